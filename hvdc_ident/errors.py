@@ -1,0 +1,101 @@
+"""The exceptions of the package.
+
+    HvdcIdentError
+    ├── InputError              the input is wrong: exit code 2 on the command line
+    │   ├── ExpressionError     text that is no expression of the grammar
+    │   ├── ModelError          a model or model card that does not hold together
+    │   ├── UnknownNameError    a name that is not there, with the nearest ones
+    │   ├── WaveformError       a data file or signal that cannot be used
+    │   ├── StudyError          a study file that asks for the impossible
+    │   └── SteadyStateError    a model that has no steady state where one was asked for
+    └── ComputationError        the work ran and failed: exit code 1
+        ├── SimulationError     a trajectory that did not reach its end
+        └── FitError            an estimation that did not reach an optimum
+
+Every message says what is wrong, where, what was expected, what was found and what to try.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class HvdcIdentError(Exception):
+    """Base of every error the package raises on purpose.
+
+    Parts that are known are printed one after the other: `what (where): expected ..., got .... Try: ...`.
+    """
+
+    def __init__(self, what: str, *, where: str = "", expected: str = "", got: str = "", hint: str = "") -> None:
+        self.what, self.where, self.expected, self.got, self.hint = what, where, expected, got, hint
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        if self.expected:
+            text += f"; expected {self.expected}"
+        if self.got:
+            text += f", got {self.got}" if self.expected else f"; got {self.got}"
+        return text + (f". Try: {self.hint}" if self.hint else "")
+
+    def at(self, where: str) -> HvdcIdentError:
+        """The same error with an outer place put before its own."""
+        place = f"{where}: {self.where}" if self.where else where
+        return type(self)(self.what, where=place, expected=self.expected, got=self.got, hint=self.hint)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.hint)
+
+
+def _rebuild(kind: type[HvdcIdentError], what: str, where: str, expected: str, got: str, hint: str) -> HvdcIdentError:
+    return kind(what, where=where, expected=expected, got=got, hint=hint)
+
+
+class InputError(HvdcIdentError):
+    """The input is wrong."""
+
+
+class ExpressionError(InputError):
+    """Text that is not an expression of the grammar."""
+
+
+class ModelError(InputError):
+    """A model that does not hold together."""
+
+
+class UnknownNameError(InputError):
+    """A name that is not there."""
+
+
+class WaveformError(InputError):
+    """Recorded data that cannot be used."""
+
+
+class StudyError(InputError):
+    """A study that asks for the impossible."""
+
+
+class SteadyStateError(InputError):
+    """No steady state where one is needed."""
+
+
+class ComputationError(HvdcIdentError):
+    """The work ran and failed."""
+
+
+class SimulationError(ComputationError):
+    """A trajectory that did not reach its end."""
+
+
+class FitError(ComputationError):
+    """An estimation that did not reach an optimum."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "") -> UnknownNameError:
+    """An error for a name that is not among the known ones, with the nearest of them as the hint."""
+    names = [str(k) for k in known]
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    shown = ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+    hint = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    return UnknownNameError(f"no {kind} '{name}'", where=where, expected=f"one of {shown}" if names else f"no {kind}s at all", hint=hint)

@@ -1,0 +1,49 @@
+"""An immutable mapping that keeps its order, can be hashed and sent to another process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, TypeVar
+
+V = TypeVar("V")
+
+
+class FrozenMap(Mapping[str, V]):
+    """A read-only `dict` from names to values; equal to any mapping with the same items, hashable if its values are."""
+
+    __slots__ = ("_hash", "_items")
+
+    def __init__(self, items: Mapping[str, V] | Iterable[tuple[str, V]] = ()) -> None:
+        self._items: dict[str, V] = dict(items)
+        self._hash: int | None = None
+
+    def __getitem__(self, name: str) -> V:
+        return self._items[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._items
+
+    def __hash__(self) -> int:
+        if self._hash is None:
+            self._hash = hash(tuple(self._items.items()))
+        return self._hash
+
+    def __repr__(self) -> str:
+        return repr(self._items)
+
+    def __or__(self, other: Mapping[str, V]) -> FrozenMap[V]:
+        """A copy in which the other's items are added or replace those of the same name."""
+        return FrozenMap({**self._items, **other})
+
+    def without(self, *names: str) -> FrozenMap[V]:
+        """A copy that lacks the names."""
+        return FrozenMap({k: v for k, v in self._items.items() if k not in names})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FrozenMap, (self._items,)

@@ -1,0 +1,193 @@
+"""What a model is: states, index-1 unknowns, named signals, parameters, inputs and outputs, in sympy expressions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import sympy as sp
+
+from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.parameters import Input, Parameter
+
+Start = sp.Expr | Literal["free"] | None
+
+
+@dataclass(frozen=True)
+class State:
+    """x' = derivative. start: an expression of parameters, "free" (unknown: becomes the parameter NAME_start) or None: the steady state.
+
+    guess: where the search for the steady state begins; None: several places are tried.
+    rest: what the state equals at rest, for a derivative that is 0 at rest wherever the state is.
+    """
+
+    derivative: sp.Expr
+    start: Start = None
+    guess: float | None = None
+    rest: sp.Expr | None = None
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A named intermediate signal: a slot where an effect can be put."""
+
+    value: sp.Expr
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Algebraic:
+    """An unknown z that equals the expression, which may lead back to z. start: where the search begins."""
+
+    equation: sp.Expr
+    start: float = 0.0
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Output:
+    """What can be recorded."""
+
+    value: sp.Expr
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """d(t) = of(t - time), a true delay; `time` is an expression of parameters in s, above 0."""
+
+    of: sp.Expr
+    time: sp.Expr
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A discrete state: `value` is taken every `period` s, from the start of the experiment on, and published `compute` s later."""
+
+    value: sp.Expr
+    period: sp.Expr
+    compute: sp.Expr = sp.Integer(0)
+
+
+@dataclass(frozen=True)
+class Parameterisation:
+    """Other parameters for some of the model's: each replaced one is an expression of the new ones."""
+
+    parameters: FrozenMap[Parameter]
+    replaces: FrozenMap[sp.Expr]
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A continuous-time model with limits, delays and sampled parts.
+
+    Every name is one symbol; an expression may use `time`, parameters, inputs, states, signals, unknowns, delays and
+    sampled values by name, in any order, as long as no circle is closed but through `algebraic`, `delays` or `sampled`.
+    Plain values are accepted where an object with more detail is stored: a number for a Parameter or an Input, an
+    expression for a State, Signal, Algebraic or Output.
+
+    Raises ModelError where names clash, are unknown, or signals run in a circle.
+    """
+
+    name: str
+    parameters: FrozenMap[Parameter] = field(default_factory=FrozenMap)
+    inputs: FrozenMap[Input] = field(default_factory=FrozenMap)
+    states: FrozenMap[State] = field(default_factory=FrozenMap)
+    signals: FrozenMap[Signal] = field(default_factory=FrozenMap)
+    algebraic: FrozenMap[Algebraic] = field(default_factory=FrozenMap)
+    outputs: FrozenMap[Output] = field(default_factory=FrozenMap)
+    delays: FrozenMap[Delay] = field(default_factory=FrozenMap)
+    sampled: FrozenMap[Sampled] = field(default_factory=FrozenMap)
+    parameterisations: FrozenMap[Parameterisation] = field(default_factory=FrozenMap)
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        from hvdc_ident.model.check import check, coerced
+
+        for name, value in coerced(self).items():
+            object.__setattr__(self, name, value)
+        check(self)
+
+    @cached_property
+    def slots(self) -> tuple[str, ...]:
+        """Names at which an effect may sit: inputs, named signals, unknowns, states; outputs as "outputs.NAME" where the name is taken."""
+        inner = [*self.inputs, *self.signals, *self.algebraic, *self.states]
+        return (*inner, *(o if o not in inner else f"outputs.{o}" for o in self.outputs))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters' values by name."""
+        return {name: p.value for name, p in self.parameters.items()}
+
+    def with_values(self, values: Mapping[str, float]) -> Model:
+        """The model with other parameter or input values; bounds of a parameter that the value leaves are an error."""
+        parameters, inputs = dict(self.parameters), dict(self.inputs)
+        for name, value in values.items():
+            if name in parameters:
+                try:
+                    parameters[name] = replace(parameters[name], value=float(value))
+                except ModelError as e:
+                    raise e.at(f"parameter '{name}'") from None
+            elif name in inputs:
+                inputs[name] = replace(inputs[name], value=float(value))
+            else:
+                raise unknown_name("parameter or input", name, [*parameters, *inputs], where=f"model '{self.name}'")
+        return replace(self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs))
+
+    def with_effects(self, effects: Iterable[Any]) -> Model:
+        """The model with effects put on its slots, one after the other; an effect at its neutral value changes nothing.
+
+        effects: `EffectUse` objects or dicts {"effect": name, "at": slot or slots, "parameters": {NAME: value}}.
+        """
+        from hvdc_ident.effects import apply_effects
+
+        return apply_effects(self, effects)
+
+    def driven(self, slots: Iterable[str]) -> Model:
+        """The model in which the slots are inputs: they follow a recorded column instead of their equation."""
+        from hvdc_ident.model.transform import driven
+
+        return driven(self, tuple(slots))
+
+    def parameterised(self, name: str) -> Model:
+        """The model in another of its own parameterisations; the values follow from the new parameters' start values."""
+        from hvdc_ident.model.transform import parameterised
+
+        return parameterised(self, name)
+
+    def __getitem__(self, name: str) -> sp.Symbol:
+        """The symbol of one of the model's names, for use in expressions."""
+        if name not in self.names:
+            raise unknown_name("variable", name, self.names, where=f"model '{self.name}'")
+        return symbol(name)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Every name an expression may use."""
+        return (*self.parameters, *self.inputs, *self.states, *self.signals, *self.algebraic, *self.delays, *self.sampled)
+
+    @cached_property
+    def structure(self) -> tuple[Any, ...]:
+        """What the machine code depends on: names and equations, without the values of parameters and inputs."""
+        return (tuple(self.parameters), tuple(self.inputs), self.states, self.signals, self.algebraic, self.outputs, self.delays, self.sampled)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        return hash((self.name, self.parameters, self.inputs, self.states, self.signals, self.algebraic, self.outputs, self.delays, self.sampled))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Only the definition travels to another process: symbols hash anew there."""
+        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}

@@ -1,0 +1,53 @@
+"""Parameters and inputs: a value with its unit, its bounds and what it means."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from hvdc_ident.errors import ModelError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A constant of the model that may be estimated.
+
+    value: start value in `unit`. min, max: bounds that the physics sets, in `unit` (infinite: none).
+    scale: a typical size in `unit`, used to compare parameters; 0 means: take |value|, or 1 where that is 0.
+    """
+
+    value: float
+    unit: str = ""
+    min: float = -math.inf
+    max: float = math.inf
+    scale: float = 0.0
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("value", "min", "max", "scale"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        if math.isnan(self.value):
+            raise ModelError("a parameter's value is not a number")
+        if not self.min <= self.max or math.isnan(self.scale) or self.scale < 0:
+            raise ModelError("a parameter's bounds or scale are wrong", expected="min <= max and scale >= 0", got=f"min {self.min:g}, max {self.max:g}, scale {self.scale:g}")
+        if not self.min <= self.value <= self.max:
+            raise ModelError("a parameter's value lies outside its own bounds", expected=f"a value in [{self.min:g}, {self.max:g}]", got=f"{self.value:g}")
+
+    @property
+    def size(self) -> float:
+        """A typical size in the parameter's unit, never 0."""
+        return self.scale or abs(self.value) or 1.0
+
+
+@dataclass(frozen=True)
+class Input:
+    """A signal that enters the model from outside; `value` is what it is where an experiment does not say."""
+
+    value: float = 0.0
+    unit: str = ""
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", float(self.value))
+        if not math.isfinite(self.value):
+            raise ModelError("an input's value is not finite", expected="a finite number", got=f"{self.value}")

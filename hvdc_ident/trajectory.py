@@ -1,0 +1,80 @@
+"""Named signals over one time axis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import WaveformError, unknown_name
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Signals sampled at the same instants.
+
+    time: (n,) in s, non-decreasing; a time that stands twice is a jump, the first row before it and the second after.
+    values: (n, k), one column a signal. names: k names. units: k units ("" where unknown).
+    """
+
+    time: Array
+    values: Array
+    names: tuple[str, ...]
+    units: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        time = np.ascontiguousarray(self.time, dtype=float)
+        values = np.ascontiguousarray(self.values, dtype=float)
+        names = tuple(self.names)
+        units = tuple(self.units) or ("",) * len(names)
+        if time.ndim != 1 or values.shape != (time.size, len(names)) or len(units) != len(names):
+            raise WaveformError("a trajectory's parts do not fit", expected=f"values of shape ({time.size}, {len(names)})", got=f"{values.shape} and {len(units)} units")
+        time.setflags(write=False)
+        values.setflags(write=False)
+        for name, value in (("time", time), ("values", values), ("names", names), ("units", units)):
+            object.__setattr__(self, name, value)
+
+    def __getitem__(self, name: str) -> Array:
+        """The signal's samples, (n,)."""
+        return self.values[:, self._column(name)]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __len__(self) -> int:
+        return int(self.time.size)
+
+    def unit(self, name: str) -> str:
+        """The signal's unit."""
+        return self.units[self._column(name)]
+
+    def select(self, names: Iterable[str]) -> Trajectory:
+        """The named signals alone, in the order given."""
+        columns = [self._column(n) for n in names]
+        return Trajectory(self.time, self.values[:, columns], tuple(self.names[c] for c in columns), tuple(self.units[c] for c in columns))
+
+    def rows(self, mask: NDArray[np.bool_]) -> Trajectory:
+        """The rows where the mask holds."""
+        return Trajectory(self.time[mask], self.values[mask], self.names, self.units)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Time, signals and units as plain lists."""
+        return {"time": self.time.tolist(), "signals": {n: self[n].tolist() for n in self.names}, "units": dict(zip(self.names, self.units, strict=True))}
+
+    def _column(self, name: str) -> int:
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise unknown_name("signal", name, self.names) from None
+
+
+def trajectory(time: Sequence[float] | Array, signals: dict[str, Any], units: dict[str, str] | None = None) -> Trajectory:
+    """A trajectory from a time axis and a dict of columns."""
+    columns = [np.asarray(v, dtype=float) for v in signals.values()]
+    values = np.column_stack(columns) if columns else np.empty((len(time), 0))
+    return Trajectory(np.asarray(time, dtype=float), values, tuple(signals), tuple((units or {}).get(n, "") for n in signals))
