@@ -1,0 +1,24 @@
+"""The mean over a sliding window, as a one-cycle measurement takes it."""
+
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
+    """The state y' = (u - u(t - T)) / T; at rest it is u, which the derivative alone would leave open."""
+    before = add.delay(u, p["T"])
+    return add.state("y", lambda y: (u - before) / p["T"], rest=u)
+
+
+EFFECT = Effect(
+    name="window-mean",
+    summary="mean of u over the last T (a one-cycle measurement)",
+    parameters=FrozenMap({"T": EffectParameter(0.02, neutral=0.0, unit="s", probes=(0.005, 0.01, 0.02), description="window")}),
+    rewrite=rewrite,
+    sentence="{at} is the mean over the last {T}",
+    excited_by="a step through the slot, recorded at several samples per window",
+)

@@ -1,0 +1,134 @@
+"""Models made from models: slots rewritten, driven by recordings, or written in other parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import sympy as sp
+
+from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model, Signal
+from hvdc_ident.parameters import Input, Parameter
+
+Renaming = Mapping[sp.Symbol, sp.Symbol]
+
+
+def fresh(model: Model, name: str) -> str:
+    """A name like the one given that the model does not use yet."""
+    taken = {*model.names, *(f"{s}_start" for s in model.states)}
+    if name not in taken:
+        return name
+    return next(f"{name}_{k}" for k in range(2, 10_000) if f"{name}_{k}" not in taken)
+
+
+def substituted(model: Model, renaming: Renaming) -> dict[str, Any]:
+    """The model's equations with symbols exchanged, as fields for `dataclasses.replace`."""
+
+    def new(e: Any) -> Any:
+        return e.xreplace(renaming) if isinstance(e, sp.Basic) else e
+
+    return {
+        "states": FrozenMap({n: replace(s, derivative=new(s.derivative), rest=new(s.rest)) for n, s in model.states.items()}),
+        "signals": FrozenMap({n: replace(s, value=new(s.value)) for n, s in model.signals.items()}),
+        "algebraic": FrozenMap({n: replace(a, equation=new(a.equation)) for n, a in model.algebraic.items()}),
+        "outputs": FrozenMap({n: replace(o, value=new(o.value)) for n, o in model.outputs.items()}),
+        "delays": FrozenMap({n: replace(d, of=new(d.of)) for n, d in model.delays.items()}),
+        "sampled": FrozenMap({n: replace(s, value=new(s.value)) for n, s in model.sampled.items()}),
+    }
+
+
+def slot(model: Model, name: str) -> tuple[str, str]:
+    """(kind, name) of a slot: input, signal, algebraic, state or output; "outputs.NAME" asks for the output."""
+    if name.startswith("outputs."):
+        if name[8:] in model.outputs:
+            return "output", name[8:]
+    else:
+        for kind, names in (("input", model.inputs), ("signal", model.signals), ("algebraic", model.algebraic), ("state", model.states), ("output", model.outputs)):
+            if name in names:
+                return kind, name
+    raise unknown_name("slot", name, model.slots, where=f"model '{model.name}'")
+
+
+def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.Expr], tuple[Model, sp.Expr]]) -> Model:
+    """The model in which all readers of a slot see another expression of it.
+
+    rewrite(model, u) returns the model with what it needs added, and the expression y of u that readers see. Before the
+    rewrite u is a name of its own: `NAME_before_LABEL` for signals and unknowns (readers keep the name), else readers
+    of an input or a state see `NAME_after_LABEL`. An unknown whose circle the effect opens becomes a signal by itself.
+    """
+    kind, name = slot(model, name)
+    if kind == "output":
+        model, y = rewrite(model, model.outputs[name].value)
+        return replace(model, outputs=model.outputs | {name: replace(model.outputs[name], value=y)})
+    if kind in ("input", "state"):
+        seen = fresh(model, f"{name}_after_{label}")
+        unit = model.inputs[name].unit if kind == "input" else model.states[name].unit
+        signals = {seen: Signal(symbol(name), unit)}
+        fields = substituted(model, {symbol(name): symbol(seen)})
+        model = replace(model, **fields | {"signals": fields["signals"] | signals})
+        model, y = rewrite(model, symbol(name))
+        return replace(model, signals=model.signals | {seen: Signal(y, unit)})
+    before = fresh(model, f"{name}_before_{label}")
+    if kind == "signal":
+        old = model.signals[name]
+        model = replace(model, signals=_inserted(model.signals, name, before, replace(old)))
+        model, y = rewrite(model, symbol(before))
+        return replace(model, signals=model.signals | {name: replace(old, value=y)})
+    unknown = model.algebraic[name]
+    model = replace(model, signals=model.signals | {before: Signal(unknown.equation, unknown.unit)}, algebraic=model.algebraic | {name: replace(unknown, equation=symbol(before))})
+    model, y = rewrite(model, symbol(before))
+    return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)})
+
+
+def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal) -> FrozenMap[Signal]:
+    """The signals with `before` put in front of `name`, which for now only repeats it."""
+    items: dict[str, Signal] = {}
+    for n, s in signals.items():
+        if n == name:
+            items[before] = value
+            items[n] = replace(s, value=symbol(before))
+        else:
+            items[n] = s
+    return FrozenMap(items)
+
+
+def driven(model: Model, slots: tuple[str, ...]) -> Model:
+    """The model in which the slots are inputs of the same name, to follow a recorded column."""
+    for given in slots:
+        kind, name = slot(model, given)
+        if kind == "output":
+            raise ModelError("an output cannot be driven", where=f"model '{model.name}', drive '{given}'", expected="a signal, unknown, state or input", hint="drive the signal that the output shows")
+        if kind == "input":
+            continue
+        rest = {
+            "signal": lambda n: {"signals": model.signals.without(n)},
+            "algebraic": lambda n: {"algebraic": model.algebraic.without(n)},
+            "state": lambda n: {"states": model.states.without(n), "parameters": model.parameters.without(f"{n}_start") if model.states[n].start == "free" else model.parameters},
+        }[kind](name)
+        unit = (model.signals | model.algebraic | model.states)[name].unit  # type: ignore[operator]
+        model = replace(model, **rest, inputs=model.inputs | {name: Input(0.0, unit, "driven by a recording")})
+    return model
+
+
+def parameterised(model: Model, name: str) -> Model:
+    """The model with some parameters written as expressions of the parameterisation's own."""
+    if name not in model.parameterisations:
+        raise unknown_name("parameterisation", name, model.parameterisations, where=f"model '{model.name}'")
+    chosen = model.parameterisations[name]
+    if not chosen.replaces:
+        return model
+    parameters: dict[str, Parameter] = {}
+    for n, p in model.parameters.items():
+        if n in chosen.replaces:
+            parameters |= {k: v for k, v in chosen.parameters.items() if k not in parameters}
+        else:
+            parameters[n] = p
+    signals = {n: Signal(e, model.parameters[n].unit, model.parameters[n].description) for n, e in chosen.replaces.items()}
+    others = FrozenMap({k: v for k, v in model.parameterisations.items() if k != name and not set(v.replaces) & set(chosen.replaces)})
+    return replace(model, parameters=FrozenMap(parameters), signals=FrozenMap({**signals, **model.signals}), parameterisations=others)
+
+

@@ -1,0 +1,70 @@
+"""The shipped models, one file each, and the one way to load any model."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+from pathlib import Path
+
+from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+
+__all__ = ["load_model", "shipped_models", "summaries"]
+
+
+@cache
+def _modules() -> FrozenMap[object]:
+    names = [m.name for m in pkgutil.iter_modules(__path__)]
+    return FrozenMap({n.replace("_", "-"): importlib.import_module(f"{__name__}.{n}") for n in sorted(names)})
+
+
+def shipped_models() -> tuple[str, ...]:
+    """Names of the shipped models."""
+    return tuple(_modules())
+
+
+def summaries() -> dict[str, str]:
+    """One line on each shipped model."""
+    return {name: str(module.SUMMARY) for name, module in _modules().items()}  # type: ignore[attr-defined]
+
+
+@cache
+def _shipped(name: str) -> Model:
+    return _modules()[name].model()  # type: ignore[attr-defined, no-any-return]
+
+
+def load_model(source: str | Path, *, trust: bool = False) -> Model:
+    """A shipped model by name, or the model of a file: a model card (.toml), or Python (.py, runs code: only with trust).
+
+    Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
+    """
+    text = str(source)
+    if text in shipped_models():
+        return _shipped(text)
+    path = Path(text)
+    suffix = path.suffix.lower()
+    if suffix == ".toml":
+        from hvdc_ident.model.card import read_card
+
+        return read_card(path)
+    if suffix == ".py":
+        return _from_python(path, trust)
+    if suffix or path.exists():
+        raise ModelError("this kind of model file cannot be read", where=text, expected="a model card (.toml) or a Python file (.py)")
+    raise unknown_name("shipped model", text, shipped_models())
+
+
+def _from_python(path: Path, trust: bool) -> Model:
+    if not trust:
+        raise ModelError("a Python model runs its code", where=str(path), hint="read the file, then give --trust (or trust=True); a model card needs no trust")
+    if not path.is_file():
+        raise ModelError("the model file is not there", where=str(path))
+    namespace: dict[str, object] = {"__name__": "hvdc_ident_user_model", "__file__": str(path)}
+    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), namespace)
+    found = namespace.get("model")
+    result = found() if callable(found) else found
+    if not isinstance(result, Model):
+        raise ModelError("the file defines no model", where=str(path), expected="a variable or function `model` that gives a Model", got=type(result).__name__)
+    return result

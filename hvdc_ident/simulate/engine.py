@@ -1,0 +1,278 @@
+"""The engine: a model's machine code with the compiled integrators, behind one verb."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.result import Simulation, Statistics
+from hvdc_ident.simulate.structure import NAMES, Structure
+from hvdc_ident.trajectory import Array, Trajectory
+
+Method = Literal["auto", "explicit", "rosenbrock"]
+STATUS = ("converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff")
+HINTS = {
+    "step-limit": "raise max_steps, loosen rtol, or look for a very fast part of the model",
+    "not-finite": "a value grew without bound or left a function's domain: check parameter values and limits",
+    "chatter": "a limit switches on and off without end: add a hysteresis or a small lag where it acts",
+    "inconsistent": "the algebraic loop has no solution there: check the operating point, or give the unknown another start",
+    "stiff": "use the Rosenbrock method",
+}
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run."""
+
+    rtol: float = 1e-8
+    atol: float = 1e-10
+    max_steps: int = 200_000
+
+
+class Engine:
+    """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
+
+    def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
+        self.structure = Structure(model, sensitivities, outputs)
+        s = self.structure.sizes
+        self._code = self.structure.compile()
+        self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
+        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width, s.n_hess], dtype=np.int64)
+        second = self.structure.second
+        self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
+        self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
+        self._explicit: bool | None = None
+
+    # --- the start ---
+
+    def start(self, p: Array, u: Array) -> tuple[Array, Array]:
+        """The steady state and held values at parameters p and inputs u, as the flat vectors y and w with their rows.
+
+        Raises SteadyStateError where Newton's method and its fallbacks find none.
+        """
+        from hvdc_ident.simulate.rest import FOUND, rest
+        from hvdc_ident.simulate.steady import fallback
+
+        announce_compilation()
+        s = self.structure.sizes
+        n, extra = s.nx + s.nz, s.nd + s.nq
+        m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
+        for guess in self._guesses(p):
+            y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width))
+            y[:n], w[1 : 1 + s.nu] = guess, u
+            jac = np.zeros((n + extra, n + extra))
+            if rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst) == FOUND:
+                return y, w
+        return fallback(self.structure, self._address, self._dims, p, u, next(iter(self._guesses(p))))
+
+    def _guesses(self, p: Array) -> list[Array]:
+        """Where the search begins: the model's own guesses, then the unknown ones at 0, at 1 and at seeded random places."""
+        m = self.structure.model
+        given = [s.guess for s in m.states.values()]
+        tail = [m.algebraic[n].start for n in self.structure.unknowns]
+        random = np.random.default_rng(0)
+        fills = [np.zeros(len(given)), np.ones(len(given)), *(random.normal(size=(4, len(given))))]
+        guesses = [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]
+        return guesses[:1] if all(g is not None for g in given) else guesses
+
+    def constants(self, p: Array) -> Array:
+        """Delay times, sampling periods and compute times, with their rows over the parameters."""
+        from hvdc_ident.simulate.steps import CONST
+
+        s = self.structure.sizes
+        count = s.nd + 2 * s.nq
+        values = np.zeros(count * (1 + s.width) + 1)
+        if count:
+            evaluate(self._address[CONST], np.zeros(1), np.zeros(1), p, np.zeros(1), values)
+            m = self.structure.model
+            names = [*m.delays, *m.sampled]
+            for k, name in enumerate(names):
+                if not values[k] > 0.0:
+                    kind = "delay" if k < s.nd else "sampling period"
+                    raise ModelError(f"the {kind} of '{name}' is not above 0", where=f"model '{m.name}'", got=f"{values[k]:g} s", hint="leave the effect out, or give it a positive time")
+            for k, name in enumerate(m.sampled):
+                period, compute = values[s.nd + k], values[s.nd + s.nq + k]
+                if not 0.0 <= compute <= period:
+                    raise ModelError(f"the compute time of '{name}' does not fit its period", where=f"model '{m.name}'", expected=f"between 0 and {period:g} s", got=f"{compute:g} s")
+        return values
+
+    # --- the run ---
+
+    def run(self, p: Array, inputs: Sequence[Any], time: Array, tolerance: Tolerance, method: Method = "auto", scale: Array | None = None, first: float | None = None) -> tuple[Array, Statistics]:
+        """Outputs at the times, (n, outputs (1 + width)): values, then rows; and what it cost.
+
+        inputs: one InputSignal an input. first: where the run starts, s (default: the first time).
+        """
+        from hvdc_ident.simulate.driver import EXPLICIT, ROSENBROCK, integrate
+
+        s = self.structure.sizes
+        begin, end = float(time[0] if first is None else first), float(time[-1])
+        # "At the first row" is what stood before anything happened: the value from the left.
+        u = np.array([float(i.values[0]) if i.times[0] >= begin else float(i(np.nextafter(begin, -np.inf))) for i in inputs])
+        y, w = self.start(p, u)
+        constants = self.constants(p)
+        pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
+        times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
+        values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
+        breaks = np.unique(np.concatenate([np.empty(0), *(i.breaks for i in inputs)]))
+        breaks = breaks[(breaks > begin) & (breaks < end)]
+        out = np.zeros((time.size, max(s.no * (1 + s.width), 1)))
+        sizes = np.ones(max(s.np, 1)) if scale is None else scale
+        tol = tolerance
+        kind = EXPLICIT if self._is_explicit(method, p, y, w, end - begin) else ROSENBROCK
+        while True:
+            counts, modes = np.zeros(5, dtype=np.int64), np.zeros(max(s.ns, 1))
+            status, reached = integrate(
+                self._address, self._dims, self._hess_row, self._hess_column, kind, p, y.copy(), w.copy(), np.zeros_like(w), constants, begin, end, breaks,
+                pointer, times, values, time, out, sizes, tol.rtol, tol.atol, tol.max_steps, counts, modes,
+            )  # fmt: skip
+            if STATUS[status] == "stiff" and method == "auto":
+                self._explicit, kind = False, ROSENBROCK
+                continue
+            break
+        statistics = Statistics(STATUS[status], "explicit" if kind == EXPLICIT else "rosenbrock", *(int(c) for c in counts))
+        if status:
+            raise SimulationError(
+                f"the simulation of model '{self.structure.model.name}' stopped: {STATUS[status]}",
+                where=f"t = {reached:.6g} s",
+                got=f"{statistics.accepted} steps accepted, {statistics.rejected} rejected, {statistics.events} switches",
+                hint=HINTS[STATUS[status]],
+            )
+        return out, statistics
+
+    def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
+        """Whether the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
+        s = self.structure.sizes
+        if method != "auto":
+            if method == "explicit" and s.nz:
+                raise ModelError("the explicit method cannot solve algebraic unknowns", where=f"model '{self.structure.model.name}'", hint="use method='rosenbrock' or 'auto'")
+            return method == "explicit"
+        if self._explicit is None:
+            if s.nz:
+                self._explicit = False
+            else:
+                fastest = np.abs(np.linalg.eigvals(self.jacobian(p, y, w))).max(initial=0.0)
+                self._explicit = bool(fastest * span < 2e4)
+        return self._explicit
+
+    def jacobian(self, p: Array, y: Array, w: Array) -> Array:
+        """d[f; g]/d[x; z], (n, n), at y and w with modes as the values say."""
+        from hvdc_ident.simulate.steps import JAC, MODES
+
+        s = self.structure.sizes
+        n = s.nx + s.nz
+        m, jac = np.zeros(max(s.ns, 1)), np.zeros((n, n))
+        evaluate(self._address[MODES], y, w, p, m, m)
+        evaluate(self._address[JAC], y, w, p, m, jac.reshape(-1))
+        return jac
+
+
+def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
+    """Calls one generated function from Python."""
+    import ctypes
+
+    pointer = ctypes.POINTER(ctypes.c_double)
+    kind = ctypes.CFUNCTYPE(None, *[pointer] * 7)
+    zero = np.zeros_like(w)
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, zero, p, m)]
+    kind(int(address))(*(a.ctypes.data_as(pointer) for a in arrays), out.ctypes.data_as(pointer))
+
+
+def announce_compilation() -> None:
+    """Says on stderr that the integrators are being compiled, where this installation has not compiled them yet."""
+    from hvdc_ident.simulate.driver import integrate
+
+    if integrate.signatures:
+        return
+    cache = integrate._cache
+    folder = Path(cache.cache_path)
+    if not list(folder.glob("driver.integrate-*.nbi")):
+        print("hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...", file=sys.stderr, flush=True)
+
+
+@lru_cache(maxsize=32)
+def _engine(key: _Key) -> Engine:
+    return Engine(key.model, key.sensitivities, key.outputs)
+
+
+@dataclass(frozen=True)
+class _Key:
+    """What decides the machine code: the equations, not the values."""
+
+    structure: tuple[Any, ...]
+    sensitivities: tuple[str, ...]
+    outputs: tuple[str, ...]
+    model: Model
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and (self.structure, self.sensitivities, self.outputs) == (other.structure, other.sensitivities, other.outputs)
+
+    def __hash__(self) -> int:
+        return hash((self.structure, self.sensitivities, self.outputs))
+
+
+def engine(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
+    """The engine of a model's structure, compiled at the first call and kept for later ones (the last 32)."""
+    return _engine(_Key(model.structure, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs), model))
+
+
+def simulate(
+    model: Model,
+    experiment: Experiment,
+    values: Mapping[str, float] | None = None,
+    sensitivities: Sequence[str] = (),
+    *,
+    outputs: Sequence[str] | None = None,
+    tolerance: Tolerance | None = None,
+    rtol: float | None = None,
+    method: Method = "auto",
+) -> Simulation:
+    """The model's outputs at the experiment's times and, exactly, their derivatives by the named parameters.
+
+    values: parameters (and constant inputs) that differ from the model's. outputs: names of outputs or signals (default:
+    all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
+    the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
+
+    Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
+    """
+    from hvdc_ident.simulate.recording import with_recording
+
+    plant = with_recording(model, experiment)
+    given = {**experiment.values, **(values or {})}
+    names = [*plant.parameters, *plant.inputs]
+    for name in (*given, *experiment.inputs):
+        if name not in plant.parameters and name not in plant.inputs:
+            raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
+    code = engine(plant, sensitivities, outputs)
+    p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
+    if not np.isfinite(p).all():
+        bad = [n for n, v in zip(plant.parameters, p, strict=True) if not np.isfinite(v)]
+        raise ModelError(f"the value of parameter '{bad[0]}' is not finite", where=f"model '{model.name}'", hint="an effect at an infinite neutral value is left out: do not set it")
+    from hvdc_ident.experiment import InputSignal
+
+    signals = [experiment.inputs.get(n) or InputSignal.constant(given.get(n, i.value)) for n, i in plant.inputs.items()]
+    tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
+    scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities] or [1.0])
+    try:
+        out, statistics = code.run(p, signals, experiment.time, tol, method, scale)
+    except (SimulationError, SteadyStateError) as e:
+        raise e.at(f"experiment '{experiment.name}'") from None
+    return _simulation(plant, code, experiment, out, statistics)
+
+
+def _simulation(model: Model, code: Engine, experiment: Experiment, out: Array, statistics: Statistics) -> Simulation:
+    s = code.structure.sizes
+    names = code.structure.outputs
+    units = tuple(model.outputs[n].unit if n in model.outputs else "" for n in names)
+    gradient = out[:, s.no :].reshape(experiment.time.size, s.no, s.width)[:, :, : s.np] if s.width else np.zeros((experiment.time.size, s.no, 0))
+    return Simulation(Trajectory(experiment.time, out[:, : s.no], names, units), code.structure.sensitivities, gradient, statistics, FrozenMap())

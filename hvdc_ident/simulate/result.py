@@ -1,0 +1,88 @@
+"""What a simulation returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.errors import unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array, Trajectory
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How a run went: its status, the method, and counts of steps, switches, evaluations and segments between breaks."""
+
+    status: str
+    method: str
+    accepted: int
+    rejected: int
+    events: int
+    evaluations: int
+    segments: int
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """Simulated outputs and their exact derivatives.
+
+    trajectory: the outputs at the experiment's times. parameters: names of the sensitivity parameters.
+    gradients: (n_time, n_outputs, n_parameters), in output unit per parameter unit.
+    """
+
+    trajectory: Trajectory
+    parameters: tuple[str, ...]
+    gradients: Array
+    statistics: Statistics
+    notes: FrozenMap[str] = field(default_factory=FrozenMap)
+
+    @property
+    def status(self) -> str:
+        """"converged"; any other outcome is an exception."""
+        return self.statistics.status
+
+    def __getitem__(self, output: str) -> Array:
+        """(n_time,) samples of one output."""
+        return self.trajectory[output]
+
+    def gradient(self, output: str) -> Array:
+        """(n_time, n_parameters) derivatives of one output."""
+        names = self.trajectory.names
+        if output not in names:
+            raise unknown_name("output", output, names)
+        return self.gradients[:, names.index(output), :]
+
+    @property
+    def sensitivities(self) -> xarray.DataArray:
+        """The derivatives with labelled axes time, output, parameter."""
+        import xarray
+
+        axes = {"time": self.trajectory.time, "output": list(self.trajectory.names), "parameter": list(self.parameters)}
+        return xarray.DataArray(self.gradients, coords=axes, dims=tuple(axes), name="sensitivity")
+
+    def plot(self, outputs: Any = None, ax: Any = None) -> Any:
+        """Axes with the outputs over time."""
+        import matplotlib.pyplot as plt
+
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        for name in outputs or self.trajectory.names:
+            axes.plot(self.trajectory.time, self.trajectory[name], label=name)
+        axes.set_xlabel("time, s")
+        axes.legend()
+        return axes
+
+    def to_dict(self) -> dict[str, Any]:
+        """The outputs, derivatives and statistics as plain lists and numbers."""
+        derivatives = {o: {p: self.gradient(o)[:, k].tolist() for k, p in enumerate(self.parameters)} for o in self.trajectory.names}
+        return {**self.trajectory.to_dict(), "sensitivities": derivatives if self.parameters else {}, "statistics": self.statistics.__dict__}
+
+
+def rmse(a: Array, b: Array) -> float:
+    """The root mean square of the difference."""
+    return float(np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)))

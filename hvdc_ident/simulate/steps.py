@@ -1,0 +1,168 @@
+"""One step of each integrator over states and sensitivities as one flat vector, with its error and its dense output."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hvdc_ident.simulate.call import call
+from hvdc_ident.simulate.linear import lu, solve, solve_rows
+from hvdc_ident.simulate.tableaus import (
+    DOPRI_A,
+    DOPRI_DENSE,
+    DOPRI_E,
+    DOPRI_TIME,
+    RODAS_A,
+    RODAS_C,
+    RODAS_D,
+    RODAS_GAMMA,
+    RODAS_H,
+    RODAS_TIME,
+)
+
+# Addresses, in the order of structure.NAMES.
+F, FS, JAC, HESS, FT, SW, SWS, SWD, MODES, OUT, OUTS, SRC, SRCS, SRCD, REST, REST_JAC, REST_P, CONST = range(18)
+
+
+@njit(cache=True, error_model="numpy")
+def add_scaled(target, factor, source, start, stop):  # type: ignore[no-untyped-def]
+    """target[start:stop] += factor source[start:stop]."""
+    for k in range(start, stop):
+        target[k] += factor * source[k]
+
+
+@njit(cache=True, error_model="numpy")
+def error_norm(e, y, yn, n, width, count, rtol, atol, scale):  # type: ignore[no-untyped-def]
+    """The largest weighted RMS error over the states and over each parameter's sensitivities; > 1 is a rejection."""
+    total = 0.0
+    for k in range(n):
+        r = e[k] / (atol + rtol * max(abs(y[k]), abs(yn[k])))
+        total += r * r
+    worst = total
+    for c in range(count):
+        floor = atol / scale[c]
+        total = 0.0
+        for i in range(n):
+            k = n + i * width + c
+            r = e[k] / (floor + rtol * max(abs(y[k]), abs(yn[k])))
+            total += r * r
+        if not total <= worst:
+            worst = total
+    return np.sqrt(worst / n)
+
+
+@njit(cache=True, error_model="numpy")
+def interpolate(y, dense, x, size, u):  # type: ignore[no-untyped-def]
+    """Writes the first `size` elements of y + x (c1 + x (c2 + x (c3 + x c4))), the rows of dense, into u."""
+    for k in range(size):
+        u[k] = y[k] + x * (dense[0, k] + x * (dense[1, k] + x * (dense[2, k] + x * dense[3, k])))
+
+
+@njit(cache=True, error_model="numpy")
+def rodas_matrix(address, y, w, wd, p, m, h, nx, jac, matrix, pivots):  # type: ignore[no-untyped-def]
+    """Factors M/(h gamma) - J in `matrix`; jac (n, n) holds the Jacobian already."""
+    n = jac.shape[0]
+    for i in range(n):
+        for j in range(n):
+            matrix[i, j] = -jac[i, j]
+    for i in range(nx):
+        matrix[i, i] += 1.0 / (h * RODAS_GAMMA)
+    return lu(matrix, pivots)
+
+
+@njit(cache=True, error_model="numpy")
+def rodas_stage(address, stage, h, nx, n, width, hess_row, hess_column, hess, ft, matrix, pivots, u, k, yd, w, wd, p, m):  # type: ignore[no-untyped-def]
+    """Computes k[stage] from the stage's values u, with w set for the stage's time."""
+    size = u.size
+    row = k[stage]
+    call(address[FS if width else F], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, row.ctypes)
+    for j in range(stage):
+        factor = RODAS_C[stage, j] / h
+        add_scaled(row, factor, k[j], 0, nx)
+        add_scaled(row, factor, k[j], n, n + nx * width)
+    if RODAS_D[stage] != 0.0:
+        add_scaled(row, h * RODAS_D[stage], ft, 0, size)
+    solve(matrix, pivots, row[:n])
+    if width:
+        for q in range(hess_row.size):
+            value = row[hess_column[q]]
+            if value != 0.0:
+                at = n + hess_row[q] * width
+                for c in range(width):
+                    row[at + c] += hess[q * width + c] * value
+        solve_rows(matrix, pivots, row[n:].reshape(n, width))
+
+
+@njit(cache=True, error_model="numpy")
+def rodas_dense(k, y, yn, dense):  # type: ignore[no-untyped-def]
+    """Writes the four rows of the step's quartic."""
+    size = y.size
+    for q in range(size):
+        dense[0, q] = yn[q] - y[q]
+        dense[1, q] = 0.0
+        dense[2, q] = 0.0
+        dense[3, q] = 0.0
+    for s in range(8):
+        a, b, c = RODAS_H[0, s], RODAS_H[1, s], RODAS_H[2, s]
+        ks = k[s]
+        for q in range(size):
+            v = ks[q]
+            dense[0, q] += a * v
+            dense[1, q] += (b - a) * v
+            dense[2, q] += (c - b) * v
+            dense[3, q] -= c * v
+
+
+@njit(cache=True, error_model="numpy")
+def dopri_dense(k, y, yn, h, dense):  # type: ignore[no-untyped-def]
+    """Writes the four rows of the step's quartic."""
+    for q in range(y.size):
+        change = yn[q] - y[q]
+        bend = h * k[0, q] - change
+        curl = change - h * k[6, q] - bend
+        last = 0.0
+        for s in range(7):
+            last += DOPRI_DENSE[s] * k[s, q]
+        last *= h
+        dense[0, q] = change + bend
+        dense[1, q] = -bend + curl + last
+        dense[2, q] = -curl - 2.0 * last
+        dense[3, q] = last
+
+
+@njit(cache=True, error_model="numpy")
+def rodas_point(stage, y, k, u):  # type: ignore[no-untyped-def]
+    """Writes y + sum a_ij k_j of the stage into u; stages 6 and 7 add to what stage 5 left there."""
+    if stage >= 6:
+        add_scaled(u, 1.0, k[stage - 1], 0, u.size)
+        return
+    for q in range(u.size):
+        u[q] = y[q]
+    for j in range(stage):
+        add_scaled(u, RODAS_A[stage, j], k[j], 0, u.size)
+
+
+@njit(cache=True, error_model="numpy")
+def dopri_point(stage, h, y, k, u):  # type: ignore[no-untyped-def]
+    """Writes y + h sum a_ij k_j of the stage into u."""
+    for q in range(u.size):
+        u[q] = y[q]
+    for j in range(stage):
+        if DOPRI_A[stage, j] != 0.0:
+            add_scaled(u, h * DOPRI_A[stage, j], k[j], 0, u.size)
+
+
+@njit(cache=True, error_model="numpy")
+def dopri_error(h, k, e):  # type: ignore[no-untyped-def]
+    """Writes the embedded error into e."""
+    for q in range(e.size):
+        e[q] = 0.0
+    for s in range(7):
+        if DOPRI_E[s] != 0.0:
+            add_scaled(e, h * DOPRI_E[s], k[s], 0, e.size)
+
+
+@njit(cache=True, error_model="numpy")
+def stage_time(method, stage):  # type: ignore[no-untyped-def]
+    """The stage's share of the step."""
+    return RODAS_TIME[stage] if method == 1 else DOPRI_TIME[stage]

@@ -1,0 +1,249 @@
+"""The functions an integrator needs, built from a model: right-hand side, Jacobians, tangents, switches, outputs, rest.
+
+Vectors (all double):
+    y   [x (nx), z (nz)] then, where there are sensitivities, its rows over the parameters, `width` doubles each
+    w   [time, inputs, delays, sampled] then rows of the delays and sampled values over the parameters
+    wd  the time derivative of w, laid out alike
+    p   all parameters; m   one mode a switch: 1 where the switch is negative, else 0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import sympy as sp
+
+from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate.machine import Code, Function, Row
+
+# The order in which the integrators take the addresses.
+NAMES = ("f", "fs", "jac", "hess", "ft", "sw", "sws", "swd", "modes", "out", "outs", "src", "srcs", "srcd", "rest", "rest_jac", "rest_p", "const")
+
+
+def torn(model: Model) -> tuple[str, ...]:
+    """The algebraic unknowns that are needed to break every circle; the others are plain signals."""
+    uses = {n: _names(s.value) for n, s in model.signals.items()} | {n: _names(a.equation) for n, a in model.algebraic.items()}
+    keep = set(model.algebraic)
+    for name in model.algebraic:
+        if not _leads_back(name, uses, keep - {name}):
+            keep.discard(name)
+    return tuple(n for n in model.algebraic if n in keep)
+
+
+def _names(e: sp.Expr) -> set[str]:
+    return {s.name for s in e.free_symbols}
+
+
+def _leads_back(start: str, uses: dict[str, set[str]], cut: set[str]) -> bool:
+    seen: set[str] = set()
+    stack = [n for n in uses[start] if n in uses]
+    while stack:
+        n = stack.pop()
+        if n == start:
+            return True
+        if n in seen or n in cut:
+            continue
+        seen.add(n)
+        stack.extend(k for k in uses[n] if k in uses)
+    return False
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Lengths of the vectors: states, unknowns, inputs, delays, sampled values, switches, outputs, sensitivity parameters, row width."""
+
+    nx: int
+    nz: int
+    nu: int
+    nd: int
+    nq: int
+    ns: int
+    no: int
+    np: int
+    width: int
+    n_hess: int
+
+
+class Structure:
+    """A model's equations as a graph, and the machine code made from it for the given sensitivity parameters and outputs."""
+
+    def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
+        self.model = model
+        self.sensitivities = tuple(sensitivities)
+        self.outputs = tuple(model.outputs if outputs is None else outputs)
+        for name in self.sensitivities:
+            if name not in model.parameters:
+                raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+        self.states = tuple(model.states)
+        self.unknowns = torn(model)
+        self.graph = Graph()
+        self._define()
+
+    # --- leaves and equations ---
+
+    def _define(self) -> None:
+        g, m = self.graph, self.model
+        leaf = g.leaf
+        nodes: dict[str, int] = {n: leaf("p", k) for k, n in enumerate(m.parameters)}
+        nodes |= {n: leaf("y", k) for k, n in enumerate((*self.states, *self.unknowns))}
+        exogenous = ("time", *m.inputs, *m.delays, *m.sampled)
+        nodes |= {n: leaf("w", k) for k, n in enumerate(exogenous)}
+        memo: dict[sp.Basic, int] = {}
+        plain = [n for n in m.algebraic if n not in self.unknowns]
+        definitions = {n: s.value for n, s in m.signals.items()} | {n: m.algebraic[n].equation for n in plain}
+        for name in _ordered(definitions, m.name):
+            nodes[name] = g.expression(definitions[name], nodes, memo)
+
+        def node(e: sp.Expr) -> int:
+            return g.expression(e, nodes, memo)
+
+        self.nodes = nodes
+        self.derivatives = [node(s.derivative) for s in m.states.values()]
+        self.residuals = [g.sub(node(m.algebraic[n].equation), nodes[n]) for n in self.unknowns]
+        self.observed = [self._observed(n, node) for n in self.outputs]
+        self.sources = [node(d.of) for d in m.delays.values()] + [node(s.value) for s in m.sampled.values()]
+        timing = [d.time for d in m.delays.values()] + [s.period for s in m.sampled.values()] + [s.compute for s in m.sampled.values()]
+        self.timing = [node(e) for e in timing]
+        self.starts = [None if s.start is None else node(symbol(f"{n}_start") if s.start == "free" else s.start) for n, s in m.states.items()]
+        self.rests = [None if s.rest is None else node(s.rest) for s in m.states.values()]
+        self.rhs = [*self.derivatives, *self.residuals]
+
+    def _observed(self, name: str, node: object) -> int:
+        if name in self.model.outputs:
+            return node(self.model.outputs[name].value)  # type: ignore[operator]
+        if name in self.nodes:
+            return self.nodes[name]
+        raise unknown_name("output or signal", name, [*self.model.outputs, *self.nodes], where=f"model '{self.model.name}'")
+
+    @cached_property
+    def sizes(self) -> Sizes:
+        m, n = self.model, len(self.sensitivities)
+        width = 0 if n == 0 else 2 if n <= 2 else -(-n // 4) * 4
+        return Sizes(len(self.states), len(self.unknowns), len(m.inputs), len(m.delays), len(m.sampled), len(self.graph.switches), len(self.outputs), n, width, len(self.second))
+
+    # --- derivatives ---
+
+    def partial(self, node: int, group: str) -> dict[int, int]:
+        """{index: node} of the derivatives with respect to the leaves of one vector."""
+        leaves = ((self.graph.nodes[v], d) for v, d in self.graph.gradient(node).items())
+        return {key[2]: d for key, d in leaves if key[1] == group}
+
+    @cached_property
+    def second(self) -> list[tuple[int, int, int]]:
+        """(row, column, node) of the Jacobian's entries that are not constant: those the sensitivities' own Jacobian needs."""
+        entries = [(i, j, d) for i, n in enumerate(self.rhs) for j, d in self.partial(n, "y").items()]
+        return [(i, j, d) for i, j, d in entries if self.graph.gradient(d)] if self.sensitivities else []
+
+    def _row(self, node: int, with_rates: bool = False) -> Row:
+        """The total derivative of a node over the sensitivity parameters, as a row of the product with S and W."""
+        m = self.model
+        position = {list(m.parameters).index(n): k for k, n in enumerate(self.sensitivities)}
+        scalars = {position[i]: d for i, d in self.partial(node, "p").items() if i in position}
+        size = len(self.states) + len(self.unknowns)
+        width = self.sizes.width
+        products = [(d, "y", size + j * width) for j, d in sorted(self.partial(node, "y").items())]
+        first, total = 1 + len(m.inputs), 1 + len(m.inputs) + len(m.delays) + len(m.sampled)
+        for group in ("w", "wd"):
+            products += [(d, group, total + (j - first) * width) for j, d in sorted(self.partial(node, group).items()) if j >= first]
+        return Row(scalars, products)
+
+    def rate(self, node: int, states_too: bool) -> int:
+        """The node's derivative in time: through w alone, or through the states' rates `yd` too."""
+        g = self.graph
+        total = g.zero
+        for j, d in self.partial(node, "w").items():
+            total = g.add(total, d if j == 0 else g.mul(d, g.leaf("wd", j)))
+        if states_too:
+            for j, d in self.partial(node, "y").items():
+                total = g.add(total, g.mul(d, g.leaf("yd", j)))
+        return total
+
+    # --- functions ---
+
+    def functions(self) -> list[Function]:
+        """All functions of `NAMES`, those without content left out."""
+        s, g = self.sizes, self.graph
+        n, width = s.nx + s.nz, s.width
+
+        def rows(nodes: Iterable[int], at: int) -> list[tuple[int, Row]]:
+            return [(at + k * width, self._row(v)) for k, v in enumerate(nodes)] if width else []
+
+        def both(name: str, nodes: list[int]) -> Function:
+            return Function(name, list(enumerate(nodes)), rows(nodes, len(nodes)))
+
+        def plain(name: str, nodes: list[int], live: bool = False) -> Function:
+            return Function(name, list(enumerate(nodes)), live=live)
+
+        jacobian = [(i * n + j, d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()]
+        by_time = [self.rate(v, False) for v in self.rhs]
+        modes = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
+        result = [
+            plain("f", self.rhs),
+            Function("jac", jacobian),
+            both("ft", by_time),
+            plain("sw", list(g.switches)),
+            plain("swd", [self.rate(v, True) for v in g.switches]),
+            plain("modes", modes, live=True),
+            plain("out", self.observed),
+            plain("src", self.sources),
+            plain("srcd", [self.rate(v, True) for v in self.sources]),
+            both("const", self.timing),
+            *self._rest(),
+        ]
+        if width:
+            result += [both("fs", self.rhs), both("sws", list(g.switches)), both("outs", self.observed), both("srcs", self.sources)]
+            result.append(Function("hess", (), [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)]))
+        if [v for v in g.switches] and len(g.switches) != s.ns:
+            raise AssertionError("a derivative made a new condition")
+        return result
+
+    def _rest(self) -> list[Function]:
+        """Residual of the steady state over [x, z, delays, sampled], its Jacobian and its derivative by the sensitivity parameters."""
+        g, s = self.graph, self.sizes
+        first = 1 + s.nu
+        tail = [g.sub(v, g.leaf("w", first + k)) for k, v in enumerate(self.sources)]
+        fixed = [rest if start is None else start for start, rest in zip(self.starts, self.rests, strict=True)]
+        head = [d if value is None else g.sub(g.leaf("y", k), value) for k, (d, value) in enumerate(zip(self.derivatives, fixed, strict=True))]
+        residual = [*head, *self.residuals, *tail]
+        n, inner = len(residual), s.nx + s.nz
+        entries = []
+        for i, v in enumerate(residual):
+            entries += [(i * n + j, d) for j, d in self.partial(v, "y").items()]
+            entries += [(i * n + inner + j - first, d) for j, d in self.partial(v, "w").items() if j >= first]
+        position = {list(self.model.parameters).index(name): k for k, name in enumerate(self.sensitivities)}
+        by_p = [(i * s.width + position[k], d) for i, v in enumerate(residual) for k, d in self.partial(v, "p").items() if k in position]
+        return [Function("rest", list(enumerate(residual))), Function("rest_jac", entries), Function("rest_p", by_p)]
+
+    def compile(self) -> Code:
+        """The machine code; keep it as long as its addresses are used."""
+        return Code(self.graph, self.functions(), max(self.sizes.width, 1))
+
+
+def _ordered(definitions: dict[str, sp.Expr], model: str) -> list[str]:
+    """The names in an order in which each uses only earlier ones."""
+    uses = {n: [k for k in sorted(_names(e)) if k in definitions] for n, e in definitions.items()}
+    done: dict[str, bool] = {}
+    order: list[str] = []
+    for root in definitions:
+        stack = [(root, iter(uses[root]))]
+        if root in done:
+            continue
+        done[root] = False
+        while stack:
+            name, rest = stack[-1]
+            following = next((k for k in rest if not done.get(k, False)), None)
+            if following is None:
+                done[name] = True
+                order.append(name)
+                stack.pop()
+            elif following in done:
+                raise ModelError(f"the signals run in a circle through '{following}'", where=f"model '{model}'", hint="declare one of them under `algebraic`")
+            else:
+                done[following] = False
+                stack.append((following, iter(uses[following])))
+    return order
