@@ -1,0 +1,274 @@
+"""Waveforms in and out: one file format per module, found by walking this folder.
+
+A format module supplies what `Format` lists; nothing else has to be registered.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib
+import os
+import pkgutil
+import re
+import stat
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from io import StringIO
+from pathlib import Path
+from typing import Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import InputError, WaveformError, unknown_name
+from hvdc_ident.trajectory import Array, Trajectory
+
+__all__ = [
+    "MAX_BYTES",
+    "Format",
+    "convert",
+    "event_rows",
+    "formats",
+    "list_signals",
+    "pick",
+    "read_waveforms",
+    "write_csv",
+]
+
+MAX_BYTES = 2 * 1024**3
+"""Largest file, and largest table in memory, in bytes."""
+
+FORMULA_START = re.compile(r"'*[=+\-@\t\r]")
+"""A text a spreadsheet would run as a formula, with any apostrophes already put before it."""
+
+_WRITTEN_AT_ONCE = 20_000  # rows
+
+
+class Format(Protocol):
+    """What a module of this folder supplies.
+
+    NAME is its key in the catalogue, SUMMARY one line for it, SUFFIXES the usual endings, lower case, with the dot.
+    """
+
+    NAME: str
+    SUMMARY: str
+    SUFFIXES: tuple[str, ...]
+
+    def recognises(self, path: Path) -> bool:
+        """Whether the file is of this format; true for no file of another one."""
+
+    def read(self, path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+        """The waveforms, all or those named in that order; WaveformError where the file cannot be used."""
+
+    def signals(self, path: Path) -> list[tuple[str, str]]:
+        """Name and unit of every signal, without reading the waveforms."""
+
+    def sample(self, path: Path) -> None:
+        """Nothing; a small valid file is at the path afterwards."""
+
+
+@cache
+def _catalogue() -> tuple[tuple[str, Format], ...]:
+    found = {}
+    for info in pkgutil.iter_modules(__path__):
+        if not info.name.startswith("_"):
+            module = cast(Format, importlib.import_module(f"{__name__}.{info.name}"))
+            found[module.NAME] = module
+    return tuple(sorted(found.items()))
+
+
+def formats() -> dict[str, Format]:
+    """The format modules of this folder by name, in alphabetical order."""
+    return dict(_catalogue())
+
+
+def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None = None) -> Trajectory:
+    """The waveforms of a file of any known format: time in s, signals in the file's units.
+
+    signals: names wanted, in that order; None for all of them.
+    Raises WaveformError where the file cannot be used, UnknownNameError for a signal it does not have.
+    """
+    file = _usable_file(path)
+    wanted = [signals] if isinstance(signals, str) else None if signals is None else list(signals)
+    found = _format_of(file).read(file, wanted)
+    _check(found, file)
+    return found
+
+
+def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[str, str]]:
+    """Name and unit ("" where unknown) of the signals in a file whose names fit the search, in the file's order.
+
+    search: part of the name, or a pattern of the whole name with * and ?; upper and lower case count the same.
+    Raises WaveformError where the file cannot be used.
+    """
+    file = _usable_file(path)
+    if "*" in search or "?" in search:
+        pattern = re.escape(search).replace(r"\*", ".*").replace(r"\?", ".")
+        fits = re.compile(pattern, re.IGNORECASE | re.DOTALL).fullmatch
+    else:
+        fits = re.compile(re.escape(search), re.IGNORECASE).search
+    return [(name, unit) for name, unit in _format_of(file).signals(file) if fits(name)]
+
+
+def convert(
+    source: str | os.PathLike[str], target_csv: str | os.PathLike[str], signals: Iterable[str] | None = None
+) -> Trajectory:
+    """The waveforms of a file of any known format, after they were written to a CSV file.
+
+    signals: names wanted; None for all. Raises WaveformError where the source cannot be used or the target not written.
+    """
+    target = Path(target_csv)
+    if target.suffix.lower() != ".csv":
+        raise WaveformError("waveforms are converted to CSV only", expected="a name ending in .csv", got=str(target))
+    if target.exists() and Path(source).exists() and target.samefile(source):
+        raise WaveformError("source and target are the same file", where=str(target), hint="another name")
+    found = read_waveforms(source, signals)
+    write_csv(found, target)
+    return found
+
+
+def write_csv(trajectory: Trajectory, path: str | os.PathLike[str], *, units: bool = False) -> None:
+    """Nothing; the trajectory is at the path afterwards, whole or not at all, every number to the last bit.
+
+    First column `time` in s, then the signals. units: write `name [unit]` where the unit is known.
+    A name a spreadsheet would take for a formula gets an apostrophe before it, which the reader takes off.
+    Raises WaveformError for values that are not finite, a signal called `time`, and a place that cannot be written.
+    """
+    target = Path(path)
+    _check(trajectory, target, rows=0)
+    if "time" in trajectory.names:
+        raise WaveformError("a signal is called 'time' like the first column", where=str(target), hint="rename it")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with open(temporary, "w", encoding="utf-8", newline="") as file:
+            file.writelines(_csv_text(trajectory, units))
+        os.replace(temporary, target)
+    except OSError as error:
+        raise WaveformError(
+            "cannot write the file", where=str(target), got=error.strerror or str(error), hint="another folder"
+        ) from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def pick(path: Path, wanted: Sequence[str] | None, names: Sequence[str], *others: Sequence[str]) -> list[int]:
+    """Positions of the wanted signals among `names`, then among `others` (the same signals spelt another way).
+
+    All of them for None. Raises UnknownNameError with the nearest names.
+    """
+    if wanted is None:
+        return list(range(len(names)))
+    positions: dict[str, int] = {}
+    for spelling in (names, *others):
+        for i, name in enumerate(spelling):
+            positions.setdefault(name, i)
+    for name in wanted:
+        if name not in positions:
+            raise unknown_name("signal", name, names, where=str(path))
+    return [positions[name] for name in wanted]
+
+
+def event_rows(time: Array) -> NDArray[np.bool_]:
+    """(n,) the rows that stay when every instant keeps its first and its last row only: before and after an event.
+
+    time: (n,) in s, non-decreasing.
+    """
+    new = np.diff(time) != 0
+    first = np.concatenate([[True], new])
+    last = np.concatenate([new, [True]])
+    return np.asarray(first | last)
+
+
+def _csv_text(trajectory: Trajectory, units: bool) -> Iterator[str]:
+    labels = ["time [s]" if units else "time"]
+    for name, unit in zip(trajectory.names, trajectory.units, strict=True):
+        label = f"'{name}" if FORMULA_START.match(name) else name
+        labels.append(f"{label} [{unit}]" if units and unit else label)
+    header = StringIO()
+    csv.writer(header, lineterminator="\n").writerow(labels)
+    yield header.getvalue()
+    for start in range(0, len(trajectory), _WRITTEN_AT_ONCE):
+        part = slice(start, start + _WRITTEN_AT_ONCE)
+        table = np.column_stack([trajectory.time[part], trajectory.values[part]])
+        yield "".join(",".join(map(repr, row)) + "\n" for row in table.tolist())
+
+
+def _usable_file(path: str | os.PathLike[str]) -> Path:
+    file = Path(path)
+    try:
+        status = file.stat()
+    except (OSError, ValueError) as error:
+        missing = isinstance(error, FileNotFoundError)
+        what = "no such file" if missing else f"cannot open the file: {getattr(error, 'strerror', None) or error}"
+        raise WaveformError(what, where=str(file), hint="check the path, which is relative to the study") from None
+    if not stat.S_ISREG(status.st_mode):
+        got = "a folder" if stat.S_ISDIR(status.st_mode) else "something else"
+        raise WaveformError("not a file of waveforms", where=str(file), expected="a regular file", got=got)
+    if status.st_size > MAX_BYTES:
+        raise WaveformError(
+            "the file is too large",
+            where=str(file),
+            expected=f"at most {MAX_BYTES / 1e9:.1f} GB",
+            got=f"{status.st_size / 1e9:.1f} GB",
+            hint="export fewer signals or a shorter time",
+        )
+    if status.st_size == 0:
+        raise WaveformError("the file is empty", where=str(file), expected="waveforms", got="0 bytes")
+    if not os.access(file, os.R_OK):
+        raise WaveformError("no permission to read the file", where=str(file))
+    return file
+
+
+def _format_of(path: Path) -> Format:
+    known = formats().values()
+    for module in known:
+        if _recognised(module, path):
+            return module
+    for module in known:  # damaged: the format its name promises has the better message
+        if path.suffix.lower() in module.SUFFIXES:
+            return module
+    listed = "; ".join(f"{m.NAME} ({', '.join(m.SUFFIXES)}): {m.SUMMARY}" for m in known)
+    raise WaveformError(
+        "the file is of no known waveform format",
+        where=str(path),
+        expected=f"one of: {listed}",
+        got=f"'{path.suffix}'" if path.suffix else "no ending",
+        hint="export it as CSV from the tool that wrote it, or give it its usual ending",
+    )
+
+
+def _recognised(module: Format, path: Path) -> bool:
+    try:
+        return module.recognises(path)
+    except (OSError, InputError):
+        return False
+
+
+def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
+    """What every format promises, whatever its module checked already."""
+    where = str(path)
+    if len(found) < rows:
+        raise WaveformError("too few rows", where=where, expected=f"at least {rows}", got=f"{len(found)}")
+    if not np.isfinite(found.time).all():
+        raise WaveformError(f"the time in row {int(np.argmin(np.isfinite(found.time))) + 1} is not finite", where=where)
+    back = np.flatnonzero(np.diff(found.time) < 0)
+    if back.size:
+        t = found.time
+        raise WaveformError(
+            f"the time goes back from {t[back[0]]:g} s to {t[back[0] + 1]:g} s",
+            where=where,
+            expected="increasing times",
+        )
+    if not event_rows(found.time).all():
+        raise WaveformError("one time stands more than twice", where=where, expected="two rows at a jump")
+    bad = np.argwhere(~np.isfinite(found.values))
+    if bad.size:
+        row, column = bad[0]
+        raise WaveformError(
+            f"signal '{found.names[column]}' is not a finite number at {found.time[row]:g} s",
+            where=where,
+            got=str(found.values[row, column]),
+            hint="select the signals you need, or cut the time in which it is missing",
+        )
