@@ -1,0 +1,149 @@
+"""The individual mode: one group of parameters after the other, each on its own outputs and experiments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvdc_ident.errors import SimulationError, StudyError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.estimate import Executor, Progress, fit
+from hvdc_ident.fit.optimiser import Optimiser
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.residual_tests import residual_tests
+from hvdc_ident.fit.result import FitResult, Status
+from hvdc_ident.frozen import FrozenMap
+
+_WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parameters fitted together, on some outputs of some experiments; none named means all."""
+
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...] = ()
+    experiments: tuple[str, ...] = ()
+
+
+def fit_individually(
+    problem: Problem,
+    groups: Sequence[Group],
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    optimiser: Optimiser | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> FitResult:
+    """The fits of the groups, one after the other, as one result.
+
+    While one group is fitted the other free parameters are held: at their estimate if their turn has been, else at
+    their start. Every estimate is conditional on those. The status is the worst of the groups'; cost, RMSE and tests
+    are those of the whole problem with all estimates put in. A group that fails leaves its parameters at their start.
+    Raises StudyError or UnknownNameError for groups that do not fit the problem.
+    """
+    _check(problem, groups)
+    current = {f.name: f.start for f in problem.free}
+    results = []
+    for group in groups:
+        result = fit(
+            _part(problem, group, current),
+            starts=starts,
+            seed=seed,
+            optimiser=optimiser,
+            executor=executor,
+            progress=progress,
+        )
+        current |= {n: result.values[n] for n in group.parameters if n in result.values and n in result.estimates}
+        results.append(result)
+    return _merged(problem, results, current)
+
+
+def _check(problem: Problem, groups: Sequence[Group]) -> None:
+    free = [f.name for f in problem.free]
+    named = [n for g in groups for n in g.parameters]
+    for name in named:
+        if name not in free:
+            raise unknown_name("free parameter", name, free, where="fit groups")
+    if sorted(named) != sorted(free):
+        raise StudyError(
+            "groups must hold every free parameter once",
+            where="fit groups",
+            expected=", ".join(free),
+            got=", ".join(named),
+        )
+    names = [e.name for e in problem.fitted_experiments]
+    for group in groups:
+        for name in group.experiments:
+            if name not in names:
+                raise unknown_name("fitted experiment", name, names, where="fit groups")
+        for name in group.outputs:
+            if name not in problem.outputs:
+                raise unknown_name("measured output", name, problem.outputs, where="fit groups")
+
+
+def _part(problem: Problem, group: Group, current: dict[str, float]) -> Problem:
+    """The problem of one group alone."""
+    mine = tuple(f for f in problem.free if f.name in group.parameters)
+    others = {n: v for n, v in current.items() if n not in group.parameters}
+    why = dict.fromkeys(others, "fitted in a group of its own")
+    return replace(
+        problem,
+        experiments=tuple(e for e in (_seen(e, group) for e in problem.fitted_experiments) if e is not None),
+        free=mine,
+        held=problem.held | others,
+        why=problem.why | why,
+        conditional_on=FrozenMap({f.name: (*problem.conditional_on.get(f.name, ()), *others) for f in mine}),
+    )
+
+
+def _seen(experiment: Experiment, group: Group) -> Experiment | None:
+    """The experiment with the group's outputs alone; None where it has none or is not the group's."""
+    if experiment.measured is None or (group.experiments and experiment.name not in group.experiments):
+        return None
+    outputs = [o for o in experiment.outputs if not group.outputs or o in group.outputs]
+    return experiment.with_(measured=experiment.measured.select(outputs)) if outputs else None
+
+
+def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, float]) -> FitResult:
+    """The groups' results as one, judged on the whole problem."""
+    status: Status = min((r.status for r in results), key=_WORST.index)
+    message = "; ".join(f"group {i + 1}: {r.status}, {r.message}" for i, r in enumerate(results))
+    weights: dict[str, float] = {}
+    nuisance: FrozenMap = FrozenMap()
+    for r in results:
+        nuisance = nuisance | r.nuisance
+        for output, source in r.noise_source.items():
+            if source != "given":
+                weights[output] = next(s[output] for s in r.sigma.values() if output in s)
+    whole = problem.with_(weights={**problem.weights, **weights})
+    shift = {f"{e}:{n}": v.value for e, group in nuisance.items() for n, v in group.items()}
+    theta = np.array([current.get(u.name, shift.get(u.name, u.start)) for u in whole.unknowns])
+    result = FitResult(
+        status=status,
+        message=message,
+        fitted=tuple(f.name for f in problem.free),
+        held=FrozenMap({n: w for n, w in results[0].held.items() if n not in current}),
+        values=FrozenMap(whole.values(theta)),
+        estimates=FrozenMap(
+            {f.name: r.estimates[f.name] for f in problem.free for r in results if f.name in r.estimates}
+        ),
+        nuisance=nuisance,
+        rmse=whole.rmse(theta),
+        rmse_start=problem.rmse(problem.start),
+        noise_source=FrozenMap({k: v for r in results for k, v in r.noise_source.items()}),
+        sigma=whole.sigma,
+        rho=FrozenMap({k: v for r in results for k, v in r.rho.items()}),
+        effective_samples=FrozenMap({k: v for r in results for k, v in r.effective_samples.items()}),
+        correlation={k: v for r in results for k, v in r.correlation.items()},
+        starts=tuple(replace(s, group=i) for i, r in enumerate(results) for s in r.starts),
+    )
+    try:
+        blocks = whole.blocks(theta, derivatives=False)
+    except SimulationError as error:
+        return replace(result, status="failed", message=f"{message}; all estimates together: {error}")
+    cost = sum(0.5 * float(b.residual @ b.residual) for b in blocks)
+    return replace(result, cost=cost, residual_tests=residual_tests(blocks, whole.fitted_experiments))

@@ -1,0 +1,157 @@
+"""Bounded Levenberg-Marquardt on exact sensitivities; a simulation that fails shrinks the step.
+
+The step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the largest column norms so far
+(Moré 1978), with bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in
+Nielsen (1999), "Damping parameter in Marquardt's method".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.optimiser import OptimiserResult, Outcome
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.unknown import Coordinates
+from hvdc_ident.trajectory import Array
+
+NAME = "trust-region"
+SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"
+
+
+@dataclass(frozen=True)
+class TrustRegion:
+    """Options of the method; all tolerances are relative and without unit.
+
+    max_evaluations: simulations of the whole set a run may take. gradient: largest cosine between the residual and a
+    free column at which a point counts as stationary. reduction: smallest relative reduction of the cost worth a step.
+    step: smallest step in scaled coordinates. damping: first lambda.
+    """
+
+    max_evaluations: int = 200
+    gradient: float = 1e-10
+    reduction: float = 1e-13
+    step: float = 1e-11
+    damping: float = 1e-3
+
+    def run(self, problem: Problem, start: Array) -> OptimiserResult:
+        """Where the run from `start` ended: converged, max-evaluations, or failed with the reason."""
+        walk = _Walk(problem, self)
+        status, message = walk.go(start)
+        return OptimiserResult(walk.theta, walk.cost, status, message, walk.evaluations)
+
+
+OPTIMISER = TrustRegion
+
+
+@dataclass
+class _Walk:
+    """One run: the point it stands on and what it knows there."""
+
+    problem: Problem
+    options: TrustRegion
+    evaluations: int = 0
+    cost: float | None = None
+    failure: str = ""
+    theta: Array = field(init=False)
+    x: Array = field(init=False)
+    r: Array = field(init=False)
+    jacobian: Array = field(init=False)
+
+    def go(self, start: Array) -> tuple[Outcome, str]:
+        """The status and the reason the walk ended for."""
+        space = self.problem.coordinates
+        low, high = space.bounds
+        self.theta = np.asarray(start, dtype=float)
+        if not self._move(np.clip(space.scaled(self.theta), low, high), space):
+            return "failed", f"the start cannot be simulated: {self.failure}"
+        size = _norms(self.jacobian)
+        damping, growth = self.options.damping, 2.0
+        while self.evaluations < self.options.max_evaluations:
+            assert self.cost is not None
+            if self._stationary(low, high):
+                return "converged", "the gradient is zero"
+            size = np.maximum(size, _norms(self.jacobian))
+            p = _step(self.jacobian, self.r, damping, size, low - self.x, high - self.x)
+            predicted = self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
+            if predicted > 0 and np.abs(p).max() > self.options.step:
+                before = self.cost
+                if self._move(self.x + p, space, better_than=before):
+                    gain = (before - self.cost) / predicted
+                    damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
+                    damping = max(damping, 1e-14)
+                    if max(before - self.cost, predicted) <= self.options.reduction * before:
+                        return "converged", "the cost does not fall any more"
+                    continue
+            elif np.abs(p).max() <= self.options.step:
+                return self._standstill(size, low, high)
+            damping, growth = damping * growth, min(2.0 * growth, 1e6)
+        return "max-evaluations", f"no optimum within {self.options.max_evaluations} evaluations"
+
+    def _move(self, x: Array, space: Coordinates, better_than: float = np.inf) -> bool:
+        """Whether the run at x succeeds and is better; only then the walk stands there."""
+        theta = space.unscaled(x)
+        self.evaluations += 1
+        try:
+            r, jacobian = self.problem.residual(theta)
+        except SimulationError as error:
+            self.failure = str(error)
+            return False
+        self.failure = ""
+        cost = 0.5 * float(r @ r)
+        if not cost < better_than:
+            return False
+        self.x, self.theta, self.r, self.cost = space.scaled(theta), theta, r, cost
+        self.jacobian = jacobian * space.slope(theta)
+        return True
+
+    def _stationary(self, low: Array, high: Array) -> bool:
+        g = self.jacobian.T @ self.r
+        g[((self.x <= low) & (g > 0)) | ((self.x >= high) & (g < 0))] = 0.0
+        scale = _norms(self.jacobian) * np.linalg.norm(self.r)
+        return bool((np.abs(g) <= self.options.gradient * scale).all())
+
+    def _standstill(self, size: Array, low: Array, high: Array) -> tuple[Outcome, str]:
+        """What a step too small to count means: an optimum, a failing region or a gradient that does not fit."""
+        if self.failure:
+            return "failed", f"every step down leads to where the simulation fails: {self.failure}"
+        p = _step(self.jacobian, self.r, 1e-10, size, low - self.x, high - self.x)
+        assert self.cost is not None
+        left = self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
+        if left <= 1e-4 * self.cost + 1e-12 * self.r.size:
+            return "converged", "no smaller step lowers the cost"
+        return "failed", "stalled: the sensitivities promise a lower cost that no step reaches (a jump, or their error)"
+
+
+def _norms(jacobian: Array) -> Array:
+    """(p,): the columns' norms, 1 for a column of zeros."""
+    norms = np.linalg.norm(jacobian, axis=0)
+    return np.where(norms > 0, norms, 1.0)
+
+
+def _step(jacobian: Array, r: Array, damping: float, size: Array, low: Array, high: Array) -> Array:
+    """The p in [low, high] that minimises |r + J p|^2 + damping |size p|^2, (p,).
+
+    Unknowns that would leave are put on their bound one after the other, the one that leaves first before the rest.
+    """
+    n = size.size
+    q, triangle = np.linalg.qr(jacobian)
+    matrix = np.vstack([triangle, np.sqrt(damping) * np.diag(size)])
+    target = np.concatenate([-(q.T @ r), np.zeros(n)])
+    g = jacobian.T @ r
+    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)))
+    p = np.zeros(n)
+    while free.any():
+        trial = p.copy()
+        trial[free] = np.linalg.lstsq(matrix[:, free], target - matrix[:, ~free] @ p[~free], rcond=None)[0]
+        outside = (trial < low) | (trial > high)
+        if not outside.any():
+            return trial
+        limit = np.where(trial < low, low, high)
+        share = np.where(outside, limit / np.where(outside, trial, 1.0), np.inf)
+        first = int(np.argmin(share))
+        p[first] = limit[first]
+        free[first] = False
+    return p

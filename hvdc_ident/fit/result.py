@@ -1,0 +1,116 @@
+"""What a fit found, and its forms: the JSON of a stage and the values to paste into a study."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from hvdc_ident.frozen import FrozenMap
+
+Status = Literal["converged", "at-bound", "two-optima", "not-converged", "failed"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimated quantity, everything in `unit`.
+
+    std: standard deviation, corrected for autocorrelated residuals; std_raw: as if they were independent; None where
+    there is none, with the reason. ci95: the 95 % interval; an end that is None is not known.
+    method: "covariance" (t times std), "one-sided" (on a bound: the bound and a limit from the curvature) or "none".
+    conditional_on: parameters held without which this one could not be told.
+    """
+
+    value: float
+    std: float | None = None
+    ci95: tuple[float | None, float | None] | None = None
+    method: str = "none"
+    conditional_on: tuple[str, ...] = ()
+    std_raw: float | None = None
+    unit: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class StartOutcome:
+    """Where one start of the multistart ended; values by unknown, cost in final weights, None where inadmissible."""
+
+    start: FrozenMap[float]
+    end: FrozenMap[float]
+    cost: float | None
+    status: str
+    message: str
+    evaluations: int
+    group: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """The outcome of a fit; `to_dict` is the JSON.
+
+    fitted: names of the free parameters. held: the reason for each other one. values: fitted ones and those held at
+    given values, as the model takes them. estimates: by parameter. nuisance: by experiment and nuisance.
+    cost: half the sum of squared residuals in units of sigma, None where the fit failed.
+    rmse, rmse_start: by output and experiment, at the optimum and at the start, in the output's unit.
+    noise_source: by output, in words. sigma: standard deviation by experiment and output, in the output's unit.
+    rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
+    correlation: between the estimates. residual_tests: by output and experiment. starts: outcomes of the multistart.
+    per_experiment: statistics over fits to single experiments, where they were made.
+    """
+
+    status: Status
+    message: str
+    fitted: tuple[str, ...]
+    held: FrozenMap[str]
+    values: FrozenMap[float]
+    estimates: FrozenMap[Estimate] = field(default_factory=FrozenMap)
+    nuisance: FrozenMap[FrozenMap[Estimate]] = field(default_factory=FrozenMap)
+    cost: float | None = None
+    chi2_per_dof: float | None = None
+    rmse: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    rmse_start: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    noise_source: FrozenMap[str] = field(default_factory=FrozenMap)
+    sigma: FrozenMap[FrozenMap[float]] = field(default_factory=FrozenMap)
+    rho: FrozenMap[float] = field(default_factory=FrozenMap)
+    effective_samples: FrozenMap[float] = field(default_factory=FrozenMap)
+    correlation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    residual_tests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    starts: tuple[StartOutcome, ...] = ()
+    per_experiment: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as JSON takes it: full precision, None for what is not finite."""
+        return {f.name: plain(getattr(self, f.name)) for f in fields(self)}
+
+    def to_toml_values(self) -> str:
+        """The text of a [model.values] table: fitted and held parameters, full precision, with units as comments."""
+        lines = ["[model.values]"]
+        for name, value in self.values.items():
+            unit = self.estimates[name].unit if name in self.estimates else ""
+            lines.append(f"{_key(name)} = {float(value)!r}" + (f"  # {unit}" if unit else ""))
+        return "\n".join(lines) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """The value in dicts, lists, strings and finite numbers; None for infinity and for what is not a number."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _key(name: str) -> str:
+    """The name as a TOML key."""
+    bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
+    return name if bare else json.dumps(name)

@@ -1,0 +1,62 @@
+"""Where the runs of a multistart begin, and which of their ends are one optimum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.unknown import Free
+from hvdc_ident.trajectory import Array
+
+DISTINCT = 1.92
+"""Half the 95 % quantile of chi-square with one degree of freedom: costs that differ by less are as good."""
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """An optimum: (p,) theta and its cost."""
+
+    theta: Array
+    cost: float
+
+
+def latin_hypercube(unknowns: Sequence[Free], count: int, seed: int) -> list[Array]:
+    """`count` starts, (p,) each, spread over the bounds (even in the logarithm where an unknown is scaled so)."""
+    if count < 1:
+        return []
+    from scipy.stats import qmc
+
+    shares = qmc.LatinHypercube(d=len(unknowns), seed=np.random.default_rng(seed)).random(count)
+    return [np.array([u.draw(float(s)) for u, s in zip(unknowns, row, strict=True)]) for row in shares]
+
+
+def distinct(problem: Problem, ends: Sequence[Optimum], worth: float = 1.0) -> list[Optimum]:
+    """The ends that are optima of their own, best first; of the others the best of each basin.
+
+    Two are one where no coordinate differs by a thousandth of its range, or where the cost between them on the straight
+    line (in scaled coordinates) never rises by DISTINCT above the worse one. worth: independent samples per sample.
+    """
+    kept: list[Optimum] = []
+    for end in sorted(ends, key=lambda o: o.cost):
+        if not any(_same(problem, end, other, worth) for other in kept):
+            kept.append(end)
+    return kept
+
+
+def _same(problem: Problem, a: Optimum, b: Optimum, worth: float) -> bool:
+    space = problem.coordinates
+    x, y = space.scaled(a.theta), space.scaled(b.theta)
+    ranges = np.array([np.log(u.drawn[1] / u.drawn[0]) if u.log else 1.0 for u in problem.unknowns])
+    if (np.abs(x - y) <= 1e-3 * ranges).all():
+        return True
+    if (max(a.cost, b.cost) - min(a.cost, b.cost)) * worth >= DISTINCT:
+        return False
+    barrier = max(a.cost, b.cost) + DISTINCT / worth
+    try:
+        return all(problem.cost(space.unscaled(x + s * (y - x))) < barrier for s in np.linspace(0.0, 1.0, 9)[1:-1])
+    except SimulationError:
+        return False

@@ -1,0 +1,118 @@
+"""A quantity to be estimated: where it starts, where it may go, how it is scaled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.errors import StudyError
+from hvdc_ident.parameters import Parameter
+from hvdc_ident.trajectory import Array
+
+LOG_FROM = 10.0
+"""From this ratio of bounds on, a positive unknown is scaled by its logarithm."""
+
+
+@dataclass(frozen=True)
+class Free:
+    """An unknown of a fit, everything in its own unit.
+
+    start: first guess. min, max: bounds of the search (infinite: none). scale: a typical size, 0 means |start|, or 1.
+    Scaling: by logarithm where min > 0 and max/min > 10 (a gain known to a decade), else by the range (0 may be
+    admissible), else, without bounds, by the typical size. Raises StudyError where the bounds do not hold the start.
+    """
+
+    name: str
+    start: float
+    min: float = -math.inf
+    max: float = math.inf
+    scale: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("start", "min", "max", "scale"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        if not (self.min < self.max and self.min <= self.start <= self.max and math.isfinite(self.start)):
+            raise StudyError(
+                f"the start or the bounds of '{self.name}' are wrong",
+                expected="min < max and a finite start between them",
+                got=f"start {self.start:g}, min {self.min:g}, max {self.max:g}",
+                hint="hold the parameter if it is not to move",
+            )
+
+    @classmethod
+    def of(cls, name: str, parameter: Parameter, **changes: float) -> Free:
+        """The unknown that a model's parameter is, with some of start, min, max, scale changed."""
+        fields = {"start": parameter.value, "min": parameter.min, "max": parameter.max, "scale": parameter.scale}
+        return cls(name, **{**fields, **changes})
+
+    @property
+    def log(self) -> bool:
+        """Whether the unknown is scaled by its logarithm."""
+        return self.min > 0 and self.max / self.min > LOG_FROM
+
+    @property
+    def size(self) -> float:
+        """A typical size in the unknown's unit, never 0."""
+        return self.scale or abs(self.start) or 1.0
+
+    @property
+    def span(self) -> float:
+        """The range between the bounds, or the typical size where a bound is infinite; in the unknown's unit."""
+        width = self.max - self.min
+        return width if math.isfinite(width) else self.size
+
+    @property
+    def drawn(self) -> tuple[float, float]:
+        """Where starts are drawn from: the bounds; for an infinite one ten typical sizes from the start."""
+        low = self.min if math.isfinite(self.min) else min(self.start, self.max) - 10.0 * self.size
+        high = self.max if math.isfinite(self.max) else max(self.start, self.min) + 10.0 * self.size
+        return low, high
+
+    def draw(self, share: float) -> float:
+        """The value at a share in [0, 1] of where starts are drawn from, even in the scaled unknown."""
+        low, high = self.drawn
+        value = low * (high / low) ** share if self.log else low + share * (high - low)
+        return float(min(max(value, self.min), self.max))
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """The scaled coordinates x of some unknowns: x = ln(theta) or theta/span, of order 1 each."""
+
+    unknowns: tuple[Free, ...]
+
+    @property
+    def log(self) -> Array:
+        """(p,) bool: which are logarithms."""
+        return np.array([u.log for u in self.unknowns], dtype=bool)
+
+    @property
+    def span(self) -> Array:
+        """(p,): the length of a coordinate's unit where it is not a logarithm, in the unknown's unit."""
+        return np.array([u.span for u in self.unknowns])
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """(p,), (p,): the bounds in scaled coordinates."""
+        low, high = (np.array([getattr(u, side) for u in self.unknowns]) for side in ("min", "max"))
+        return self.scaled(low), self.scaled(high)
+
+    def scaled(self, theta: Array) -> Array:
+        """x of theta, (p,)."""
+        return np.where(self.log, np.log(np.where(self.log, theta, 1.0)), theta / self.span)
+
+    def unscaled(self, x: Array) -> Array:
+        """Theta of x, (p,), inside the bounds to the last digit."""
+        theta = np.where(self.log, np.exp(np.where(self.log, x, 0.0)), x * self.span)
+        low, high = (np.array([getattr(u, side) for u in self.unknowns]) for side in ("min", "max"))
+        x_low, x_high = self.bounds
+        with np.errstate(invalid="ignore"):
+            theta = np.where(x <= x_low + 1e-14 * (1.0 + np.abs(x_low)), low, theta)
+            theta = np.where(x >= x_high - 1e-14 * (1.0 + np.abs(x_high)), high, theta)
+        return np.clip(theta, low, high)
+
+    def slope(self, theta: Array) -> Array:
+        """dtheta/dx, (p,)."""
+        return np.where(self.log, theta, self.span)

@@ -1,0 +1,131 @@
+"""The optimiser: bounds, failing regions, scaling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import UnknownNameError
+from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit.optimisers import catalogue, optimiser
+from hvdc_ident.fit.optimisers.trust_region import TrustRegion
+from tests.fit.simulators import Closed, decay, line, parameters, recorded
+
+T = np.linspace(0.0, 3.0, 31)
+
+
+def problem(fails=lambda p: False, **bounds) -> Problem:
+    """The decay 2 exp(-1.5 t) to be found, without noise."""
+    simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay}, fails)
+    limits = {"a": (0.1, 10.0), "k": (0.0, 20.0)} | bounds
+    free = (Free("a", 1.0, *limits["a"]), Free("k", 1.0, *limits["k"]))
+    return Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
+
+
+def test_the_catalogue_names_every_file():
+    assert "trust-region" in catalogue()
+    assert all(m.SUMMARY and m.OPTIMISER().run for m in catalogue().values())
+    assert optimiser("trust-region") == TrustRegion()
+    with pytest.raises(UnknownNameError, match="did you mean 'trust-region'"):
+        optimiser("trust-regon")
+
+
+@pytest.mark.parametrize("start", [(1.0, 1.0), (10.0, 0.0), (0.1, 20.0), (0.1, 0.0)])
+def test_it_recovers_exact_values_without_noise(start):
+    run = TrustRegion().run(problem(), np.array(start))
+    assert run.status == "converged", run.message
+    assert run.theta == pytest.approx([2.0, 1.5], rel=1e-9)
+    assert run.evaluations < 40
+
+
+def test_an_optimum_outside_ends_on_the_bound_with_the_others_at_their_best():
+    run = TrustRegion().run(problem(k=(0.0, 1.2)), np.array([1.0, 1.0]))
+    assert run.status == "converged"
+    assert run.theta[1] == 1.2
+    e, y = np.exp(-1.2 * T), 2.0 * np.exp(-1.5 * T)
+    assert run.theta[0] == pytest.approx(y @ e / (e @ e), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_bounded_linear_problems_end_as_an_exhaustive_search_does(seed):
+    from scipy.optimize import lsq_linear
+
+    rng = np.random.default_rng(seed)
+    p = 5
+    matrix = rng.normal(size=(12, p)) @ (np.eye(p) + 0.8 * rng.normal(size=(p, p)))
+    y = rng.normal(size=12)
+    names = [f"b{i}" for i in range(p)]
+
+    def product(t, values):
+        return matrix @ [values[n] for n in names], {n: matrix[:, i] for i, n in enumerate(names)}
+
+    simulator = Closed(parameters(**dict.fromkeys(names, 0.0)), {"y": product})
+    free = tuple(Free(n, 0.0, -0.1, 0.1) for n in names)
+    one = Problem(simulator, (recorded("e", np.arange(12.0), {"y": 1.0}, y=y),), free)
+    run = TrustRegion().run(one, one.start)
+    best = lsq_linear(matrix, y, (-0.1, 0.1), method="bvls", tol=1e-14)
+    assert run.status == "converged"
+    assert run.theta == pytest.approx(best.x, abs=1e-7)
+
+
+def test_it_walks_round_where_simulations_fail():
+    run = TrustRegion().run(problem(fails=lambda p: p["k"] > 1.6), np.array([9.0, 0.01]))
+    assert run.status == "converged"
+    assert run.theta == pytest.approx([2.0, 1.5], rel=1e-8)
+
+
+def test_an_optimum_behind_a_failing_region_is_a_failure_with_its_reason():
+    run = TrustRegion().run(problem(fails=lambda p: p["k"] > 1.2), np.array([1.0, 1.0]))
+    assert run.status == "failed"
+    assert "every step down leads to where the simulation fails" in run.message
+    assert "the run does not reach its end" in run.message
+    assert run.cost is not None
+    assert run.theta[1] <= 1.2
+
+
+def test_a_start_that_fails_has_no_cost():
+    run = TrustRegion().run(problem(fails=lambda p: True), np.array([1.0, 1.0]))
+    assert (run.status, run.cost, run.evaluations) == ("failed", None, 1)
+    assert run.message.startswith("the start cannot be simulated")
+
+
+def test_it_stops_at_its_evaluations():
+    run = TrustRegion(max_evaluations=3).run(problem(), np.array([0.1, 20.0]))
+    assert (run.status, run.evaluations) == ("max-evaluations", 3)
+
+
+def test_sensitivities_that_are_wrong_do_not_pass_as_an_optimum():
+    def wrong(t, p):
+        y, g = line(t, p)
+        return y, {n: -v for n, v in g.items()}
+
+    simulator = Closed(parameters(a=0.0, b=0.0), {"y": wrong})
+    free = (Free("a", 0.0, -5, 5), Free("b", 0.0, -5, 5))
+    one = Problem(simulator, (recorded("e", T, {"y": 1.0}, y=1 + T),), free)
+    run = TrustRegion().run(one, one.start)
+    assert run.status == "failed"
+    assert "stalled" in run.message
+
+
+def test_an_error_of_the_simulation_does_not_hide_the_optimum():
+    def rough(t, p):
+        y, g = decay(t, p)
+        return y * (1 + 1e-7 * np.sin(1e9 * p["k"] + 1e9 * p["a"])), g
+
+    simulator = Closed(parameters(a=1.0, k=1.0), {"y": rough})
+    y = 2 * np.exp(-1.5 * T) + 0.01 * np.sin(20 * T)
+    free = (Free("a", 1.0, 0.1, 10), Free("k", 1.0, 0, 20))
+    one = Problem(simulator, (recorded("e", T, {"y": 0.01}, y=y),), free)
+    run = TrustRegion().run(one, one.start)
+    assert run.status == "converged"
+    assert run.evaluations < 80
+
+
+def test_scaling_follows_the_bounds():
+    assert Free("a", 2.0, 1.0, 11.0).log
+    assert not Free("a", 2.0, 1.0, 9.0).log
+    assert not Free("a", 2.0, 0.0, 9.0).log
+    assert Free("a", 2.0, 0.0, 8.0).span == 8.0
+    assert Free("a", 2.0).span == 2.0
+    assert Free("a", 1.0, 0.01, 100.0).draw(0.5) == pytest.approx(1.0)
+    assert Free("a", 1.0, 0.0).drawn == (0.0, 11.0)
