@@ -1,0 +1,126 @@
+"""Stages put to work on a study: what runs first, what is written, what need not be done again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from hvdc_ident.errors import ComputationError
+from hvdc_ident.files import digest, json_text, plain, write_text
+from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
+from hvdc_ident.study.study import Study
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Done:
+    """A stage that ran. data: its JSON. failed: why it did not come to its end, empty where it did. fresh: not kept from before."""
+
+    stage: Stage
+    data: Mapping[str, Any]
+    failed: str
+    fresh: bool
+
+
+def run_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
+    """The stage's result, written to the folder together with those of the stages it builds on.
+
+    Those are kept where they stand in the folder for the same study, software and seed; the stage itself runs anew.
+    Raises InputError, with nothing written, or ComputationError.
+    """
+    wanted = stage(name)
+    earlier: dict[str, Any] = {}
+    for before in wanted.after:
+        earlier[before] = _kept_or_run(study, stage(before), folder, options).data
+    return _run(study, wanted, folder, options, earlier)
+
+
+def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
+    """Every stage the study asks for, in order, written to the folder; those that stand there unchanged are kept.
+
+    A stage that fails ends the run of those that build on it; the others run.
+    """
+    done: dict[str, Done] = {}
+    for wanted in (s for s in stages() if s.wanted(study)):
+        if any(done[b].failed for b in wanted.after if b in done):
+            continue
+        done[wanted.name] = _kept_or_run(study, wanted, folder, options)
+    return list(done.values())
+
+
+def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options) -> Done:
+    kept = _kept(study, wanted, folder, options)
+    if kept is not None:
+        return Done(wanted, kept, "", fresh=False)
+    earlier = {b: _kept_or_run(study, stage(b), folder, options).data for b in wanted.after}
+    return _run(study, wanted, folder, options, earlier)
+
+
+def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any]) -> Done:
+    try:
+        outcome = wanted.run(study, options, earlier)
+    except ComputationError as e:
+        outcome = Outcome({"status": "failed", "message": str(e)}, failed=str(e))
+    heading = heading_of(study, options.seed)
+    mark = "" if outcome.failed else _mark(study, wanted, options)
+    data = plain({**heading, "stage": wanted.name, "fingerprint": mark, "files": list(outcome.files), **outcome.data})
+    for name, text in outcome.files.items():
+        write_text(folder / name, text)
+    write_text(folder / wanted.file, json_text(data))
+    return Done(wanted, data, outcome.failed, fresh=True)
+
+
+def heading_of(study: Study, seed: int) -> dict[str, Any]:
+    """What every JSON begins with: schema, study, model, software, seed, and the hashes of the files read."""
+    return {
+        "schema": SCHEMA,
+        "study": study.name,
+        "model": study.model.name,
+        "software": f"hvdc_ident {version()}",
+        "seed": seed,
+        "sources": dict(study.sources),
+    }
+
+
+def version() -> str:
+    """The version of the installed package, or "0+unknown"."""
+    try:
+        return metadata.version("hvdc_ident")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"
+
+
+def _kept(study: Study, wanted: Stage, folder: Path, options: Options) -> dict[str, Any] | None:
+    """The stage's JSON in the folder, where it is whole and nothing that decides it has changed."""
+    try:
+        data = json.loads((folder / wanted.file).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if (
+        not isinstance(data, dict)
+        or not data.get("fingerprint")
+        or data["fingerprint"] != _mark(study, wanted, options)
+    ):
+        return None
+    files = data.get("files")
+    return data if isinstance(files, list) and all((folder / str(f)).is_file() for f in files) else None
+
+
+def _mark(study: Study, wanted: Stage, options: Options) -> str:
+    """A hash of all that decides a stage's result: the study, its files, the seed, this software."""
+    parts = [wanted.name, *(f"{n}={h}" for n, h in study.sources.items()), str(options.seed), version(), _code()]
+    return digest("\n".join(parts).encode())
+
+
+@cache
+def _code() -> str:
+    """A hash of the package's own source: another state of it may find other numbers."""
+    root = Path(__file__).resolve().parents[1]
+    files = sorted(p for p in root.rglob("*.py"))
+    return digest("\n".join(f"{p.relative_to(root).as_posix()} {digest(p.read_bytes())}" for p in files).encode())

@@ -1,0 +1,283 @@
+"""Experiments from the study's tables and the data files they name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.experiment import Experiment, InputSignal
+from hvdc_ident.files import digest
+from hvdc_ident.formats import read_waveforms
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.study import schema
+from hvdc_ident.study.units import factor, same_unit
+from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor
+
+TIME_SHIFT = "time-shift"
+
+
+@dataclass(frozen=True)
+class NoiseNote:
+    """The standard deviation an output's noise is taken to have, in its unit, and where that comes from.
+
+    source: "given" or "estimated"; "floor": the record is deterministic, weights come from the misfit of the fit.
+    """
+
+    std: float
+    source: Literal["given", "estimated", "floor"]
+
+
+@dataclass
+class Recordings:
+    """The data files of a study, each read once. digests: sha256 by the name in the study."""
+
+    folder: Path
+    digests: dict[str, str] = field(default_factory=dict)
+    _read: dict[str, Trajectory] = field(default_factory=dict)
+
+    def load(self, columns: Mapping[str, Mapping[str, Sequence[str]]]) -> None:
+        """Nothing; the files are read. columns: by file, by experiment, the columns wanted."""
+        for name, wanted in columns.items():
+            path = self.folder / name
+            try:
+                self._read[name] = read_waveforms(path, dict.fromkeys(c for cs in wanted.values() for c in cs))
+            except InputError as e:
+                raise self._placed(e, path, wanted) from None
+            self.digests[name] = digest(path.read_bytes())
+
+    def __getitem__(self, name: str) -> Trajectory:
+        """The columns read from a file."""
+        return self._read[name]
+
+    def _placed(self, error: InputError, path: Path, wanted: Mapping[str, Sequence[str]]) -> InputError:
+        """The error with the first experiment that meets it."""
+        for experiment, columns in wanted.items():
+            try:
+                read_waveforms(path, columns)
+            except InputError as e:
+                placed = e.at(f"experiment '{experiment}'")
+                return placed if isinstance(placed, InputError) else error
+        return error
+
+
+def read_experiments(
+    tables: Sequence[schema.Experiment], model: Model, recordings: Recordings, where: str
+) -> tuple[tuple[Experiment, ...], FrozenMap[FrozenMap[NoiseNote]]]:
+    """The experiments, and where the noise of each output comes from."""
+    wanted: dict[str, dict[str, list[str]]] = {}
+    seen: set[str] = set()
+    for table in tables:
+        place = f"{where}, experiment '{table.name}'"
+        if table.name.lower() in seen:
+            raise StudyError(
+                "two experiments of one name", where=place, expected="a name of its own, for files are named after it"
+            )
+        seen.add(table.name.lower())
+        _check_names(table, model, place)
+        columns = [column for _, column in _channels(table)]
+        wanted.setdefault(table.data, {})[table.name] = list(dict.fromkeys(columns))
+    try:
+        recordings.load(wanted)
+    except InputError as e:
+        raise e.at(where) from None
+    found, notes = [], {}
+    for table in tables:
+        place = f"{where}, experiment '{table.name}'"
+        try:
+            experiment, notes[table.name] = _experiment(table, model, recordings[table.data], place)
+        except InputError as e:
+            raise (e if place in e.where else e.at(place)) from None
+        found.append(experiment)
+    return tuple(found), FrozenMap(notes)
+
+
+def _check_names(table: schema.Experiment, model: Model, place: str) -> None:
+    """Raises where the table names what the model does not have."""
+    signals = [*table.inputs, *table.outputs, *table.drive]
+    _known("input", table.inputs, model.inputs, f"{place}.inputs")
+    _known("output", table.outputs, model.outputs, f"{place}.outputs")
+    _known("slot", table.drive, model.slots, f"{place}.drive")
+    _known("measured output", table.noise, table.outputs, f"{place}.noise")
+    _known("measured output", table.instrument, table.outputs, f"{place}.instrument")
+    _known("signal of the experiment", table.columns, ["time", *signals], f"{place}.columns")
+    if any(n in model.parameters and n not in model.inputs for n in table.values):
+        raise StudyError(
+            "a parameter among the inputs held constant",
+            where=f"{place}.values",
+            expected="inputs",
+            hint="[model.values] for parameters",
+        )
+    _known("input", table.values, model.inputs, f"{place}.values")
+    _known("nuisance", table.nuisance, [TIME_SHIFT, *model.inputs], f"{place}.nuisance")
+    if isinstance(table.interpolation, dict):
+        _known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
+    for kind, names in (("values", table.values), ("drive", table.drive)):
+        if both := [n for n in names if n in table.inputs]:
+            raise StudyError(f"'{both[0]}' stands in inputs and in {kind}", where=place, expected="one of them")
+
+
+def _known(kind: str, names: Iterable[str], known: Collection[str], where: str) -> None:
+    for name in names:
+        if name not in known:
+            raise unknown_name(kind, name, known, where=where)
+
+
+def _channels(table: schema.Experiment) -> list[tuple[str, str]]:
+    """Signal of the model and recorded column, for inputs, driven slots and outputs; a column may serve twice."""
+    pairs = []
+    for signal, column in (*table.inputs.items(), *table.drive.items(), *table.outputs.items()):
+        line = table.columns.get(signal)
+        other = line.name if line else None
+        if other is not None and column not in (signal, other):
+            raise StudyError(
+                f"two columns for '{signal}'",
+                where=f"experiment '{table.name}'",
+                expected="one of them",
+                got=f"'{column}' and '{other}'",
+            )
+        pairs.append((signal, other or column))
+    return pairs
+
+
+def _experiment(
+    table: schema.Experiment, model: Model, data: Trajectory, place: str
+) -> tuple[Experiment, FrozenMap[NoiseNote]]:
+    columns = dict(_channels(table))
+    time = _time(table, data, place)
+    scaled = {s: _scaled(table, model, s, c, data, place) for s, c in columns.items()}
+    inputs = {s: _input(table, s, time, scaled[s], place) for s in (*table.inputs, *table.drive)}
+    outputs = tuple(table.outputs)
+    event = _event(table, inputs, time, place)
+    window = _window(table, time, place)
+    notes = {o: _noise(table.noise.get(o), time, scaled[o], event) for o in outputs}
+    measured = Trajectory(
+        time, np.column_stack([scaled[o] for o in outputs]), outputs, tuple(model.outputs[o].unit for o in outputs)
+    )
+    experiment = Experiment(
+        name=table.name,
+        time=time,
+        inputs=FrozenMap(inputs),
+        values=FrozenMap(table.values),
+        measured=measured,
+        noise=FrozenMap({o: n.std for o, n in notes.items() if n.source != "floor"}),
+        event=event,
+        window=window,
+        role=table.role,
+        drive=tuple(table.drive),
+        instrument=FrozenMap({o: _instrument(line) for o, line in table.instrument.items()}),
+        nuisance=tuple(dict.fromkeys(table.nuisance)),
+    )
+    return experiment, FrozenMap(notes)
+
+
+def _time(table: schema.Experiment, data: Trajectory, place: str) -> Array:
+    """The rows' instants in s."""
+    line = table.columns.get("time")
+    if line is None:
+        return data.time
+    if line.name is not None:
+        raise StudyError(
+            "the time is the file's first column", where=f"{place}.columns.time", expected="unit or scale alone"
+        )
+    scale = line.scale if line.scale is not None else factor(line.unit or "s", "s")
+    if scale is None or scale <= 0:
+        raise StudyError(
+            "no unit of time",
+            where=f"{place}.columns.time",
+            expected="s, ms, us, or a scale above 0",
+            got=f"{line.unit or line.scale}",
+        )
+    return data.time * scale
+
+
+def _scaled(table: schema.Experiment, model: Model, signal: str, column: str, data: Trajectory, place: str) -> Array:
+    """The column in the model's unit. Raises where the units contradict each other and no scale is given."""
+    line = table.columns.get(signal) or schema.Column()
+    recorded = line.unit if line.unit is not None else data.unit(column)
+    if line.unit is not None and data.unit(column) and not same_unit(line.unit, data.unit(column)):
+        raise StudyError(
+            f"the unit of column '{column}' contradicts the file's",
+            where=f"{place}.columns.{signal}",
+            expected=f"'{data.unit(column)}' as in {table.data}",
+            got=f"'{line.unit}'",
+        )
+    if line.scale is not None:
+        if line.scale == 0:
+            raise StudyError(
+                "a scale of 0 leaves nothing", where=f"{place}.columns.{signal}", expected="a number that is not 0"
+            )
+        return data[column] * line.scale
+    unit = _unit(model, signal)
+    if not recorded or not unit or same_unit(recorded, unit):
+        return data[column]
+    by = factor(recorded, unit)
+    raise StudyError(
+        f"column '{column}' is in another unit than the model's '{signal}'",
+        where=f"{place}.columns.{signal}" if line.unit is not None else f"{place}, {table.data}",
+        expected=f"'{unit}'",
+        got=f"'{recorded}'",
+        hint=f'columns = {{{signal} = {{unit = "{recorded}", scale = {f"{by:g}" if by else "... (value in the model = scale x recorded)"}}}}}',
+    )
+
+
+def _unit(model: Model, signal: str) -> str:
+    for table in (model.inputs, model.outputs, model.signals, model.states, model.algebraic):
+        if signal in table:
+            return str(table[signal].unit)  # type: ignore[index]
+    return ""
+
+
+def _input(table: schema.Experiment, signal: str, time: Array, values: Array, place: str) -> InputSignal:
+    kind = table.interpolation
+    chosen = kind.get(signal) if isinstance(kind, dict) else kind
+    try:
+        return input_signal(time, values, chosen)
+    except InputError as e:
+        raise e.at(f"{place}, signal '{signal}'") from None
+
+
+def _event(table: schema.Experiment, inputs: Mapping[str, InputSignal], time: Array, place: str) -> float | None:
+    if table.event is None:
+        return event_time(inputs)
+    if not time[0] <= table.event <= time[-1]:
+        raise StudyError(
+            "the event lies outside the record",
+            where=f"{place}.event",
+            expected=f"{time[0]:g} to {time[-1]:g} s",
+            got=f"{table.event:g} s",
+        )
+    return table.event
+
+
+def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, float] | None:
+    if table.window is None:
+        return None
+    low, high = table.window
+    if int(((time >= low) & (time <= high)).sum()) < 2:
+        raise StudyError(
+            "the window holds fewer than two rows",
+            where=f"{place}.window",
+            expected=f"a part of {time[0]:g} to {time[-1]:g} s",
+            got=f"[{low:g}, {high:g}]",
+        )
+    return low, high
+
+
+def _noise(given: float | None, time: Array, values: Array, event: float | None) -> NoiseNote:
+    """The larger of what is given, or else estimated, and the floor; where the floor is larger the data are deterministic."""
+    floor = noise_floor(values)
+    std = given if given is not None else noise_estimate(time, values, event)
+    if std <= floor:
+        return NoiseNote(floor, "floor")
+    return NoiseNote(std, "given" if given is not None else "estimated")
+
+
+def _instrument(line: schema.Instrument) -> FrozenMap[float]:
+    return FrozenMap({k: float(v) for k, v in line.model_dump(by_alias=True, exclude_none=True).items()})

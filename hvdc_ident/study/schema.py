@@ -1,0 +1,208 @@
+"""The study file, table by table, as it is written: types, ranges and known keys; names are looked up later."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, StringConstraints, model_validator
+
+
+def _column_by_name(value: Any) -> Any:
+    """A list of names as a table from each name to the column of the same name."""
+    if not isinstance(value, list):
+        return value
+    doubled = sorted({str(v) for v in value if value.count(v) > 1})
+    if doubled:
+        raise ValueError(f"'{doubled[0]}' is listed twice")
+    return {v if isinstance(v, str) else _not_text(v): v for v in value}
+
+
+def _known_interpolation(value: Any) -> Any:
+    """The value, once what is given per input is known to be right (a union of types could not say which is wrong)."""
+    for name, kind in value.items() if isinstance(value, dict) else ():
+        if kind not in ("hold", "linear"):
+            raise ValueError(f"{name}: an unknown interpolation {kind!r}, neither 'hold' nor 'linear'")
+    return value
+
+
+def _effect_names(value: Any) -> Any:
+    """The value, once it is "all" or a list of names."""
+    if value == "all" or (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
+        return value
+    raise ValueError(f'effects: neither "all" nor a list of names: {value!r}')
+
+
+def _not_text(value: Any) -> str:
+    raise ValueError(f"names are text in quotes, not {value!r}")
+
+
+Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+FileName = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^\w[\w .+-]*$")]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
+Names = Annotated[list[Name], Field(min_length=1)]
+Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name)]
+Interpolation = Literal["hold", "linear"]
+
+
+class Table(BaseModel):
+    """A table of the study file: an unknown key, a text for a number and a number that is not finite are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=False, protected_namespaces=())
+
+
+class Effect(Table):
+    """[[model.effect]]: an effect that the model has from the start."""
+
+    effect: Name
+    at: Annotated[Names, BeforeValidator(lambda v: [v] if isinstance(v, str) else v)]
+    parameters: dict[Name, FiniteFloat] = {}
+    source: Name | None = Field(default=None, alias="from")
+
+
+class Model(Table):
+    """[model]: where the model comes from and what differs from it."""
+
+    source: Name
+    parameterisation: Name | None = None
+    values: dict[Name, FiniteFloat] = {}
+    effect: list[Effect] = []
+
+
+class Candidate(Table):
+    """One line of [parameters]: a parameter that may be estimated; what is left out is the model's own."""
+
+    start: FiniteFloat | None = None
+    min: FiniteFloat | None = None
+    max: FiniteFloat | None = None
+
+
+class Column(Table):
+    """One line of an experiment's `columns`: the recorded column of a signal and how it gets the model's unit."""
+
+    name: Name | None = None
+    unit: Annotated[str, StringConstraints(max_length=50)] | None = None
+    scale: FiniteFloat | None = None
+
+
+class Instrument(Table):
+    """One line of an experiment's `instrument`: the recording chain of an output."""
+
+    window_mean: NotNegative | None = Field(default=None, alias="window-mean")
+    delay: NotNegative | None = None
+    accuracy_class: Positive | None = Field(default=None, alias="class")
+
+
+class Experiment(Table):
+    """[[experiment]]: one recording and what to make of it."""
+
+    name: FileName
+    data: Name
+    role: Literal["fit", "holdout"] = "fit"
+    inputs: Columns = {}
+    outputs: Columns
+    noise: dict[Name, NotNegative] = {}
+    event: FiniteFloat | None = None
+    window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    values: dict[Name, FiniteFloat] = {}
+    columns: dict[Name, Column] = {}
+    nuisance: list[Name] = []
+    drive: Columns = {}
+    instrument: dict[Name, Instrument] = {}
+    interpolation: Annotated[
+        Interpolation | dict[Name, Interpolation] | None, BeforeValidator(_known_interpolation)
+    ] = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Experiment:
+        if self.window and not self.window[0] < self.window[1]:
+            raise ValueError("window: its end is not after its start")
+        if not self.outputs:
+            raise ValueError("outputs: at least one recorded output is needed")
+        return self
+
+
+class Linearize(Table):
+    """[linearize]: between which inputs and outputs, and where."""
+
+    inputs: Names | None = None
+    outputs: Names | None = None
+    at: Literal["steady", "start"] = "steady"
+
+
+class Sweep(Table):
+    """[[sweep]]: the values of one parameter, listed or spread over a range."""
+
+    parameter: Name
+    min: FiniteFloat | None = None
+    max: FiniteFloat | None = None
+    points: Annotated[int, Field(ge=2, le=1_000_000)] | None = None
+    scale: Literal["linear", "log"] = "linear"
+    values: Annotated[list[FiniteFloat], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Sweep:
+        spread = (self.min, self.max, self.points)
+        if self.values is not None and any(v is not None for v in spread):
+            raise ValueError("give either values or min, max and points")
+        if self.values is None:
+            if self.min is None or self.max is None or self.points is None:
+                raise ValueError("min, max and points are needed, or values")
+            if not self.min < self.max:
+                raise ValueError("max is not above min")
+            if self.scale == "log" and self.min <= 0:
+                raise ValueError("a log scale needs min above 0")
+        return self
+
+
+class Identifiability(Table):
+    """[identifiability]: asks for the stage."""
+
+
+class Group(Table):
+    """One group of [fit] groups: these parameters against these outputs of these experiments (all where left out)."""
+
+    parameters: Names
+    outputs: Names | None = None
+    experiments: Names | None = None
+
+
+class Fit(Table):
+    """[fit]: how the candidates are estimated."""
+
+    mode: Literal["simultaneous", "individual"] = "simultaneous"
+    groups: list[Group] = []
+    optimiser: Name = "trust-region"
+    loss: Name = "linear"
+    starts: Annotated[int, Field(ge=1, le=10_000)] = 8
+    whiten: bool = False
+
+    @model_validator(mode="after")
+    def _groups_fit_the_mode(self) -> Fit:
+        if self.mode == "individual" and not self.groups:
+            raise ValueError('mode "individual" needs groups, one a controller')
+        if self.groups and self.mode != "individual":
+            raise ValueError('groups belong to mode "individual"')
+        return self
+
+
+class Diagnose(Table):
+    """[diagnose]: which effects to try, and what is too small to matter."""
+
+    effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = "all"
+    material: dict[Name, Positive] = {}
+
+
+class StudyFile(Table):
+    """The whole study file."""
+
+    version: Literal[1] = Field(alias="schema")
+    name: Name | None = None
+    model: Model
+    parameters: dict[Name, Candidate] = {}
+    experiment: list[Experiment] = []
+    linearize: Linearize | None = None
+    sweep: list[Sweep] = []
+    identifiability: Identifiability | None = None
+    fit: Fit | None = None
+    diagnose: Diagnose | None = None

@@ -1,0 +1,84 @@
+"""What a stage is: a question a study can ask, answered by one JSON and some files. A stage is one file in `stages/`.
+
+A stage's file has `STAGE = Stage(...)` and imports numpy and the like inside its functions, for the command line
+lists the stages before it knows which one will run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from hvdc_ident.errors import unknown_name
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+Progress = Callable[[int, int, str], None]
+"""Called with what is done, what there is to do, and a line of text."""
+
+
+def silent(done: int, total: int, text: str) -> None:
+    """Nothing: progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How stages run. workers: processes; seed: of every random number; progress: who is told."""
+
+    workers: int = 1
+    seed: int = 0
+    progress: Progress = silent
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a stage found. data: the JSON without its heading. files: text by name, written beside it.
+
+    failed: why the work did not come to an end, empty where it did; what there is, is kept all the same.
+    """
+
+    data: Mapping[str, Any]
+    files: Mapping[str, str] = field(default_factory=dict)
+    failed: str = ""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.
+
+    name: its command. file: its JSON in DIR. run: the work, given the study, the options and the data of the stages it
+    builds on, by name; what the study lacks for it is a StudyError. wanted: whether `run STUDY` includes it.
+    after: the stages it builds on; they run first. order: place among the stages of a run.
+    """
+
+    name: str
+    file: str
+    summary: str
+    run: Callable[[Study, Options, Mapping[str, Any]], Outcome]
+    wanted: Callable[[Study], bool]
+    order: int
+    after: tuple[str, ...] = ()
+
+
+@cache
+def stages() -> tuple[Stage, ...]:
+    """Every stage, in the order of a run, found by walking `stages/`."""
+    from hvdc_ident.study import stages as folder
+
+    found = [
+        importlib.import_module(f"{folder.__name__}.{m.name}").STAGE for m in pkgutil.iter_modules(folder.__path__)
+    ]
+    return tuple(sorted(found, key=lambda s: (s.order, s.name)))
+
+
+def stage(name: str) -> Stage:
+    """The stage of that name. Raises UnknownNameError."""
+    for found in stages():
+        if found.name == name:
+            return found
+    raise unknown_name("stage", name, [s.name for s in stages()])

@@ -1,0 +1,199 @@
+"""A study: the model, the candidates and the experiments, with every name looked up and every file read."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.files import digest
+from hvdc_ident.fit import Free
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.models import load_model, shipped_models
+from hvdc_ident.study import schema
+from hvdc_ident.study.parse import parse_study
+from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A study that holds together.
+
+    model: with its parameterisation, effects and [model.values]. candidates: what may be estimated, with start and
+    bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
+    settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study.
+    """
+
+    name: str
+    path: Path
+    model: Model
+    candidates: FrozenMap[Free]
+    experiments: tuple[Experiment, ...]
+    noise: FrozenMap[FrozenMap[NoiseNote]]
+    settings: schema.StudyFile
+    sources: FrozenMap[str]
+
+    @property
+    def folder(self) -> Path:
+        """Where results go unless --out says otherwise: STUDY-results beside the study."""
+        return self.path.with_name(f"{self.path.stem}-results")
+
+    @property
+    def start(self) -> FrozenMap[float]:
+        """The candidates' start values by name: where an estimation begins."""
+        return FrozenMap({name: free.start for name, free in self.candidates.items()})
+
+    @property
+    def values(self) -> FrozenMap[float]:
+        """The candidates' values for a plain simulation: what [model.values] states, else the start."""
+        stated = self.settings.model.values
+        return FrozenMap({name: stated.get(name, free.start) for name, free in self.candidates.items()})
+
+
+def load_study(path: str | Path, trust: bool = False) -> Study:
+    """The study of a file. trust: whether a model that is Python code may be run.
+
+    Raises InputError: StudyError, ModelError, UnknownNameError or WaveformError, with the place in the file.
+    """
+    file = Path(path)
+    content = _read(file)
+    settings = parse_study(content, file)
+    where = file.name
+    model, model_sources = _model(settings.model, file, trust)
+    recordings = Recordings(file.parent)
+    candidates = _candidates(settings, model, where)
+    experiments, noise = read_experiments(settings.experiment, model, recordings, where)
+    study = Study(
+        name=settings.name or file.stem,
+        path=file,
+        model=model,
+        candidates=candidates,
+        experiments=experiments,
+        noise=noise,
+        settings=settings,
+        sources=FrozenMap({where: digest(content), **model_sources, **recordings.digests}),
+    )
+    _check_questions(study, where)
+    return study
+
+
+def _read(file: Path) -> bytes:
+    if file.is_dir():
+        raise StudyError(
+            "a folder is no study", where=str(file), expected="a study file (TOML)", hint=f"{file / 'study.toml'}"
+        )
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        hint = "'hvdc-ident new DIR' writes a study to start from"
+        raise StudyError("no such study file", where=str(file), hint=hint) from None
+    except OSError as e:
+        raise StudyError(f"the study file cannot be read: {(e.strerror or str(e)).lower()}", where=str(file)) from None
+
+
+def _model(table: schema.Model, file: Path, trust: bool) -> tuple[Model, dict[str, str]]:
+    """The model as the study wants it, and the hash of the file it comes from."""
+    source: str | Path = table.source
+    sources: dict[str, str] = {}
+    if table.source not in shipped_models() and _is_path(table.source):
+        source = file.parent / table.source
+        if not source.is_file():
+            raise StudyError(
+                f"no model file '{table.source}'",
+                where=f"{file.name}, model.source",
+                expected="a path from the study's folder, or a shipped model: " + ", ".join(shipped_models()),
+            )
+        sources[table.source] = digest(source.read_bytes())
+    place = "model.source"
+    try:
+        model = load_model(source, trust=trust)
+        if table.parameterisation is not None:
+            place = "model.parameterisation"
+            model = model.parameterised(table.parameterisation)
+        if table.effect:
+            place = "model.effect"
+            model = model.with_effects([e.model_dump(by_alias=True, exclude_none=True) for e in table.effect])
+        place = "model.values"
+        model = model.with_values(table.values) if table.values else model
+    except InputError as e:
+        raise e.at(f"{file.name}, {place}") from None
+    return model, sources
+
+
+def _is_path(source: str) -> bool:
+    return "/" in source or "\\" in source or Path(source).suffix in (".toml", ".fmu", ".py")
+
+
+def _candidates(settings: schema.StudyFile, model: Model, where: str) -> FrozenMap[Free]:
+    found = {}
+    for name, line in settings.parameters.items():
+        place = f"{where}, parameters.{name}"
+        if name not in model.parameters:
+            hint = " (it is an input: see an experiment's values)" if name in model.inputs else ""
+            raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters{hint}")
+        own = model.parameters[name]
+        given = {k: v for k in ("start", "min", "max") if (v := getattr(line, k)) is not None}
+        try:
+            free = Free.of(name, own, **given)
+        except InputError as e:
+            raise e.at(place) from None
+        if free.min < own.min or free.max > own.max:
+            raise StudyError(
+                "the bounds go beyond the model's own",
+                where=place,
+                expected=f"bounds within [{own.min:g}, {own.max:g}]",
+                got=f"[{free.min:g}, {free.max:g}]",
+            )
+        found[name] = free
+    return FrozenMap(found)
+
+
+def _check_questions(study: Study, where: str) -> None:
+    """Raises where a stage's table names what is not there."""
+    s, model = study.settings, study.model
+    names = [e.name for e in study.experiments]
+    measured = list(dict.fromkeys(o for e in study.experiments for o in e.outputs))
+    if s.linearize:
+        _all_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
+        _all_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
+    for line in s.sweep:
+        _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
+        _check_sweep(line, model, where)
+    for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
+        place = f"{where}, fit.groups number {number}"
+        _all_known("candidate", group.parameters, study.candidates, f"{place}.parameters")
+        _all_known("measured output", group.outputs, measured, f"{place}.outputs")
+        _all_known("experiment", group.experiments, names, f"{place}.experiments")
+    if s.fit:
+        from hvdc_ident.fit.optimisers import catalogue
+
+        _all_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
+    if s.diagnose:
+        _all_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
+        if s.diagnose.effects != "all":
+            from hvdc_ident.effects import effects
+
+            _all_known("effect", s.diagnose.effects, effects(), f"{where}, diagnose.effects")
+
+
+def _check_sweep(line: schema.Sweep, model: Model, where: str) -> None:
+    """Raises where a swept value leaves the model's own bounds."""
+    own = model.parameters[line.parameter]
+    ends = line.values or [v for v in (line.min, line.max) if v is not None]
+    for value in (min(ends), max(ends)):
+        if not own.min <= value <= own.max:
+            raise StudyError(
+                f"a value of '{line.parameter}' lies outside the model's own bounds",
+                where=f"{where}, sweep of {line.parameter}",
+                expected=f"values in [{own.min:g}, {own.max:g}]",
+                got=f"{value:g}",
+            )
+
+
+def _all_known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str) -> None:
+    for name in names or ():
+        if name not in known:
+            raise unknown_name(kind, name, known, where=where)

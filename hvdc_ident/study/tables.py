@@ -1,0 +1,69 @@
+"""The tables stages write: waveforms side by side, fitted values as CSV and as SSP parameter values."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.trajectory import Trajectory
+
+SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
+SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+
+
+def rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
+    """The root mean square of measured - simulated over the rows that are compared, in the output's unit."""
+    assert experiment.measured is not None
+    rows = experiment.compared
+    difference = experiment.measured[output][rows] - simulated[output][rows]
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
+    """CSV text: time, then for each measured output the simulated column OUTPUT and the recorded OUTPUT.measured."""
+    assert experiment.measured is not None
+    header, columns = ["time"], [experiment.time]
+    for output in experiment.outputs:
+        header += [output, f"{output}.measured"]
+        columns += [simulated[output], experiment.measured[output]]
+    return csv_text(header, np.column_stack(columns).tolist())
+
+
+def values_csv(
+    values: Mapping[str, float], units: Mapping[str, str], estimates: Mapping[str, Any], held: Mapping[str, str]
+) -> str:
+    """CSV text with a row for each fitted or held parameter: value, unit, std, interval, and why it is held."""
+    rows: list[list[Any]] = []
+    for name, value in values.items():
+        e = estimates.get(name) or {}
+        low, high = e.get("ci95") or (None, None)
+        rows.append([name, value, units.get(name, ""), e.get("std"), low, high, held.get(name, "")])
+    return csv_text(["parameter", "value", "unit", "std", "ci95_low", "ci95_high", "held"], rows)
+
+
+def ssv(values: Mapping[str, float], name: str) -> str:
+    """The values as an SSP 1.0 parameter value file (.ssv)."""
+    rows = "".join(
+        f"    <ssv:Parameter name={quoteattr(n)}><ssv:Real value={quoteattr(repr(float(v)))}/></ssv:Parameter>\n"
+        for n, v in values.items()
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<ssv:ParameterSet xmlns:ssv="{SSV}" xmlns:ssc="{SSC}" version="1.0" name={quoteattr(name)}>\n'
+        f"  <ssv:Parameters>\n{rows}  </ssv:Parameters>\n</ssv:ParameterSet>\n"
+    )
+
+
+def csv_text(header: list[str], rows: list[list[Any]]) -> str:
+    """CSV text, every number with all its digits, nothing for None."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([["" if v is None else repr(v) if isinstance(v, float) else v for v in row] for row in rows])
+    return stream.getvalue()
