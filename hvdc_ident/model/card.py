@@ -1,0 +1,211 @@
+"""Model cards: a model as TOML text, read and written without loss."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, Field, fields
+from pathlib import Path
+from typing import Any
+
+import sympy as sp
+
+from hvdc_ident.errors import ExpressionError, InputError, ModelError, unknown_name
+from hvdc_ident.expression.printer import to_text
+from hvdc_ident.files import write_text
+from hvdc_ident.model.coerce import SECTIONS, required_keys
+from hvdc_ident.model.definition import Model, Parameterisation
+
+SCHEMA = 1
+MAX_BYTES = 5_000_000
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
+_TOP = ("schema", "name", "description", *SECTIONS)
+_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
+_SHORT = frozenset(("signals", "outputs"))
+
+
+def read_card(path: str | Path) -> Model:
+    """The model of a card, a TOML file.
+
+    Raises ModelError for a file that is missing, over 5 MB, not UTF-8 or not TOML, and ModelError, UnknownNameError
+    or ExpressionError with the file and the place in it for what it says.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as e:
+        reason = (getattr(e, "strerror", None) or "no usable path").lower()
+        raise ModelError(f"the model card cannot be read: {reason}", where=str(path)) from None
+    if len(content) > MAX_BYTES:
+        raise ModelError("the model card is too large", where=str(path), expected=f"at most {MAX_BYTES} bytes")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as e:
+        what = f"the model card is no UTF-8 text (byte {e.start + 1})"
+        raise ModelError(what, where=str(path), hint="save it as UTF-8") from None
+    return parse_card(text, str(path))
+
+
+def parse_card(text: str, where: str = "model card") -> Model:
+    """The model of a card's text. where: what to call the card in errors, which are those of `read_card`."""
+    try:
+        card = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:
+        raise ModelError(f"the model card is not TOML: {e}", where=where) from None
+    except (RecursionError, ValueError):
+        raise ModelError("the model card is not TOML: nested too deeply or a number too long", where=where) from None
+    try:
+        return _model(card)
+    except InputError as e:
+        raise e.at(where) from None
+
+
+def _model(card: dict[str, Any]) -> Model:
+    for key in card:
+        if key not in _TOP:
+            raise unknown_name("key", key, _TOP)
+    schema = card.get("schema")
+    if schema != SCHEMA or isinstance(schema, bool | float):
+        got = "nothing" if schema is None else repr(schema)[:40]
+        raise ModelError("the card's schema is not known", expected=f"schema = {SCHEMA}", got=got)
+    for key in ("name", "description"):
+        if not isinstance(card.get(key, ""), str):
+            raise ModelError(f"the {key} is no text", expected=f'{key} = "..."', got=repr(card[key])[:40])
+    if "name" not in card:
+        raise ModelError("the card has no name", expected='name = "..."')
+    sections: dict[str, Any] = {s: _section(s, card[s]) for s in SECTIONS if s in card}
+    return Model(name=card["name"], description=card.get("description", ""), **sections)
+
+
+def _section(section: str, table: object) -> dict[str, Any]:
+    kind, _, noun = SECTIONS[section]
+    if not isinstance(table, dict):
+        raise ModelError(f"'{section}' is no table", expected=f"[{section}]", got=_kind(table))
+    for name, item in table.items():
+        place = f"[{section}] {noun} '{name}'"
+        if isinstance(item, dict):
+            required_keys(item, kind, place)
+            _check_values(item, place)
+        elif section not in _SHORT or not isinstance(item, str | int | float) or isinstance(item, bool):
+            raise ModelError(
+                "its value is of the wrong kind", where=place, expected=_expected(section), got=_kind(item)
+            )
+    return table
+
+
+def _check_values(item: dict[str, Any], place: str) -> None:
+    """Nothing; raises for values of TOML that no field takes. The kinds of the rest are checked by the model."""
+    for key, value in item.items():
+        if isinstance(value, dict):
+            if key not in ("parameters", "replaces"):
+                raise ModelError(
+                    f"its {key} is of the wrong kind", where=place, expected="a number or text", got="a table"
+                )
+        elif isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise ModelError(
+                f"its {key} is of the wrong kind", where=place, expected="a number or text", got=_kind(value)
+            )
+
+
+def _expected(section: str) -> str:
+    return "a text or a table {value = ...}" if section in _SHORT else f"a table {{{SECTIONS[section][1]} = ...}}"
+
+
+def _kind(value: object) -> str:
+    names = {
+        dict: "a table",
+        list: "a list",
+        str: "a text",
+        bool: "a truth value",
+        int: "an integer",
+        float: "a number",
+    }
+    return names.get(type(value), f"a {type(value).__name__}")
+
+
+def write_card(model: Model) -> str:
+    """The text of the model's card: `parse_card(write_card(m)) == m`, every number to the last bit.
+
+    Raises ExpressionError with the place for an expression that the card's grammar has no words for.
+    """
+    lines = [f"schema = {SCHEMA}", f"name = {_string(model.name)}"]
+    if model.description:
+        lines.append(f"description = {_string(model.description)}")
+    for section in SECTIONS:
+        items: Mapping[str, Any] = getattr(model, section)
+        place = f"model '{model.name}', {SECTIONS[section][2]}"
+        if section == "parameterisations":
+            for name, item in items.items():
+                lines += _parameterisation(name, item, f"{place} '{name}'")
+        elif items:
+            lines += ["", f"[{section}]"]
+            for name, item in items.items():
+                written = _item(item, section, f"{place} '{name}'")
+                lines.append(f"{_key(name)} = {written}")
+    return "\n".join(lines) + "\n"
+
+
+def save_card(model: Model, path: str | Path) -> Path:
+    """The path, once the model's card is written there whole: the file is the old one or the new one, never a part."""
+    return write_text(Path(path), write_card(model))
+
+
+def _parameterisation(name: str, item: Parameterisation, place: str) -> Iterator[str]:
+    head = f"parameterisations.{_key(name)}"
+    yield from ("", f"[{head}]")
+    if item.description:
+        yield f"description = {_string(item.description)}"
+    yield from ("", f"[{head}.parameters]")
+    for new, parameter in item.parameters.items():
+        yield f"{_key(new)} = {_item(parameter, 'parameters', place)}"
+    yield from ("", f"[{head}.replaces]")
+    for replaced, expression in item.replaces.items():
+        text = _value(expression, f"{place}, replaced '{replaced}'")
+        yield f"{_key(replaced)} = {text}"
+
+
+def _item(item: Any, section: str, place: str) -> str:
+    given = [(f.name, getattr(item, f.name)) for f in fields(item) if _is_given(f, getattr(item, f.name))]
+    if section in _SHORT and len(given) == 1:
+        return _value(given[0][1], place)
+    return "{" + ", ".join(f"{key} = {_value(value, f'{place}, {key}')}" for key, value in given) + "}"
+
+
+def _is_given(field: Field[Any], value: Any) -> bool:
+    """True for what has to be written: all but defaults; by repr, as -0.0 is no 0.0."""
+    return field.name == "value" or field.default is MISSING or repr(field.default) != repr(value)
+
+
+def _value(value: Any, place: str) -> str:
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, float):
+        return _float(value)
+    if isinstance(value, sp.Expr):
+        try:
+            return _string(to_text(value))
+        except ExpressionError as e:
+            raise e.at(place) from None
+    raise ModelError("the value cannot be written to a card", where=place, got=type(value).__name__)
+
+
+def _float(value: float) -> str:
+    return ("inf" if value > 0 else "-inf") if math.isinf(value) else repr(value)
+
+
+def _key(name: str) -> str:
+    return name if _BARE.fullmatch(name) else _string(name)
+
+
+def _string(text: str) -> str:
+    return '"' + "".join(_ESCAPES.get(c) or (c if _is_plain(c) else f"\\u{ord(c):04x}") for c in text) + '"'
+
+
+def _is_plain(character: str) -> bool:
+    if "\ud800" <= character <= "\udfff":
+        raise ModelError("a text of the model is no valid unicode", got=f"the surrogate U+{ord(character):04X}")
+    return character >= " " and character != "\x7f"
