@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -52,6 +52,12 @@ def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
             continue
         done[wanted.name] = _kept_or_run(study, wanted, folder, options)
     return list(done.values())
+
+
+def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) -> None:
+    """Nothing; `run.json` says what a run did: the heading, and each stage with its outcome."""
+    rows = {d.stage.name: {"file": d.stage.file, "failed": d.failed} for d in done}
+    write_text(folder / "run.json", json_text({**heading, "stages": rows}))
 
 
 def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options) -> Done:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.model.definition import Model
 from hvdc_ident.parameters import Parameter
@@ -25,5 +26,8 @@ class ModelSimulator:
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
     ) -> Simulation:
-        """A run of the experiment. Raises SimulationError or SteadyStateError."""
-        return simulate(self.model, experiment, values, sensitivities)
+        """A run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
+        try:
+            return simulate(self.model, experiment, values, sensitivities)
+        except SteadyStateError as e:
+            raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None

@@ -26,6 +26,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     need_experiments(study, "fit", role="fit")
     need_candidates(study, "fit")
     problem = Problem(ModelSimulator(study.model), study.experiments, tuple(study.candidates.values()))
+    _check_start(study)
     result = _fitted(study, options, problem)
     found = result.to_dict()
     data = {
@@ -56,6 +57,18 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             continue  # its RMSE is null in the JSON
         files[f"fit.{experiment.name}.csv"] = comparison_csv(experiment, simulated)
     return Outcome(data, files, failed=result.message if result.status == "not-converged" else "")
+
+
+def _check_start(study: Study) -> None:
+    """Raises SteadyStateError where an experiment has no steady state at the start values: the study is then wrong."""
+    from contextlib import suppress
+
+    from hvdc_ident.errors import SimulationError
+    from hvdc_ident.simulate import simulate
+
+    for experiment in study.experiments:
+        with suppress(SimulationError):
+            simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
 
 
 def _fitted(study: Study, options: Options, problem: Problem) -> FitResult:

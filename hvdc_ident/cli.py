@@ -1,0 +1,356 @@
+"""The command line: `hvdc-ident COMMAND ...`. Exit codes: 0 done, 1 the work ran and failed, 2 the input is wrong.
+
+Nothing heavy is imported before a command needs it, so that the help comes at once.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from hvdc_ident.errors import HvdcIdentError, InputError
+from hvdc_ident.study.stage import Options, Stage, stages
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+app = typer.Typer(
+    name="hvdc-ident",
+    help="Linearisation, identifiability, calibration and discrepancy diagnosis of converter models.",
+    epilog="Exit codes: 0 done; 1 the work ran and a stage failed, results kept; 2 the input is wrong.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+StudyFile = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).", show_default=False)]
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="DIR", help="Folder for results; default STUDY-results.", show_default=False),
+]
+Workers = Annotated[int, typer.Option("--workers", metavar="N", min=1, max=4096, help="Processes to work with.")]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, max=2**31 - 1, help="Seed of every random number.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
+Trust = Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")]
+
+
+class _Failed(Exception):
+    """The work ran and failed; what it found is written."""
+
+
+def guarded(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with every exception turned into one message and an exit code, never a traceback."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **named: Any) -> None:
+        try:
+            command(*arguments, **named)
+            sys.stdout.flush()
+        except typer.Exit:
+            raise
+        except HvdcIdentError as e:
+            _end(2 if isinstance(e, InputError) else 1, str(e))
+        except _Failed as e:
+            _end(1, str(e))
+        except KeyboardInterrupt:
+            _end(130, "interrupted; what was finished is kept, and the same command goes on from there")
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except MemoryError:
+            _end(1, "not enough memory for this study")
+        except Exception as e:
+            if os.environ.get("HVDC_IDENT_DEBUG") == "1":
+                traceback.print_exc()
+            what = " ".join(f"{type(e).__name__}: {e}".split())[:300]
+            _end(
+                1,
+                f"a bug in hvdc-ident, not in your study: {what}. Try: HVDC_IDENT_DEBUG=1 shows where; please report it",
+            )
+
+    return run
+
+
+def _end(code: int, message: str) -> NoReturn:
+    typer.echo(f"{'interrupted' if code == 130 else 'error'}: {message.removeprefix('interrupted; ')}", err=True)
+    raise typer.Exit(code)
+
+
+def _say(text: str, *, json: bool, quiet: bool) -> None:
+    """Text for people: on stdout, unless that is asked to hold JSON or to stay empty."""
+    if not (json or quiet):
+        typer.echo(text)
+
+
+def _print_json(value: Any) -> None:
+    from hvdc_ident.files import json_text
+
+    typer.echo(json_text(value), nl=False)
+
+
+@app.callback(invoke_without_command=True)
+def _top(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"hvdc-ident {installed('hvdc_ident')}")
+        raise typer.Exit
+
+
+@app.command()
+@guarded
+def demo(
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for study, data, results and report.")
+    ] = Path("hvdc-ident-demo"),
+    workers: Workers = 1,
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate the shipped link on waveforms made here, and write DIR/report.html."""
+    from hvdc_ident.study.demo import write_demo
+    from hvdc_ident.study.progress import progress
+    from hvdc_ident.study.study import load_study
+
+    with progress(quiet or json) as told:
+        study = load_study(write_demo(out, seed=seed, progress=told))
+        done = _run_all(study, out, Options(workers, seed, told))
+    _tell_run(study, out, done, json=json, quiet=quiet)
+
+
+@app.command()
+@guarded
+def new(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder to make; it must not hold a study.", show_default=False)
+    ],
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a commented study with data that runs, to start from."""
+    from hvdc_ident.study.starter import write_starter
+
+    path = write_starter(folder)
+    if json:
+        _print_json({"schema": 1, "study": path.as_posix()})
+    _say(f"{path} is written. Next: hvdc-ident run {path}", json=json, quiet=quiet)
+
+
+@app.command()
+@guarded
+def check(
+    study: StudyFile, seed: Seed = 0, json: Json = False, quiet: Quiet = False, trust: Trust = False, out: Out = None
+) -> None:
+    """Validate the study, its model and its data; run nothing, write nothing."""
+    from hvdc_ident.study.study import load_study
+    from hvdc_ident.study.summary import summary, summary_text
+
+    found = summary(load_study(study, trust), seed)
+    if json:
+        _print_json(found)
+    _say(summary_text(found), json=json, quiet=quiet)
+
+
+@app.command("run")
+@guarded
+def run_(
+    study: StudyFile,
+    out: Out = None,
+    workers: Workers = 1,
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+    trust: Trust = False,
+) -> None:
+    """Every stage the study asks for, then the report; a second run redoes only what changed."""
+    from hvdc_ident.study.progress import progress
+    from hvdc_ident.study.study import load_study
+
+    loaded = load_study(study, trust)
+    folder = out or loaded.folder
+    with progress(quiet or json) as told:
+        done = _run_all(loaded, folder, Options(workers, seed, told))
+    _tell_run(loaded, folder, done, json=json, quiet=quiet)
+
+
+def _run_all(study: Study, folder: Path, options: Options) -> list[Any]:
+    from hvdc_ident.report.page import write_report
+    from hvdc_ident.study.pipeline import heading_of, run_all, write_run
+
+    done = run_all(study, folder, options)
+    write_run(folder, heading_of(study, options.seed), done)
+    options.progress(len(done), len(done) + 1, "report")
+    write_report(folder)
+    return done
+
+
+def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet: bool) -> None:
+    if json:
+        from hvdc_ident.study.pipeline import heading_of
+
+        seed = done[0].data["seed"] if done else 0
+        _print_json(
+            {**heading_of(study, seed), "stages": {d.stage.name: d.data for d in done}, "report": "report.html"}
+        )
+    for d in done:
+        state = "failed" if d.failed else "done" if d.fresh else "kept from before"
+        _say(f"{d.stage.name}: {state}", json=json, quiet=quiet)
+    _say(f"report: {folder / 'report.html'}", json=json, quiet=quiet)
+    failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
+    if failures:
+        raise _Failed("; ".join(failures))
+
+
+def _add_stage(stage: Stage) -> None:
+    """Registers one stage as a command of its name."""
+
+    def command(
+        study: StudyFile,
+        out: Out = None,
+        workers: Workers = 1,
+        seed: Seed = 0,
+        json: Json = False,
+        quiet: Quiet = False,
+        trust: Trust = False,
+    ) -> None:
+        from hvdc_ident.study.pipeline import run_stage
+        from hvdc_ident.study.progress import progress
+        from hvdc_ident.study.study import load_study
+
+        loaded = load_study(study, trust)
+        folder = out or loaded.folder
+        with progress(quiet or json) as told:
+            done = run_stage(loaded, stage.name, folder, Options(workers, seed, told))
+        if json:
+            _print_json(done.data)
+        _say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}", json=json, quiet=quiet)
+        if done.failed:
+            raise _Failed(f"{stage.name}: {done.failed}")
+
+    command.__doc__ = stage.summary
+    app.command(stage.name)(guarded(command))
+
+
+for _stage in stages():
+    _add_stage(_stage)
+
+
+@app.command()
+@guarded
+def report(
+    source: Annotated[
+        Path, typer.Argument(metavar="STUDY|DIR", help="A study, or a folder of results.", show_default=False)
+    ],
+    out: Out = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    trust: Trust = False,
+) -> None:
+    """Build the page again from the results in DIR."""
+    from hvdc_ident.report.page import write_report
+
+    if source.is_dir():
+        folder = source
+    else:
+        from hvdc_ident.study.study import load_study
+
+        folder = out or load_study(source, trust).folder
+    page = write_report(folder)
+    if json:
+        _print_json({"schema": 1, "report": page.as_posix(), "bytes": page.stat().st_size})
+    _say(f"report: {page}", json=json, quiet=quiet)
+
+
+@app.command()
+@guarded
+def convert(
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="A file of waveforms in any known format.", show_default=False)
+    ],
+    to: Annotated[
+        Path | None, typer.Option("--to", metavar="FILE.csv", help="The CSV to write.", show_default=False)
+    ] = None,
+    signal: Annotated[
+        list[str] | None, typer.Option("--signal", metavar="NAME", help="A signal wanted; default all.")
+    ] = None,
+    search: Annotated[
+        str | None,
+        typer.Option(
+            "--list", metavar="TEXT", help="List the signals whose name has TEXT ('' for all).", show_default=False
+        ),
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Any waveform format to CSV; or, with --list, what a file holds."""
+    from hvdc_ident.formats import convert as to_csv
+    from hvdc_ident.formats import list_signals
+
+    if (search is None) == (to is None):
+        raise InputError(
+            "convert needs one of --to and --list",
+            where="the command line",
+            hint="--to FILE.csv, or --list '' to see the signals",
+        )
+    if search is not None:
+        found = list_signals(data, search)
+        if json:
+            _print_json({"schema": 1, "signals": [{"name": n, "unit": u} for n, u in found]})
+        _say("\n".join(f"{n} [{u}]" if u else n for n, u in found) or "no such signal", json=json, quiet=quiet)
+        return
+    assert to is not None
+    written = to_csv(data, to, signal)
+    if json:
+        _print_json({"schema": 1, "file": to.as_posix(), "rows": len(written), "signals": list(written.names)})
+    _say(f"{to}: {len(written)} rows, {len(written.names)} signals", json=json, quiet=quiet)
+
+
+@app.command()
+@guarded
+def models(json: Json = False, quiet: Quiet = False) -> None:
+    """The shipped models, one line each."""
+    from hvdc_ident.models import summaries
+
+    _catalogue("models", summaries(), json=json)
+
+
+@app.command()
+@guarded
+def effects(json: Json = False, quiet: Quiet = False) -> None:
+    """The catalogue of effects, one line each."""
+    from hvdc_ident.effects import effects as known
+
+    _catalogue("effects", {name: effect.summary for name, effect in known().items()}, json=json)
+
+
+@app.command()
+@guarded
+def formats(json: Json = False, quiet: Quiet = False) -> None:
+    """The waveform formats, one line each."""
+    from hvdc_ident.formats import formats as known
+
+    _catalogue("formats", {name: f"{f.SUMMARY} ({', '.join(f.SUFFIXES)})" for name, f in known().items()}, json=json)
+
+
+def _catalogue(kind: str, lines: dict[str, str], *, json: bool) -> None:
+    if json:
+        _print_json({"schema": 1, kind: lines})
+        return
+    width = max((len(n) for n in lines), default=0)
+    typer.echo("\n".join(f"{name:<{width}}  {text}" for name, text in lines.items()))
+
+
+def main() -> None:
+    """Nothing; the process ends with the command's exit code."""
+    app()

@@ -1,0 +1,50 @@
+"""Figures as SVG text inside the page, and waveforms thinned to what can be seen."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+POINTS = 2000
+MEASURED, BEFORE, AFTER, MARK = "#222222", "#d08020", "#1f5fa8", "#999999"
+
+
+def figure(width: float, height: float) -> Figure:
+    """An empty figure, sizes in inches; no window, no state shared with other figures."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def svg(fig: Figure, label: str) -> str:
+    """The figure as an `<svg>` element, the same bytes each time; text stays text."""
+    import matplotlib
+
+    from hvdc_ident.report.html import text
+
+    style = {"svg.fonttype": "none", "svg.hashsalt": label, "font.family": "sans-serif", "text.parse_math": False}
+    stream = io.StringIO()
+    with matplotlib.rc_context(style):
+        fig.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    drawn = stream.getvalue()
+    return drawn[drawn.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{text(label)}"', 1)
+
+
+def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
+    """At most about so many points that draw the same line: the smallest and the largest of each stretch, in order."""
+    if time.size <= points:
+        return time, values
+    edges = np.linspace(0, time.size, points // 2 + 1).astype(int)
+    keep = []
+    for start, end in zip(edges[:-1], edges[1:], strict=True):
+        part = values[start:end]
+        keep += sorted({start + int(np.argmin(part)), start + int(np.argmax(part))})
+    chosen = np.unique([0, *keep, time.size - 1])
+    return time[chosen], values[chosen]

@@ -1,0 +1,70 @@
+"""A folder of results as it stands on the disk."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import InputError
+from hvdc_ident.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Results:
+    """The JSON of every stage in a folder, by file name without its ending, and the tables beside them."""
+
+    folder: Path
+
+    @cached_property
+    def stages(self) -> dict[str, dict[str, Any]]:
+        """The JSON files that have the heading of a result. Raises InputError for one that is broken, or none at all."""
+        if not self.folder.is_dir():
+            raise InputError(
+                "no folder of results", where=str(self.folder), hint="run the study first: hvdc-ident run STUDY"
+            )
+        found = {}
+        for path in sorted(self.folder.glob("*.json")):
+            try:
+                data = json.loads(path.read_text(encoding="utf-8"))
+            except (OSError, ValueError, RecursionError) as e:
+                hint = "run the study again"
+                raise InputError("a result that cannot be read", where=str(path), got=str(e)[:100], hint=hint) from None
+            if isinstance(data, dict) and {"schema", "study", "model", "software"} <= set(data):
+                found[path.stem] = data
+        if not found:
+            raise InputError(
+                "no results in the folder", where=str(self.folder), hint="run the study first: hvdc-ident run STUDY"
+            )
+        return found
+
+    def get(self, stage: str) -> dict[str, Any]:
+        """The JSON of a stage, empty where it has not run."""
+        return self.stages.get(stage, {})
+
+    @property
+    def heading(self) -> dict[str, Any]:
+        """Schema, study, model, software, seed and sources, from the last stage of the chain that has them."""
+        return self.get("run") or self.get("fit") or next(iter(self.stages.values()))
+
+    def table(self, name: str) -> Trajectory | None:
+        """A table of numbers whose first column is the time; None where the file is not there or no such table."""
+        path = self.folder / name
+        if path.parent.resolve() != self.folder.resolve() or not path.is_file():
+            return None
+        with path.open(encoding="utf-8", newline="") as file:
+            header = next(csv.reader(file), [])
+            try:
+                rows = np.loadtxt(file, delimiter=",", ndmin=2)
+            except ValueError:
+                return None
+        return (
+            Trajectory(rows[:, 0], rows[:, 1:], tuple(header[1:]))
+            if rows.shape[1] == len(header) and rows.size
+            else None
+        )

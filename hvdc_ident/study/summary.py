@@ -1,0 +1,62 @@
+"""What `check` tells about a study: what it found, without running anything."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.study.pipeline import heading_of
+from hvdc_ident.study.stage import stages
+from hvdc_ident.study.study import Study
+
+
+def summary(study: Study, seed: int = 0) -> dict[str, Any]:
+    """The study in numbers: model, candidates, experiments with rows, event and noise, and the stages it asks for."""
+    model = study.model
+    return {
+        **heading_of(study, seed),
+        "sizes": {
+            "states": len(model.states),
+            "parameters": len(model.parameters),
+            "inputs": len(model.inputs),
+            "outputs": len(model.outputs),
+        },
+        "candidates": {
+            n: {"start": f.start, "min": f.min, "max": f.max, "unit": model.parameters[n].unit}
+            for n, f in study.candidates.items()
+        },
+        "experiments": {e.name: _experiment(e, study) for e in study.experiments},
+        "stages": [s.name for s in stages() if s.wanted(study)],
+    }
+
+
+def summary_text(found: dict[str, Any]) -> str:
+    """The same for people, in a few lines."""
+    sizes = ", ".join(f"{n} {k}" for k, n in found["sizes"].items())
+    lines = [f"study {found['study']}: good", f"model {found['model']}: {sizes}"]
+    for name, c in found["candidates"].items():
+        unit = f" {c['unit']}" if c["unit"] else ""
+        lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}")
+    for name, e in found["experiments"].items():
+        event = f"event at {e['event']:g} s" if e["event"] is not None else "no event"
+        noise = ", ".join(f"{o} {n['std']:.3g} ({n['source']})" for o, n in e["noise"].items())
+        start, end = e["time"]
+        lines.append(
+            f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
+        )
+    lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
+    return "\n".join(lines)
+
+
+def _experiment(e: Experiment, study: Study) -> dict[str, Any]:
+    notes = study.noise[e.name]
+    return {
+        "role": e.role,
+        "rows": int(e.time.size),
+        "time": [float(e.time[0]), float(e.time[-1])],
+        "event": e.event,
+        "window": e.window,
+        "inputs": [n for n in e.inputs if n not in e.drive],
+        "outputs": list(e.outputs),
+        "noise": {o: {"std": n.std, "source": n.source} for o, n in notes.items()},
+    }
