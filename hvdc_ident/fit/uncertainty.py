@@ -18,6 +18,9 @@ SINGULAR = 1e-7
 UNSEEN = 1e-9
 """A parameter whose whole range moves the residual by less than this has no effect."""
 
+FEWEST_ROWS = 4
+"""From fewer rows no autocorrelation is estimated; with a few tens it is a rough guess and errs to the wide side."""
+
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
@@ -60,7 +63,7 @@ def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
     """
     n = sum(r.size for r in residuals)
     power = sum(float(r @ r) for r in residuals)
-    if power == 0.0 or n < 4:
+    if power == 0.0 or n < FEWEST_ROWS:
         return 0.0
     rho = sum(float(r[1:] @ r[:-1]) for r in residuals) / power
     if rho < 1.645 / np.sqrt(n):
