@@ -75,7 +75,7 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             what = " ".join(f"{type(e).__name__}: {e}".split())[:300]
             _end(
                 1,
-                f"a bug in hvdc-ident, not in your study: {what}. Try: HVDC_IDENT_DEBUG=1 shows where; please report it",
+                f"a bug in hvdc-ident, not in your study: {what}. Try: HVDC_IDENT_DEBUG=1 shows where, for a report",
             )
 
     return run

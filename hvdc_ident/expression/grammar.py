@@ -17,10 +17,11 @@ from typing import NamedTuple, NoReturn
 
 from hvdc_ident.errors import ExpressionError
 
-MAX_LENGTH = 20_000
+MAX_LENGTH = 100_000
 MAX_TOKENS = 10_000
 MAX_DEPTH = 100
 MAX_CALLS = 32
+MAX_COMPARISONS = 1024
 MANY = 32
 
 ARITY: dict[str, tuple[int, int]] = {

@@ -32,7 +32,8 @@ def normal(value: sp.Expr) -> sp.Expr | None:
         parts = [normal(a) if isinstance(a, sp.Expr) else _condition(a) for a in value.args]
         if isinstance(value, _OUTSIDE) or any(p is None for p in parts):
             return None
-        result = _rebuilt(value, parts)
+        done = isinstance(value, (sp.Max, sp.Min)) and all(p is a for p, a in zip(parts, value.args, strict=True))
+        result = value if done else _rebuilt(value, parts)  # sympy compares the values of max and min slowly
     if result == value:
         result = value
     return result if isinstance(result, sp.Expr) and not result.has(*_NOT_REAL) else None

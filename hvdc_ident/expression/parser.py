@@ -12,6 +12,7 @@ import sympy as sp
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression.functions import clip, symbol
 from hvdc_ident.expression.grammar import (
+    MAX_COMPARISONS,
     Call,
     Chain,
     Comparison,
@@ -87,6 +88,7 @@ class _Builder:
 
     def __init__(self, source: Source) -> None:
         self.source = source
+        self.comparisons = 0
 
     def expression(self, root: Node) -> sp.Expr:
         """The expression of the whole tree."""
@@ -108,7 +110,17 @@ class _Builder:
             case Call("where"):
                 return self._where(node)
         arguments = [self.value(child) for child in _children(node)]
+        if isinstance(node, Call) and node.function in ("min", "max"):
+            self._count_comparisons(node, arguments)
         return self._guarded(lambda: checked(_combine(node, arguments)), node)
+
+    def _count_comparisons(self, node: Call, arguments: list[sp.Expr]) -> None:
+        """Nothing; raises where sympy would compare too many pairs of values, which it does slowly."""
+        count = sum(len(a.args) if isinstance(a, (sp.Min, sp.Max)) else 1 for a in arguments)
+        self.comparisons += count**2
+        if self.comparisons > MAX_COMPARISONS:
+            what = f"too many values in min and max (their numbers' squares sum to over {MAX_COMPARISONS})"
+            self.source.fail(f"{what}; name parts of it as signals", node.position)
 
     def _where(self, node: Call) -> sp.Expr:
         condition, yes, no = node.arguments

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +44,7 @@ def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Ar
         return time, values
     edges = np.linspace(0, time.size, points // 2 + 1).astype(int)
     keep = []
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in pairwise(edges):
         part = values[start:end]
         keep += sorted({start + int(np.argmin(part)), start + int(np.argmax(part))})
     chosen = np.unique([0, *keep, time.size - 1])

@@ -12,12 +12,14 @@ from hvdc_ident.report.html import text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """
 :root { --ink: #1c1c1c; --soft: #666; --line: #ddd; --accent: #1f5fa8; }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 62rem; padding: 2rem 1.5rem 4rem; color: var(--ink); background: #fff;
   font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 1.7rem; margin: 0 0 .2rem; } h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-top: .6rem; border-top: 1px solid var(--line); }
+h1 { font-size: 1.7rem; margin: 0 0 .2rem; }
+h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; padding-top: .6rem; border-top: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 1.6rem 0 .3rem; }
 header p, .small { color: var(--soft); font-size: .9rem; } header { margin-bottom: 1.2rem; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-size: .9rem; width: 100%; }
@@ -25,9 +27,13 @@ th, td { text-align: left; padding: .35rem .6rem; border-bottom: 1px solid var(-
 th { font-weight: 600; color: var(--soft); border-bottom: 2px solid var(--line); white-space: nowrap; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tbody tr:hover { background: #f6f8fa; }
-code { font: .8rem ui-monospace, "Cascadia Mono", Menlo, Consolas, monospace; color: var(--soft); overflow-wrap: anywhere; }
+code { font: .8rem ui-monospace, "Cascadia Mono", Menlo, Consolas, monospace; }
+code { color: var(--soft); overflow-wrap: anywhere; }
 figure { margin: .4rem 0 1rem; break-inside: avoid; } figure svg { width: 100%; height: auto; display: block; }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; } h2, h3 { break-after: avoid; } tr { break-inside: avoid; } }
+@media print {
+  body { max-width: none; padding: 0; font-size: 10pt; }
+  h2, h3 { break-after: avoid; } tr { break-inside: avoid; }
+}
 """
 
 
@@ -55,7 +61,7 @@ def page(folder: Path) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; img-src data:\">\n"
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
         f"<header><h1>{title}</h1><p>{text(heading.get('software', ''))}</p></header>\n"
         + "\n".join(parts)

@@ -23,7 +23,7 @@ class Results:
 
     @cached_property
     def stages(self) -> dict[str, dict[str, Any]]:
-        """The JSON files that have the heading of a result. Raises InputError for one that is broken, or none at all."""
+        """The JSON files that have the heading of a result. Raises InputError for a broken one, or none at all."""
         if not self.folder.is_dir():
             raise InputError(
                 "no folder of results", where=str(self.folder), hint="run the study first: hvdc-ident run STUDY"

@@ -50,7 +50,7 @@ def waveforms(
             axes.axvline(event, color=MARK, linewidth=0.8, linestyle=":")
         if window is not None:
             axes.axvspan(*window, color="#1f5fa8", alpha=0.05, linewidth=0)
-    top.legend(fontsize=8, frameon=False, loc="best")
+    fig.legend(*top.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside upper right", ncols=3)
     if shown is not None:
         top.set_ylim(*_limits([t for t in (before, after) if t is not None], output))
     return fig

@@ -47,7 +47,7 @@ class Engine:
         s = self.structure.sizes
         self._code = self.structure.compile()
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
-        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width, s.n_hess], dtype=np.int64)
+        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width, s.n_hess, self.structure.moves_by_itself], dtype=np.int64)
         second = self.structure.second
         self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
         self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
@@ -131,7 +131,7 @@ class Engine:
         tol = tolerance
         kind = EXPLICIT if self._is_explicit(method, p, y, w, end - begin) else ROSENBROCK
         while True:
-            counts, modes = np.zeros(5, dtype=np.int64), np.zeros(max(s.ns, 1))
+            counts, modes = np.zeros(6, dtype=np.int64), np.zeros(max(s.ns, 1))
             status, reached = integrate(
                 self._address, self._dims, self._hess_row, self._hess_column, kind, p, y.copy(), w.copy(), np.zeros_like(w), constants, begin, end, breaks,
                 pointer, times, values, time, out, sizes, tol.rtol, tol.atol, tol.max_steps, counts, modes,

@@ -155,7 +155,14 @@ class Graph:
                 return self.constant(_FOLD[name](values[0]))
             except (ValueError, OverflowError):
                 return self.constant(math.nan)
+        if name == "sqrt" and self._cut_at_zero(arguments[0]):
+            name = "sqrt0"
         return self._node(name, *arguments)
+
+    def _cut_at_zero(self, a: int) -> bool:
+        """Whether a node is max(0, x): with modes held, x may pass 0 within a step before the switch is found."""
+        key = self.nodes[a]
+        return key[0] == "select" and self.zero in key[2:]
 
     # --- conditions ---
 
@@ -348,8 +355,11 @@ class Graph:
         if op == "pow":
             slope = self.mul(a[1], self.power(x, self.sub(a[1], self.one)))
             return [(x, slope)] if self.value(a[1]) is not None else [(x, slope), (a[1], self.mul(n, self.call("log", x)))]
-        if op == "sqrt":
-            return [(x, self.div(self.constant(0.5), n))]
+        if op in ("sqrt", "sqrt0"):
+            # sqrt(max(0, x)) is flat where its argument is cut at 0: the slope there must be 0, not 0 times infinity.
+            return [(x, self.mul(self.constant(0.5), self.call("inverse", n)))]
+        if op == "inverse":
+            return [(x, self.neg(self.mul(n, n)))]
         if op == "atan2":
             y, r2 = a[1], self.add(square, self.mul(a[1], a[1]))
             return [(x, self.div(y, r2)), (y, self.neg(self.div(x, r2)))]
@@ -390,6 +400,6 @@ def _evaluate(graph: Graph, n: int, values: dict[int, float], leaves: Mapping[in
         return _FOLD[op](x[0])
     return {
         "add": lambda: x[0] + x[1], "sub": lambda: x[0] - x[1], "mul": lambda: x[0] * x[1], "div": lambda: x[0] / x[1],
-        "neg": lambda: -x[0], "pow": lambda: x[0] ** x[1], "atan2": lambda: math.atan2(x[0], x[1]),
+        "neg": lambda: -x[0], "inverse": lambda: 1.0 / x[0] if x[0] else 0.0, "sqrt0": lambda: math.sqrt(max(x[0], 0.0)), "pow": lambda: x[0] ** x[1], "atan2": lambda: math.atan2(x[0], x[1]),
         "and": lambda: x[0] and x[1], "or": lambda: x[0] or x[1], "not": lambda: not x[0],
     }[op]()  # fmt: skip

@@ -41,6 +41,7 @@ class Function:
     nodes: Sequence[tuple[int, int]] = ()  # (place, node)
     rows: Sequence[tuple[int, Row]] = ()  # (place, row)
     live: bool = False  # conditions by comparison instead of by frozen mode
+    hot: bool = False  # called in every step: worth the compiler's full effort
 
 
 class Code:
@@ -49,32 +50,37 @@ class Code:
     def __init__(self, graph: Graph, functions: Sequence[Function], width: int) -> None:
         serial = next(_serial)
         names = {f.name: f"hvdcident_{serial}_{f.name}" for f in functions}
-        text = "\n".join([*_declarations(width), *(_Emitter(graph, f, names[f.name], width).text() for f in functions)])
-        self._engine = _compiled(text)
-        self.address = {f.name: self._engine.get_function_address(names[f.name]) for f in functions}
+        self._engines: list[llvm.ExecutionEngine] = []
+        self.address: dict[str, int] = {}
+        for hot in (True, False):
+            chosen = [f for f in functions if f.hot == hot]
+            text = "\n".join([*_declarations(), *(_Emitter(graph, f, names[f.name], width).text() for f in chosen)])
+            engine = _compiled(text, hot)
+            self._engines.append(engine)
+            self.address |= {f.name: engine.get_function_address(names[f.name]) for f in chosen}
 
     def __del__(self) -> None:
-        engine = getattr(self, "_engine", None)
-        if engine is not None:
+        for engine in getattr(self, "_engines", ()):
             engine.close()
 
 
-def _declarations(width: int) -> list[str]:
+def _declarations() -> list[str]:
     lines = [f"declare double @llvm.{f}.f64(double)" for f in _INTRINSIC]
     lines += ["declare double @llvm.pow.f64(double, double)", "declare double @atan2(double, double)"]
     return lines + [f"declare double @{f}(double)" for f in _LIBM if f != "atan2"]
 
 
-def _compiled(text: str) -> llvm.ExecutionEngine:
+def _compiled(text: str, hot: bool) -> llvm.ExecutionEngine:
+    """The engine of a module; a cold one is compiled quickly instead of well, which halves the time of a new structure."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     module = llvm.parse_assembly(text, llvm.create_context())
     module.verify()
     target = llvm.Target.from_default_triple()
-    machine = target.create_target_machine(opt=2, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten())
+    machine = target.create_target_machine(opt=2 if hot else 0, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten())
     module.triple = llvm.get_default_triple()
-    tuning = llvm.create_pipeline_tuning_options(speed_level=2)
-    tuning.slp_vectorization = True
+    tuning = llvm.create_pipeline_tuning_options(speed_level=2 if hot else 1)
+    tuning.slp_vectorization = hot
     passes = llvm.create_pass_builder(machine, tuning)
     passes.getModulePassManager().run(module, passes)
     engine = llvm.create_mcjit_compiler(module, machine)
@@ -175,6 +181,14 @@ class _Emitter:
         x = [self.names[k] for k in a]
         if op in ("add", "sub", "mul", "div"):
             return self._emit(f"f{op} contract double {x[0]}, {x[1]}")
+        if op == "inverse":  # 1/x, and 0 where x is 0
+            quotient = self._emit(f"fdiv double {_number(1.0)}, {x[0]}")
+            zero = self._emit(f"fcmp oeq double {x[0]}, {_number(0.0)}")
+            return self._emit(f"select i1 {zero}, double {_number(0.0)}, double {quotient}")
+        if op == "sqrt0":  # the root of max(x, 0)
+            positive = self._emit(f"fcmp ogt double {x[0]}, {_number(0.0)}")
+            cut = self._emit(f"select i1 {positive}, double {x[0]}, double {_number(0.0)}")
+            return self._emit(f"call double @llvm.sqrt.f64(double {cut})")
         if op == "neg":
             return self._emit(f"fneg double {x[0]}")
         if op == "select":

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Statistics:
-    """How a run went: its status, the method, and counts of steps, switches, evaluations and segments between breaks."""
+    """How a run went: its status, the method, and counts of steps, switches, evaluations and segments between breaks.
+
+    forced: very short steps taken past an instant of infinite slope, where the tolerance cannot be met.
+    """
 
     status: str
     method: str
@@ -26,6 +29,7 @@ class Statistics:
     events: int
     evaluations: int
     segments: int
+    forced: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,23 +32,23 @@ def add_scaled(target, factor, source, start, stop):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy")
-def error_norm(e, y, yn, n, width, count, rtol, atol, scale):  # type: ignore[no-untyped-def]
-    """The largest weighted RMS error over the states and over each parameter's sensitivities; > 1 is a rejection."""
+def error_norm(e, y, yn, n, rows, width, count, rtol, atol, scale):  # type: ignore[no-untyped-def]
+    """The largest weighted RMS error over the first `rows` of the n unknowns and of each parameter's sensitivities; > 1 is a rejection."""
     total = 0.0
-    for k in range(n):
+    for k in range(rows):
         r = e[k] / (atol + rtol * max(abs(y[k]), abs(yn[k])))
         total += r * r
     worst = total
     for c in range(count):
         floor = atol / scale[c]
         total = 0.0
-        for i in range(n):
+        for i in range(rows):
             k = n + i * width + c
             r = e[k] / (floor + rtol * max(abs(y[k]), abs(yn[k])))
             total += r * r
         if not total <= worst:
             worst = total
-    return np.sqrt(worst / n)
+    return np.sqrt(worst / rows)
 
 
 @njit(cache=True, error_model="numpy")
@@ -71,7 +71,7 @@ def rodas_matrix(address, y, w, wd, p, m, h, nx, jac, matrix, pivots):  # type: 
 
 
 @njit(cache=True, error_model="numpy")
-def rodas_stage(address, stage, h, nx, n, width, hess_row, hess_column, hess, ft, matrix, pivots, u, k, yd, w, wd, p, m):  # type: ignore[no-untyped-def]
+def rodas_stage(address, stage, h, forced, nx, n, width, hess_row, hess_column, hess, ft, matrix, pivots, u, k, yd, w, wd, p, m):  # type: ignore[no-untyped-def]
     """Computes k[stage] from the stage's values u, with w set for the stage's time."""
     size = u.size
     row = k[stage]
@@ -80,7 +80,7 @@ def rodas_stage(address, stage, h, nx, n, width, hess_row, hess_column, hess, ft
         factor = RODAS_C[stage, j] / h
         add_scaled(row, factor, k[j], 0, nx)
         add_scaled(row, factor, k[j], n, n + nx * width)
-    if RODAS_D[stage] != 0.0:
+    if forced and RODAS_D[stage] != 0.0:
         add_scaled(row, h * RODAS_D[stage], ft, 0, size)
     solve(matrix, pivots, row[:n])
     if width:

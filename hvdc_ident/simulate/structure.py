@@ -163,6 +163,11 @@ class Structure:
                 total = g.add(total, g.mul(d, g.leaf("yd", j)))
         return total
 
+    @property
+    def moves_by_itself(self) -> bool:
+        """Whether an equation uses `time`, so that its derivative in time is not 0 between changes of the inputs."""
+        return any(0 in self.partial(v, "w") for v in self.rhs)
+
     # --- functions ---
 
     def functions(self) -> list[Function]:
@@ -173,31 +178,31 @@ class Structure:
         def rows(nodes: Iterable[int], at: int) -> list[tuple[int, Row]]:
             return [(at + k * width, self._row(v)) for k, v in enumerate(nodes)] if width else []
 
-        def both(name: str, nodes: list[int]) -> Function:
-            return Function(name, list(enumerate(nodes)), rows(nodes, len(nodes)))
+        def both(name: str, nodes: list[int], hot: bool = False) -> Function:
+            return Function(name, list(enumerate(nodes)), rows(nodes, len(nodes)), hot=hot)
 
-        def plain(name: str, nodes: list[int], live: bool = False) -> Function:
-            return Function(name, list(enumerate(nodes)), live=live)
+        def plain(name: str, nodes: list[int], live: bool = False, hot: bool = False) -> Function:
+            return Function(name, list(enumerate(nodes)), live=live, hot=hot)
 
         jacobian = [(i * n + j, d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()]
         by_time = [self.rate(v, False) for v in self.rhs]
         modes = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
         result = [
-            plain("f", self.rhs),
-            Function("jac", jacobian),
+            plain("f", self.rhs, hot=not width),
+            Function("jac", jacobian, hot=True),
             both("ft", by_time),
-            plain("sw", list(g.switches)),
+            plain("sw", list(g.switches), hot=True),
             plain("swd", [self.rate(v, True) for v in g.switches]),
             plain("modes", modes, live=True),
-            plain("out", self.observed),
+            plain("out", self.observed, hot=not width),
             plain("src", self.sources),
             plain("srcd", [self.rate(v, True) for v in self.sources]),
             both("const", self.timing),
             *self._rest(),
         ]
         if width:
-            result += [both("fs", self.rhs), both("sws", list(g.switches)), both("outs", self.observed), both("srcs", self.sources)]
-            result.append(Function("hess", (), [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)]))
+            result += [both("fs", self.rhs, hot=True), both("sws", list(g.switches)), both("outs", self.observed, hot=True), both("srcs", self.sources)]
+            result.append(Function("hess", (), [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)], hot=True))
         if [v for v in g.switches] and len(g.switches) != s.ns:
             raise AssertionError("a derivative made a new condition")
         return result

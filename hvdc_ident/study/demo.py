@@ -33,8 +33,8 @@ STEPS = {
 }
 
 STUDY = f"""{FIRST_LINE}
-# The recordings come from the link with a lag of {LAG * 1e3:g} ms on all four currents, with noise of {NOISE:g} pu. The model
-# fitted here has no such lag: watch the gains make up for it. The true gains are KIP 30, KPVDC 24, KIVDC 734.7, KIQ 30.
+# The recordings come from the link with a lag of {LAG * 1e3:g} ms on all four currents and noise of {NOISE:g} pu.
+# The model fitted here has no such lag: watch the gains make up for it. The true gains are KIP 30, KPVDC 24, KIVDC 734.7, KIQ 30.
 schema = 1
 name = "demo"
 
@@ -82,4 +82,5 @@ def recording(
 
 def _lines(name: str, moved: str) -> str:
     outputs = ", ".join(f'"{o}"' for o in OUTPUTS)
-    return f'\n[[experiment]]\nname = "{name}"\ndata = "{name}.csv"\ninputs = ["{moved}"]\noutputs = [{outputs}]\nevent = {EVENT}\n'
+    signals = f'inputs = ["{moved}"]\noutputs = [{outputs}]'
+    return f'\n[[experiment]]\nname = "{name}"\ndata = "{name}.csv"\n{signals}\nevent = {EVENT}\n'

@@ -33,7 +33,7 @@ EXPECTED = {
 
 
 def parse_study(content: bytes, path: Path) -> StudyFile:
-    """The study file's tables. Raises StudyError: not text, not TOML, another schema, a key or value that does not fit."""
+    """The study file's tables. Raises StudyError: not text or TOML, another schema, a key or value that does not fit."""
     where = path.name
     table = _toml(content, where)
     if "schema" not in table:

@@ -20,7 +20,10 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Done:
-    """A stage that ran. data: its JSON. failed: why it did not come to its end, empty where it did. fresh: not kept from before."""
+    """A stage that ran.
+
+    data: its JSON. failed: why it did not come to its end, empty where it did. fresh: not kept from before.
+    """
 
     stage: Stage
     data: Mapping[str, Any]

@@ -218,12 +218,13 @@ def _scaled(table: schema.Experiment, model: Model, signal: str, column: str, da
     if not recorded or not unit or same_unit(recorded, unit):
         return data[column]
     by = factor(recorded, unit)
+    scale = f"{by:g}" if by else "... (value in the model = scale x recorded)"
     raise StudyError(
         f"column '{column}' is in another unit than the model's '{signal}'",
         where=f"{place}.columns.{signal}" if line.unit is not None else f"{place}, {table.data}",
         expected=f"'{unit}'",
         got=f"'{recorded}'",
-        hint=f'columns = {{{signal} = {{unit = "{recorded}", scale = {f"{by:g}" if by else "... (value in the model = scale x recorded)"}}}}}',
+        hint=f'columns = {{{signal} = {{unit = "{recorded}", scale = {scale}}}}}',
     )
 
 
@@ -271,7 +272,7 @@ def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, f
 
 
 def _noise(given: float | None, time: Array, values: Array, event: float | None) -> NoiseNote:
-    """The larger of what is given, or else estimated, and the floor; where the floor is larger the data are deterministic."""
+    """The larger of what is given, or else estimated, and the floor; where that is larger the data are deterministic."""
     floor = noise_floor(values)
     std = given if given is not None else noise_estimate(time, values, event)
     if std <= floor:

@@ -66,7 +66,7 @@ def _weights(fit: dict[str, Any]) -> str:
         parts.append(f"Intervals rest on the noise given or estimated before the event for {text(', '.join(given))}.")
     if misfit:
         parts.append(
-            f"{text(', '.join(misfit))}: the data are deterministic, so the standard deviation comes from the misfit of the fit."
+            f"{text(', '.join(misfit))}: the data are deterministic, so the standard deviation comes from the misfit."
         )
     return f"<p class='small'>{' '.join(parts)}</p>"
 

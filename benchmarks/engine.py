@@ -1,0 +1,177 @@
+"""The engine against its floor and against CasADi, in one run.
+
+    python benchmarks/engine.py            (needs the extra `bench`)
+
+The link, 8 gains as parameters, 1.5 s, three steps, 3001 points. "stiff": the link as it is (index-1 DAE, a mode near
+-41 000 1/s). "smooth": lags on all currents, measurements and the dc line, no fast mode. Times are the minimum of
+several runs; only ratios of one run mean anything on a shared machine.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import sympy as sp
+from numba import njit
+
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.models import load_model
+from hvdc_ident.simulate import Tolerance, engine, simulate
+from hvdc_ident.simulate.call import call
+from hvdc_ident.simulate.structure import NAMES
+
+GAINS = ("KPVDC", "KIVDC", "KPP", "KIP", "KPQ", "KIQ", "KPQ2", "KIQ2")
+STEPS = {"Vdcref1": (0.1, 1.0, 1.019), "Pref2": (0.5, 0.4, 0.5), "Qref1": (0.9, 0.0, 0.1)}
+CASE = experiment("steps", np.linspace(0.0, 1.5, 3001), {n: InputSignal.step(*s) for n, s in STEPS.items()})
+
+
+def best(function, repeat=15, warm=2):
+    """The shortest of several runs, s."""
+    for _ in range(warm):
+        function()
+    return min(_timed(function) for _ in range(repeat))
+
+
+def _timed(function):
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+@njit(error_model="numpy")
+def _many(address, y, w, p, m, out, count):
+    for _ in range(count):
+        call(address, y.ctypes, y.ctypes, w.ctypes, w.ctypes, p.ctypes, m.ctypes, out.ctypes)
+
+
+def cost(code, name):
+    """Seconds of one call of a generated function."""
+    s = code.structure.sizes
+    address = code._address[NAMES.index(name)]
+    p = np.array(list(code.structure.model.values.values()))
+    u = np.array([i.value for i in code.structure.model.inputs.values()])
+    y, w = code.start(p, u)
+    out, m = np.zeros(100_000), np.zeros(max(s.ns, 1))
+    return best(lambda: _many(address, y, w, p, m, out, 20_000), 9) / 20_000
+
+
+def floor(model, sensitivities, statistics):
+    """Accepted steps x the method's evaluations x the generated functions' cost, s."""
+    code = engine(model, sensitivities)
+    rhs = cost(code, "fs" if sensitivities else "f")
+    if statistics.method == "explicit":
+        return statistics.accepted * 6 * rhs
+    extra = cost(code, "jac") + (cost(code, "hess") if sensitivities else 0.0)
+    return statistics.accepted * (8 * rhs + extra)
+
+
+def smooth(link):
+    """The link with lags that take the fast modes out: 16 states, no unknowns."""
+    lags = [(["Ir1", "Ii1", "Ir2", "Ii2"], 1.6e-3), (["Vdc1_m", "P2_m", "Q1_m", "Q2_m"], 1.5e-3), (["Idc"], 3e-3)]
+    return link.with_effects({"effect": "lag", "at": at, "parameters": {"T": T}} for at, T in lags)
+
+
+def casadi_run(model, sensitivities, rtol):
+    """A function that runs CasADi's cvodes or idas on the same equations from the same start, and its last output."""
+    import casadi as ca
+
+    code = engine(model, ())
+    s = code.structure
+    values = {n: ca.SX.sym(n) for n in (*s.states, *s.unknowns, *model.parameters, *model.inputs)}
+    rules = {"clip": lambda x, a, b: ca.fmin(ca.fmax(x, a), b), "Max": lambda *a: _fold(ca.fmax, a), "Min": lambda *a: _fold(ca.fmin, a), "sqrt": ca.sqrt}
+    from hvdc_ident.simulate.structure import _ordered
+
+    definitions = {n: g.value for n, g in model.signals.items()} | {n: model.algebraic[n].equation for n in model.algebraic if n not in s.unknowns}
+    for name in _ordered(definitions, model.name):
+        values[name] = _casadi(definitions[name], values, rules)
+    ode = ca.vertcat(*(_casadi(x.derivative, values, rules) for x in model.states.values()))
+    x, p = ca.vertcat(*(values[n] for n in s.states)), ca.vertcat(*(values[n] for n in model.parameters))
+    u = ca.vertcat(*(values[n] for n in model.inputs))
+    dae = {"x": x, "ode": ode, "p": ca.vertcat(p, u)}
+    if s.unknowns:
+        dae |= {"z": ca.vertcat(*(values[n] for n in s.unknowns)), "alg": ca.vertcat(*(_casadi(model.algebraic[n].equation, values, rules) - values[n] for n in s.unknowns))}
+    options = {"reltol": rtol, "abstol": rtol / 100, "max_num_steps": 200_000} | ({"calc_ic": True} if s.unknowns else {"linear_multistep_method": "bdf"})
+    p0 = np.array(list(model.values.values()))
+    u0 = np.array([i.value for i in model.inputs.values()])
+    y, _ = code.start(p0, u0)
+    columns = [list(model.parameters).index(n) for n in sensitivities]
+    stops = [0.0, *(t for t, _, _ in STEPS.values()), 1.5]
+    plugin = "idas" if s.unknowns else "cvodes"
+    parts = []
+    for a, b in zip(stops[:-1], stops[1:], strict=True):
+        grid = CASE.time[(CASE.time > a) & (CASE.time <= b + 1e-12)]
+        whole = ca.integrator("f", plugin, dae, a, list(grid), options)
+        parts.append((whole.factory("s", ["x0", "z0", "p", *(["fwd:x0", "fwd:p", "fwd:z0"] if columns else [])], ["xf", *(["fwd:xf"] if columns else [])], {}, {}) if not columns else whole.forward(len(columns)), whole, grid.size))
+    start_rows = engine(model, sensitivities).start(p0, u0)[0] if columns else None
+
+    def run():
+        x0, level = y[: len(s.states)], u0.copy()
+        z0 = y[len(s.states) :]
+        n, width = len(s.states) + len(s.unknowns), engine(model, sensitivities).structure.sizes.width if columns else 0
+        fx = start_rows[n:].reshape(n, width)[: len(s.states), : len(columns)] if columns else None
+        fp = np.zeros((len(p0) + len(u0), len(columns)))
+        for k, c in enumerate(columns):
+            fp[c, k] = 1.0
+        for (forward, whole, count), begin in zip(parts, stops, strict=False):
+            for name, (t, _, after) in STEPS.items():
+                if t <= begin:
+                    level[list(model.inputs).index(name)] = after
+            pu = np.concatenate([p0, level])
+            r = whole(x0=x0, z0=z0, p=pu)
+            if columns:
+                # CasADi lays out the directions side by side, each with all its grid columns.
+                q = forward(x0=x0, z0=z0, p=pu, out_xf=r["xf"], out_qf=r["qf"], out_zf=r["zf"], fwd_x0=fx, fwd_p=fp)
+                fx = np.asarray(q["fwd_xf"]).reshape(len(s.states), len(columns), count)[:, :, -1]
+            x0, z0 = np.asarray(r["xf"])[:, -1], np.asarray(r["zf"])[:, -1] if s.unknowns else z0
+        return x0, fx
+
+    return run
+
+
+def _fold(f, a):
+    r = a[0]
+    for b in a[1:]:
+        r = f(r, b)
+    return r
+
+
+def _casadi(e, values, rules):
+    free = sorted(e.free_symbols, key=str)
+    return sp.lambdify(free, e, modules=[rules, "math"])(*(values[v.name] for v in free))
+
+
+def fresh_structure():
+    """Seconds from a model definition nobody compiled yet to its first trajectory with sensitivities."""
+    link = load_model("vsc-hvdc-link")
+    start = time.perf_counter()
+    model = link.with_effects([{"effect": "lag", "at": ["P2_m"], "parameters": {"T": 2e-3}}, {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.9}}])
+    simulate(model, CASE, sensitivities=GAINS)
+    return time.perf_counter() - start
+
+
+def main():
+    link = load_model("vsc-hvdc-link")
+    simulate(link, CASE, sensitivities=GAINS)
+    print(f"new structure, definition to first trajectory with 8 sensitivities: {fresh_structure():.2f} s")
+    for label, model in (("stiff", link), ("smooth", smooth(link))):
+        for rtol in (1e-6, 1e-8):
+            for names in ((), GAINS):
+                tolerance = Tolerance(rtol, rtol / 100)
+                result = simulate(model, CASE, sensitivities=names, tolerance=tolerance)
+                mine = best(lambda model=model, names=names, tolerance=tolerance: simulate(model, CASE, sensitivities=names, tolerance=tolerance))
+                base = floor(model, names, result.statistics)
+                line = f"{label:6s} rtol {rtol:.0e} {len(names)} sensitivities: {mine * 1e3:7.2f} ms, {result.statistics.accepted} steps ({result.statistics.method}), floor {base * 1e3:5.2f} ms, ratio {mine / base:4.1f}"
+                try:
+                    peer = casadi_run(model, names, rtol)
+                    theirs = best(peer, 3, 1)
+                    x, fx = peer()
+                    line += f"; casadi {theirs * 1e3:7.1f} ms, {theirs / mine:5.1f} x"
+                except ImportError:
+                    line += "; casadi is not installed"
+                print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
