@@ -34,7 +34,7 @@ STEPS = {
 
 STUDY = f"""{FIRST_LINE}
 # The recordings come from the link with a lag of {LAG * 1e3:g} ms on all four currents and noise of {NOISE:g} pu.
-# The model fitted here has no such lag: watch the gains make up for it. The true gains are KIP 30, KPVDC 24, KIVDC 734.7, KIQ 30.
+# The model fitted here has no such lag: watch the gains make up for it. True: KIP 30, KPVDC 24, KIVDC 734.7, KIQ 30.
 schema = 1
 name = "demo"
 

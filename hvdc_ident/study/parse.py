@@ -33,7 +33,7 @@ EXPECTED = {
 
 
 def parse_study(content: bytes, path: Path) -> StudyFile:
-    """The study file's tables. Raises StudyError: not text or TOML, another schema, a key or value that does not fit."""
+    """The study file's tables. Raises StudyError: not text or TOML, another schema, a key or value that is wrong."""
     where = path.name
     table = _toml(content, where)
     if "schema" not in table:
@@ -132,7 +132,7 @@ def _place(loc: typing.Sequence[int | str], table: Any) -> str:
     """`experiment 'step-up'.window`: the place in the words of the file."""
     text, here = "", table
     for part in loc:
-        here = here[part] if isinstance(here, dict | list) and _has(here, part) else None
+        here = _inner(here, part)
         if isinstance(part, int):
             name = here.get("name") if isinstance(here, dict) else None
             text += f" '{name}'" if isinstance(name, str) else f" number {part + 1}"
@@ -141,8 +141,10 @@ def _place(loc: typing.Sequence[int | str], table: Any) -> str:
     return text
 
 
-def _has(here: Any, part: int | str) -> bool:
-    return part in here if isinstance(here, dict) else isinstance(part, int) and part < len(here)
+def _inner(here: Any, part: int | str) -> Any:
+    if isinstance(here, dict):
+        return here.get(part)
+    return here[part] if isinstance(here, list) and isinstance(part, int) and part < len(here) else None
 
 
 def _unknown_key(key: str, outer: tuple[int | str, ...], table: dict[str, Any], where: str) -> StudyError:

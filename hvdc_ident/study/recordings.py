@@ -231,7 +231,7 @@ def _scaled(table: schema.Experiment, model: Model, signal: str, column: str, da
 def _unit(model: Model, signal: str) -> str:
     for table in (model.inputs, model.outputs, model.signals, model.states, model.algebraic):
         if signal in table:
-            return str(table[signal].unit)  # type: ignore[index]
+            return str(table[signal].unit)
     return ""
 
 
@@ -272,7 +272,7 @@ def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, f
 
 
 def _noise(given: float | None, time: Array, values: Array, event: float | None) -> NoiseNote:
-    """The larger of what is given, or else estimated, and the floor; where that is larger the data are deterministic."""
+    """The larger of what is given, else estimated, and the floor; where that acts the data are deterministic."""
     floor = noise_floor(values)
     std = given if given is not None else noise_estimate(time, values, event)
     if std <= floor:

@@ -28,6 +28,6 @@ class ModelSimulator:
     ) -> Simulation:
         """A run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
         try:
-            return simulate(self.model, experiment, values, sensitivities)
+            return simulate(self.model, experiment, values, sensitivities, outputs=experiment.outputs or None)
         except SteadyStateError as e:
             raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None

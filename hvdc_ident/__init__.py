@@ -1,0 +1,104 @@
+"""Linearisation, identifiability, calibration and discrepancy diagnosis of converter models.
+
+The verbs and the nouns of the package; each is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import inspect
+
+    from hvdc_ident.experiment import Experiment, InputSignal
+    from hvdc_ident.fit import fit
+    from hvdc_ident.formats import read_waveforms
+    from hvdc_ident.model.definition import Model
+    from hvdc_ident.models import load_model
+    from hvdc_ident.parameters import Input, Parameter
+    from hvdc_ident.simulate import simulate
+    from hvdc_ident.study.study import load_study
+    from hvdc_ident.trajectory import Trajectory
+
+    __version__: str
+
+__all__ = [
+    "Experiment",
+    "Input",
+    "InputSignal",
+    "Model",
+    "Parameter",
+    "Trajectory",
+    "__version__",
+    "fit",
+    "load_model",
+    "load_study",
+    "read_waveforms",
+    "simulate",
+]
+
+_HOME = {
+    "Experiment": "experiment",
+    "Input": "parameters",
+    "InputSignal": "experiment",
+    "Model": "model.definition",
+    "Parameter": "parameters",
+    "Trajectory": "trajectory",
+    "fit": "fit",
+    "load_model": "models",
+    "load_study": "study.study",
+    "read_waveforms": "formats",
+    "simulate": "simulate",
+}
+
+
+_VERBS = ("fit", "simulate")
+"""Names of a function and of the folder it lives in."""
+
+
+class _Verb(ModuleType):
+    """A folder that can be called: it runs the function of its own name."""
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self._function(*arguments, **named)
+
+    @property
+    def _function(self) -> Any:
+        return self.__dict__[self.__name__.rpartition(".")[2]]
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        import inspect
+
+        return inspect.signature(self._function)
+
+
+class _Package(ModuleType):
+    """The package; importing `hvdc_ident.fit` puts that folder under the verb's name: it answers the call."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _VERBS and isinstance(value, ModuleType):
+            value.__class__ = _Verb
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    """The public name, imported now; or the version."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("hvdc_ident")
+    if name not in _HOME:
+        raise AttributeError(f"module 'hvdc_ident' has no attribute '{name}'")
+    module = importlib.import_module(f"hvdc_ident.{_HOME[name]}")
+    return module if name in _VERBS else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,71 @@
+"""Imports run down the list of rooms and never up."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
+
+ROOMS = (
+    "errors files frozen parameters trajectory experiment waveform expression model effects models formats simulate fmu "
+    "linearize sensitivity fit identifiability discrepancy report study cli"
+).split()
+
+ALLOWED = {
+    # (from, to): why
+    ("model", "effects"): "Model.with_effects is a method of the model; the catalogue is looked up when it is called",
+}
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """Every module of the package that a file imports, anywhere in it; what only type checkers see is left out."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    typing_only = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in typing_only:
+            continue
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute"
+            module = node.module or ""
+            yield from [f"{module}.{alias.name}" for alias in node.names] if module == "hvdc_ident" else [module]
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def _room(path: Path) -> str:
+    first = path.relative_to(PACKAGE).parts[0]
+    return first.removesuffix(".py")
+
+
+def test_every_room_has_a_place_in_the_list() -> None:
+    rooms = {_room(p) for p in PACKAGE.rglob("*.py")} - {"__init__"}
+    assert rooms <= set(ROOMS), f"not in the list: {sorted(rooms - set(ROOMS))}"
+
+
+def test_imports_run_down() -> None:
+    upward = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = _room(path)
+        if room == "__init__":
+            continue  # the package's face: it may name everything
+        for module in _imports(path):
+            parts = module.split(".")
+            if parts[0] != "hvdc_ident" or len(parts) < 2:
+                continue
+            other = parts[1]
+            if other not in ROOMS or ROOMS.index(other) <= ROOMS.index(room) or (room, other) in ALLOWED:
+                continue
+            upward.append(f"{path.relative_to(PACKAGE)} imports {module}")
+    assert not upward, "\n".join(upward)
+
+
+def test_only_what_is_needed_is_allowed() -> None:
+    used = {(_room(p), m.split(".")[1]) for p in PACKAGE.rglob("*.py") for m in _imports(p) if m.count(".")}
+    assert set(ALLOWED) <= used

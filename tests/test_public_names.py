@@ -1,0 +1,50 @@
+"""What `import hvdc_ident` offers: exactly the names of __all__, each with a docstring."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+
+import pytest
+
+import hvdc_ident
+
+
+def test_all_names_resolve() -> None:
+    for name in hvdc_ident.__all__:
+        assert getattr(hvdc_ident, name) is not None
+    assert sorted(hvdc_ident.__all__) == list(hvdc_ident.__all__) == dir(hvdc_ident)
+    assert set(hvdc_ident._HOME) | {"__version__"} == set(hvdc_ident.__all__)
+
+
+def test_another_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'no_such_thing'"):
+        _ = hvdc_ident.no_such_thing  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", [n for n in hvdc_ident.__all__ if not n.startswith("_")])
+def test_public_names_have_a_docstring(name: str) -> None:
+    assert (getattr(hvdc_ident, name).__doc__ or "").strip()
+
+
+@pytest.mark.parametrize("verb", ["fit", "simulate"])
+def test_a_verb_can_be_called_whatever_was_imported_first(verb: str) -> None:
+    folder = importlib.import_module(f"hvdc_ident.{verb}")
+    assert callable(getattr(hvdc_ident, verb))
+    assert inspect.signature(getattr(hvdc_ident, verb)) == inspect.signature(getattr(folder, verb))
+
+
+def test_version_is_a_version() -> None:
+    assert re.fullmatch(r"\d+\.\d+.*", hvdc_ident.__version__)
+
+
+def test_the_package_and_the_command_line_import_nothing_heavy() -> None:
+    code = "import sys, hvdc_ident, hvdc_ident.cli; print(*sorted(sys.modules))"
+    loaded = set(
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    )
+    heavy = {"numpy", "scipy", "sympy", "numba", "llvmlite", "matplotlib", "pydantic", "xarray", "control"}
+    assert not loaded & heavy
