@@ -29,7 +29,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
 
 StudyFile = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).", show_default=False)]
@@ -118,7 +118,7 @@ def demo(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate the shipped link on waveforms made here, and write DIR/report.html."""
+    """Calibrate the shipped link on recordings made here."""
     from hvdc_ident.study.demo import write_demo
     from hvdc_ident.study.progress import progress
     from hvdc_ident.study.study import load_study
@@ -138,7 +138,7 @@ def new(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a commented study with data that runs, to start from."""
+    """Write a commented study, with data, to start from."""
     from hvdc_ident.study.starter import write_starter
 
     path = write_starter(folder)
@@ -152,7 +152,7 @@ def new(
 def check(
     study: StudyFile, seed: Seed = 0, json: Json = False, quiet: Quiet = False, trust: Trust = False, out: Out = None
 ) -> None:
-    """Validate the study, its model and its data; run nothing, write nothing."""
+    """Validate study, model and data; run nothing."""
     from hvdc_ident.study.study import load_study
     from hvdc_ident.study.summary import summary, summary_text
 
@@ -173,7 +173,10 @@ def run_(
     quiet: Quiet = False,
     trust: Trust = False,
 ) -> None:
-    """Every stage the study asks for, then the report; a second run redoes only what changed."""
+    """Every stage the study asks for, then the report.
+
+    A second run redoes only what changed; after a kill it goes on.
+    """
     from hvdc_ident.study.progress import progress
     from hvdc_ident.study.study import load_study
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
-ROOMS = (
-    "errors files frozen parameters trajectory experiment waveform expression model effects models formats simulate fmu "
-    "linearize sensitivity fit identifiability discrepancy report study cli"
-).split()
+ROOMS = """
+errors files frozen parameters trajectory experiment waveform expression model effects models formats simulate fmu
+linearize sensitivity fit identifiability discrepancy report study cli
+""".split()  # noqa: SIM905 - one list of words, read as such
 
 ALLOWED = {
     # (from, to): why

@@ -1,4 +1,4 @@
-"""Every wrong study or recording: exit code 2, one message that says what, where and what was expected, nothing written."""
+"""Every wrong study or recording: exit code 2, one message with what, where and what was expected, nothing written."""
 
 from __future__ import annotations
 

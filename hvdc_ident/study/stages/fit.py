@@ -109,7 +109,7 @@ def _executor(workers: int) -> Iterator[Any]:
 STAGE = Stage(
     name="fit",
     file="fit.json",
-    summary="Estimates of the candidate parameters from the recordings, with their intervals.",
+    summary="Estimates of the candidates, with their intervals.",
     run=run,
     wanted=lambda study: study.settings.fit is not None,
     order=40,

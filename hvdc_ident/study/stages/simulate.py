@@ -50,7 +50,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 STAGE = Stage(
     name="simulate",
     file="simulation.json",
-    summary="The model as the study gives it, against every recording: RMSE and waveforms.",
+    summary="The model as it is given, against every recording.",
     run=run,
     wanted=lambda study: bool(study.experiments),
     order=10,

@@ -1,0 +1,174 @@
+"""The page: built from files alone, safe against names, small, the same each time."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import InputError
+from hvdc_ident.report.drawing import visible
+from hvdc_ident.report.html import number, share
+from hvdc_ident.report.page import page, write_report
+
+NASTY = "<script>alert(1)</script>&\"'$x^2$"
+
+
+def folder_of(path: Path, rows: int = 500, study: str = "a study", output: str = "y", unit: str = "pu") -> Path:
+    """A folder of results as the stages write them."""
+    heading = {
+        "schema": 1,
+        "study": study,
+        "model": "m",
+        "software": "hvdc_ident 0",
+        "seed": 0,
+        "sources": {"s.toml": "ab"},
+    }
+    about = {"role": "fit", "event": 0.1, "window": None}
+    fit: dict[str, Any] = {
+        **heading,
+        "status": "converged",
+        "message": "2 of 2 runs converged",
+        "fitted": ["K"],
+        "held": {"L": "its bound is open", "R": "not a candidate"},
+        "values": {"K": 2.0, "L": 1.0},
+        "estimates": {"K": {"value": 2.0, "std": 0.1, "ci95": [1.8, 2.2], "method": "covariance"}},
+        "candidates": {
+            "K": {"start": 1.0, "min": 0.0, "max": None, "unit": unit},
+            "L": {"start": 1.0, "min": 0.5, "max": 2.0},
+        },
+        "rmse": {output: {"e": 0.01}},
+        "rmse_start": {output: {"e": 0.1}},
+        "chi2_per_dof": 1.02,
+        "units": {output: unit},
+        "experiments": {"e": about},
+        "noise": {"e": {output: {"std": 0.01, "source": "given"}}},
+    }
+    path.mkdir(parents=True, exist_ok=True)
+    (path / "fit.json").write_text(json.dumps(fit))
+    (path / "simulation.json").write_text(
+        json.dumps({**heading, "rmse": {output: {"e": 0.1}}, "experiments": {"e": about}})
+    )
+    time = np.linspace(0.0, 1.0, rows)
+    quoted = '"' + output.replace('"', '""') + '"'
+    measured = '"' + output.replace('"', '""') + '.measured"'
+    for stage, gain in (("simulation", 0.8), ("fit", 1.0)):
+        lines = [f"{t!r},{gain * t!r},{t!r}" for t in time.tolist()]
+        (path / f"{stage}.e.csv").write_text(f"time,{quoted},{measured}\n" + "\n".join(lines) + "\n")
+    return path
+
+
+class _Balanced(HTMLParser):
+    """Notes every tag that is not closed, and every address."""
+
+    VOID = frozenset({"meta", "br", "link", "hr", "img"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append(tag)
+        self.addresses += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append(tag)
+        self.addresses += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+
+def parsed(text: str) -> _Balanced:
+    parser = _Balanced()
+    parser.feed(text)
+    parser.close()
+    assert not parser.open
+    return parser
+
+
+def test_the_page_is_whole_and_needs_no_network(tmp_path: Path) -> None:
+    text = page(folder_of(tmp_path))
+    found = parsed(text)
+    assert found.seen.count("svg") == 1 and "script" not in found.seen
+    assert all(a.startswith("#") for a in found.addresses)
+    for words in (
+        "Gains",
+        "Error before and after",
+        "Waveforms",
+        "Provenance",
+        "its bound is open",
+        "1.8 … 2.2",
+        "−90.0 %",
+    ):
+        assert words in text
+
+
+def test_the_page_is_the_same_each_time(tmp_path: Path) -> None:
+    folder_of(tmp_path)
+    assert page(tmp_path) == page(tmp_path)
+
+
+def test_names_are_escaped(tmp_path: Path) -> None:
+    text = page(folder_of(tmp_path, study=NASTY, output=NASTY, unit=NASTY))
+    assert "script" not in parsed(text).seen
+    assert "<script" not in text and "&lt;script&gt;" in text
+
+
+def test_long_waveforms_stay_small(tmp_path: Path) -> None:
+    assert write_report(folder_of(tmp_path, rows=200_000)).stat().st_size < 300_000
+
+
+def test_what_is_drawn_keeps_every_extreme() -> None:
+    time = np.linspace(0.0, 1.0, 100_001)
+    values = np.zeros(time.size)
+    values[51_234], values[51_236] = 3.0, -2.0
+    t, v = visible(time, values)
+    assert t.size <= 2002 and v.max() == 3.0 and v.min() == -2.0
+    assert (np.diff(t) > 0).all() and t[0] == 0.0 and t[-1] == 1.0
+
+
+def test_an_older_result_is_pointed_out(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path)
+    old = json.loads((folder / "simulation.json").read_text())
+    (folder / "simulation.json").write_text(json.dumps({**old, "sources": {"s.toml": "cd"}}))
+    assert "simulation.json comes from an earlier state of the study" in page(folder)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[" * 100_000])
+def test_a_broken_result_is_an_input_error(tmp_path: Path, content: str) -> None:
+    (folder_of(tmp_path) / "fit.json").write_text(content)
+    with pytest.raises(InputError, match=re.escape("fit.json")):
+        page(tmp_path)
+
+
+def test_a_table_outside_the_folder_is_not_read(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "inner")
+    (tmp_path / "fit.x.csv").write_text("time,y,y.measured\n0,1,2\n")
+    data = json.loads((folder / "fit.json").read_text())
+    data["experiments"] = {"../x": {"role": "fit"}, "/../../x": {}}
+    (folder / "fit.json").write_text(json.dumps(data))
+    assert "<figure>" in page(folder)  # that of the simulation alone
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(1.0, "1"), (None, "–"), (float("nan"), "–"), (-0.5, "−0.5"), (1e-9, "1·10<sup>−9</sup>"), (True, "–")],
+)
+def test_numbers(value: object, shown: str) -> None:
+    assert number(value) == shown
+
+
+def test_shares() -> None:
+    assert share(2.0, 1.0) == "+100.0 %"
+    assert share(2.0, 0.0) == share(None, 1.0) == "–"

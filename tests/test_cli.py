@@ -1,0 +1,220 @@
+"""The command line: what it prints where, its exit codes, and that nothing surfaces as a traceback."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from hvdc_ident.cli import app
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.study.stage import stages
+
+CARD = """\
+schema = 1
+name = "lag"
+[parameters]
+k = {value = 1.0, unit = "1/s", min = 0.001, max = 1000.0}
+[inputs]
+u = {value = 0.0}
+[states]
+x = {derivative = "k*(u - x)"}
+[outputs]
+y = "x"
+"""
+STUDY = """\
+schema = 1
+name = "first"
+[model]
+source = "lag.toml"
+[parameters]
+k = {start = 2, min = 0.5, max = 20}
+[[experiment]]
+name = "step"
+data = "step.csv"
+inputs = ["u"]
+outputs = ["y"]
+noise = {y = 1e-3}
+[fit]
+starts = 2
+"""
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    time = np.arange(201) * 0.01
+    u = np.where(time >= 0.5, 1.0, 0.0)
+    y = np.where(time >= 0.5, 1.0 - np.exp(-5.0 * (time - 0.5)), 0.0) + 1e-3 * np.random.default_rng(3).standard_normal(
+        201
+    )
+    rows = "\n".join(f"{t:.2f},{a:g},{b:.9f}" for t, a, b in zip(time, u, y, strict=True))
+    (tmp_path / "step.csv").write_text(f"time,u,y\n{rows}\n")
+    (tmp_path / "lag.toml").write_text(CARD)
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path / "study.toml"
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def test_check_tells_what_it_found_and_writes_nothing(study: Path) -> None:
+    before = sorted(study.parent.iterdir())
+    result = call("check", study)
+    assert result.exit_code == 0, result.output
+    assert "study first: good" in result.stdout
+    assert "candidate k: from 2 within [0.5, 20] 1/s" in result.stdout
+    assert "201 rows, 0 to 2 s, event at 0.5 s; noise y 0.001 (given)" in result.stdout
+    assert sorted(study.parent.iterdir()) == before
+
+
+def test_fit_finds_the_gain_and_writes_every_file(study: Path) -> None:
+    result = call("fit", study)
+    assert result.exit_code == 0, result.output
+    folder = study.parent / "study-results"
+    found = json.loads((folder / "fit.json").read_text())
+    assert abs(found["estimates"]["k"]["value"] - 5.0) < 0.05
+    assert {"schema", "study", "model", "software", "seed"} <= set(found)
+    names = {"fit.json", "fitted-values.toml", "fitted-values.csv", "fitted-values.ssv", "fit.step.csv"}
+    assert {p.name for p in folder.iterdir()} == names
+
+
+def test_run_then_report_from_the_folder_alone(study: Path, tmp_path: Path) -> None:
+    assert call("run", study, "--out", tmp_path / "r", "--quiet").output == ""
+    page = (tmp_path / "r" / "report.html").read_text()
+    (tmp_path / "r" / "report.html").unlink()
+    study.unlink()
+    assert call("report", tmp_path / "r").exit_code == 0
+    assert (tmp_path / "r" / "report.html").read_text() == page
+
+
+def test_a_second_run_keeps_what_stands_and_a_change_is_done_again(study: Path) -> None:
+    def states() -> dict[str, str]:
+        lines = [line.split(": ") for line in call("run", study).stdout.splitlines()]
+        return {a: b for a, b in lines if a in ("simulate", "fit")}
+
+    assert states() == {"simulate": "done", "fit": "done"}
+    assert states() == {"simulate": "kept from before", "fit": "kept from before"}
+    (study.parent / "study-results" / "fitted-values.ssv").unlink()
+    assert states() == {"simulate": "kept from before", "fit": "done"}
+    study.write_text(STUDY.replace("start = 2", "start = 3"))
+    assert states() == {"simulate": "done", "fit": "done"}
+
+
+@pytest.mark.parametrize("command", ["check", "simulate", "fit", "run"])
+def test_json_is_all_there_is_on_stdout(study: Path, command: str) -> None:
+    result = call(command, study, "--json")
+    found = json.loads(result.stdout)
+    assert found["study"] == "first" and found["schema"] == 1 and found["seed"] == 0
+    assert result.stderr == ""
+
+
+def test_two_seeds_two_headings_one_seed_one_result(study: Path) -> None:
+    def fit(seed: int) -> dict[str, Any]:
+        return dict(json.loads(call("fit", study, "--json", "--seed", seed).stdout))
+
+    assert fit(4) == fit(4)
+    assert fit(5)["seed"] == 5
+
+
+@pytest.mark.parametrize(
+    "arguments", [["chekc", "x"], ["check"], ["fit", "x", "--sed", "1"], ["run", "x", "--workers", "0"]]
+)
+def test_wrong_usage_is_exit_code_2(arguments: list[str]) -> None:
+    assert call(*arguments).exit_code == 2
+
+
+@pytest.mark.parametrize("kind", ["models", "effects", "formats"])
+def test_catalogues(kind: str) -> None:
+    text, data = call(kind), json.loads(call(kind, "--json").stdout)
+    assert text.exit_code == 0
+    assert len(text.stdout.splitlines()) == len(data[kind]) > 0
+    assert all(line.strip() for line in data[kind].values())
+
+
+def test_convert_and_list(study: Path, tmp_path: Path) -> None:
+    data = study.parent / "step.csv"
+    assert call("convert", data, "--list", "").stdout.split() == ["u", "y"]
+    assert call("convert", data, "--to", tmp_path / "y.csv", "--signal", "y").exit_code == 0
+    assert (tmp_path / "y.csv").read_text().startswith("time,y\n")
+    assert call("convert", data).exit_code == 2
+
+
+def test_new_writes_a_study_that_passes_check(tmp_path: Path) -> None:
+    assert call("new", tmp_path / "n").exit_code == 0
+    assert call("check", tmp_path / "n" / "study.toml").exit_code == 0
+    again = call("new", tmp_path / "n")
+    assert again.exit_code == 2 and "already" in again.stderr
+
+
+def test_a_demo_never_overwrites_a_study(study: Path) -> None:
+    result = call("demo", "--out", study.parent)
+    assert result.exit_code == 2 and "another study" in result.stderr
+    assert study.read_text() == STUDY
+
+
+def test_a_folder_that_cannot_be_made_is_the_users_to_mend(study: Path) -> None:
+    result = call("simulate", study, "--out", study / "inside-a-file")
+    assert result.exit_code == 2 and "cannot write" in result.stderr
+
+
+def test_results_without_a_stage(tmp_path: Path) -> None:
+    result = call("report", tmp_path)
+    assert result.exit_code == 2 and "no results" in result.stderr
+
+
+def test_a_stage_that_fails_keeps_its_results_and_ends_in_1(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("the run stopped at 0.5 s")
+
+    monkeypatch.setattr("hvdc_ident.simulate.simulate", fails)
+    result = call("simulate", study)
+    assert result.exit_code == 1
+    assert result.stderr.strip() == "error: simulate: the run stopped at 0.5 s"
+    kept = json.loads((study.parent / "study-results" / "simulation.json").read_text())
+    assert kept["rmse"] == {"y": {"step": None}}
+    assert kept["experiments"]["step"]["reason"] == "the run stopped at 0.5 s"
+
+
+def test_a_bug_is_one_line_and_the_traceback_is_asked_for(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("hvdc_ident.study.study.load_study", breaks)
+    result = call("check", study)
+    assert result.exit_code == 1
+    assert "Traceback" not in result.output and "ZeroDivisionError: division by zero" in result.stderr
+    monkeypatch.setenv("HVDC_IDENT_DEBUG", "1")
+    assert "Traceback" in call("check", study).stderr
+
+
+def test_an_interrupt_is_130(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stops(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hvdc_ident.study.study.load_study", stops)
+    result = call("run", study)
+    assert result.exit_code == 130 and result.stderr.startswith("interrupted: ")
+
+
+def test_every_stage_is_a_command_and_says_what_it_does() -> None:
+    text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).stdout
+    for stage in stages():
+        assert f"  {stage.name}" in text and stage.summary.rstrip(".") in text
+
+
+def test_the_installed_command_answers(tmp_path: Path) -> None:
+    code = "from hvdc_ident.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "check", "none.toml"], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert (
+        done.stderr == "error: none.toml: no such study file. Try: 'hvdc-ident new DIR' writes a study to start from\n"
+    )
