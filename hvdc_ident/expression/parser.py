@@ -170,11 +170,27 @@ def _combine(node: Node, arguments: list[sp.Expr]) -> sp.Expr:
             signed = zip(node.items, arguments, strict=True)
             return sp.Add(*(a if mark == "+" else product([sp.Integer(-1), a]) for (mark, _), a in signed))
         case Chain():
-            factors = zip(node.items, arguments, strict=True)
-            return product([a if mark == "*" else power(a, sp.Integer(-1)) for (mark, _), a in factors])
+            return _quotient([mark for mark, _ in node.items], arguments)
         case Call():
             return call(node.function, arguments)
     raise AssertionError(node)
+
+
+def _quotient(marks: list[str], arguments: list[sp.Expr]) -> sp.Expr:
+    """The product of the arguments after *, divided by those after /; its numbers as Python would divide them."""
+    numbers = [(m, a) for m, a in zip(marks, arguments, strict=True) if a.is_Rational or a.is_Float]
+    exact = all(a.is_Rational for _, a in numbers)
+    coefficient: Any = sp.Integer(1) if exact else 1.0
+    for mark, number in numbers:
+        value = number if exact else float(number)
+        if mark == "/" and value == 0:
+            raise _Unfit(_NOT_REAL)
+        coefficient = coefficient * value if mark == "*" else coefficient / value
+    if not exact and not math.isfinite(coefficient):
+        raise _Unfit("the number is not finite: too large for a double")
+    others = [(m, a) for m, a in zip(marks, arguments, strict=True) if not (a.is_Rational or a.is_Float)]
+    factors = [a if mark == "*" else power(a, sp.Integer(-1)) for mark, a in others]
+    return product([coefficient if exact else sp.Float(coefficient), *factors] if numbers else factors)
 
 
 def literal(text: str) -> sp.Expr:
@@ -242,6 +258,8 @@ def power(base: sp.Expr, exponent: sp.Expr) -> sp.Expr:
     size = abs(constant(exponent))
     if base.is_number:
         value = math.pow(constant(base), constant(exponent))
+        if constant(base) < 0 and not exponent.is_Integer:
+            return sp.Float(value)
         return sp.Pow(base, exponent) if size * _bits(base) <= 53 or base.is_Float else sp.Float(value)
     coefficient, rest = base.as_coeff_Mul()
     if coefficient.is_Rational and size * _bits(coefficient) > 53:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import sympy as sp
 
@@ -14,7 +14,7 @@ from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.parameters import Input, Parameter
 
-Start = sp.Expr | Literal["free"] | None
+Start: TypeAlias = sp.Expr | Literal["free"] | None
 
 
 @dataclass(frozen=True)
