@@ -28,6 +28,7 @@ th { font-weight: 600; color: var(--soft); border-bottom: 2px solid var(--line);
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tbody tr:hover { background: #f6f8fa; }
 code { font: .8rem ui-monospace, "Cascadia Mono", Menlo, Consolas, monospace; }
+sup { line-height: 0; font-size: .75em; }
 code { color: var(--soft); overflow-wrap: anywhere; }
 figure { margin: .4rem 0 1rem; break-inside: avoid; } figure svg { width: 100%; height: auto; display: block; }
 @media print {

@@ -87,7 +87,8 @@ def _first(error: ValidationError, table: dict[str, Any], where: str) -> StudyEr
         )
     got = _shown(problem["input"])
     if kind in EXPECTED:
-        return StudyError("a value of the wrong kind", where=place, expected=EXPECTED[kind], got=got)
+        what = "a value that does not fit" if kind == "finite_number" else "a value of the wrong kind"
+        return StudyError(what, where=place, expected=EXPECTED[kind], got=got)
     if kind == "value_error":
         text = str(problem["ctx"]["error"])
         key, _, rest = text.partition(": ")

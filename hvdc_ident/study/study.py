@@ -132,8 +132,10 @@ def _candidates(settings: schema.StudyFile, model: Model, where: str) -> FrozenM
     for name, line in settings.parameters.items():
         place = f"{where}, parameters.{name}"
         if name not in model.parameters:
-            hint = " (it is an input: see an experiment's values)" if name in model.inputs else ""
-            raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters{hint}")
+            if name in model.inputs:
+                hint = "an experiment's inputs, or its values"
+                raise StudyError(f"'{name}' is an input, not a parameter", where=f"{where}, parameters", hint=hint)
+            raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
         own = model.parameters[name]
         given = {k: v for k in ("start", "min", "max") if (v := getattr(line, k)) is not None}
         try:

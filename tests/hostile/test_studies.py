@@ -84,7 +84,7 @@ CASES = {
         ("KIP", "bounds"), _replace("[parameters]", "[model.values]\nKIP = -3\n[parameters]")
     ),
     "unknown parameter": Case(("no parameter 'KIPP'", "'KIP'"), _replace("KIP =", "KIPP =")),
-    "an input as parameter": Case(("no parameter 'Pref2'", "input"), _replace("KIP =", "Pref2 =")),
+    "an input as parameter": Case(("'Pref2' is an input", "values"), _replace("KIP =", "Pref2 =")),
     "bounds that miss the start": Case(("KIP", "min 60"), _replace("min = 5", "min = 60")),
     "bounds beyond the model's": Case(("parameters.KIP", "the model's own"), _replace("min = 5", "min = -5")),
     "infinite start": Case(("parameters.KIP.start", "finite number", "inf"), _replace("start = 25", "start = inf")),

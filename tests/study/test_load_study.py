@@ -25,7 +25,8 @@ def write(folder: Path, extra: str = "", head: str = "", **columns: np.ndarray) 
     names = "" if "inputs" in extra else 'inputs = ["Pref2"]\n'
     names += "" if 'outputs = ["Irorder2"]' in extra or "outputs = {" in extra else 'outputs = ["Irorder2"]\n'
     (folder / "s.toml").write_text(
-        f'schema = 1\n[model]\nsource = "vsc-hvdc-link"\n{head}\n[[experiment]]\nname = "d"\ndata = "d.csv"\n{names}{extra}\n'
+        f'schema = 1\n[model]\nsource = "vsc-hvdc-link"\n{head}\n'
+        f'[[experiment]]\nname = "d"\ndata = "d.csv"\n{names}{extra}\n'
     )
     return folder / "s.toml"
 
@@ -45,7 +46,8 @@ def test_names_defaults_and_sources(tmp_path: Path) -> None:
 
 
 def test_values_effects_and_parameterisation_reach_the_model(tmp_path: Path) -> None:
-    head = 'parameterisation = "physical"\n[model.values]\nZg = 0.02\n[[model.effect]]\neffect = "lag"\nat = ["Ir1", "Ir2"]\nparameters = {T = 0.002}\n'
+    head = 'parameterisation = "physical"\n[model.values]\nZg = 0.02\n[[model.effect]]\neffect = "lag"\n'
+    head += 'at = ["Ir1", "Ir2"]\nparameters = {T = 0.002}\n'
     study = loaded(tmp_path, head=head)
     assert study.model.values["Zg"] == 0.02
     assert {"J", "Ts"} <= set(study.model.parameters)
@@ -53,7 +55,8 @@ def test_values_effects_and_parameterisation_reach_the_model(tmp_path: Path) -> 
 
 
 def test_stated_values_win_over_starts_in_a_simulation_not_in_a_fit(tmp_path: Path) -> None:
-    head = "[model.values]\nKIP = 31\n[parameters]\nKIP = {start = 25, min = 5, max = 50}\nKPVDC = {start = 20, max = 40}\n"
+    head = "[model.values]\nKIP = 31\n[parameters]\nKIP = {start = 25, min = 5, max = 50}\n"
+    head += "KPVDC = {start = 20, max = 40}\n"
     study = loaded(tmp_path, head=head)
     assert dict(study.values) == {"KIP": 31.0, "KPVDC": 20.0}
     assert dict(study.start) == {"KIP": 25.0, "KPVDC": 20.0}
@@ -144,7 +147,8 @@ def test_later_stages_are_checked_as_well(tmp_path: Path, table: str, said: str)
     "table",
     [
         '[linearize]\ninputs = ["Vdcref1"]\nat = "start"',
-        '[[sweep]]\nparameter = "KIVDC"\nmin = 250\nmax = 1500\npoints = 51\nscale = "log"\n[[sweep]]\nparameter = "KIP"\nvalues = [1, 2.5]',
+        '[[sweep]]\nparameter = "KIVDC"\nmin = 250\nmax = 1500\npoints = 51\nscale = "log"',
+        '[[sweep]]\nparameter = "KIVDC"\nmin = 1\nmax = 2\npoints = 5\n[[sweep]]\nparameter = "KIP"\nvalues = [1, 2.5]',
         "[identifiability]",
         '[fit]\nmode = "simultaneous"\noptimiser = "trust-region"\nstarts = 3',
         '[diagnose]\neffects = "all"\nmaterial = {Irorder2 = 0.005}',
