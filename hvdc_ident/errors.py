@@ -7,7 +7,8 @@
     │   ├── UnknownNameError    a name that is not there, with the nearest ones
     │   ├── WaveformError       a data file or signal that cannot be used
     │   ├── StudyError          a study file that asks for the impossible
-    │   └── SteadyStateError    a model that has no steady state where one was asked for
+    │   ├── SteadyStateError    a model that has no steady state where one was asked for
+    │   └── LinearizationError  a point, loop or reduction that has no linear answer
     └── ComputationError        the work ran and failed: exit code 1
         ├── SimulationError     a trajectory that did not reach its end
         └── FitError            an estimation that did not reach an optimum
@@ -78,6 +79,10 @@ class StudyError(InputError):
 
 class SteadyStateError(InputError):
     """No steady state where one is needed."""
+
+
+class LinearizationError(InputError):
+    """No linear model, margin or reduction where one was asked for."""
 
 
 class ComputationError(HvdcIdentError):

@@ -113,7 +113,7 @@ def _inverse(normalised: Array, seen: Array) -> tuple[Array, Array]:
     inverse, null = np.zeros((p, p)), np.zeros((0, p))
     columns = np.flatnonzero(seen)
     if columns.size:
-        _, s, vt = np.linalg.svd(normalised[:, columns], full_matrices=True)
+        _, s, vt = np.linalg.svd(np.linalg.qr(normalised[:, columns], mode="r"), full_matrices=True)
         s = np.concatenate([s, np.zeros(columns.size - s.size)])
         good = s > SINGULAR * s[0]
         inverse[np.ix_(columns, columns)] = (vt[good].T / s[good] ** 2) @ vt[good]

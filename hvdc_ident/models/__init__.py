@@ -1,11 +1,17 @@
-"""The shipped models, one file each, and the one way to load any model."""
+"""The shipped models, one file each, and the one way to load any model.
+
+A file gives `model()` and one line, SUMMARY, under its own name with hyphens; where it has structure options it may
+ship more of them: VARIANTS, {name: (one line, function that gives the model)}.
+"""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.frozen import FrozenMap
@@ -15,24 +21,27 @@ __all__ = ["load_model", "shipped_models", "summaries"]
 
 
 @cache
-def _modules() -> FrozenMap[object]:
-    names = [m.name for m in pkgutil.iter_modules(__path__)]
-    return FrozenMap({n.replace("_", "-"): importlib.import_module(f"{__name__}.{n}") for n in sorted(names)})
+def _shipped_by_name() -> FrozenMap[tuple[str, Callable[[], Model]]]:
+    found: dict[str, tuple[str, Callable[[], Model]]] = {}
+    for name in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+        module: Any = importlib.import_module(f"{__name__}.{name}")
+        found |= {name.replace("_", "-"): (str(module.SUMMARY), module.model)} | getattr(module, "VARIANTS", {})
+    return FrozenMap(found)
 
 
 def shipped_models() -> tuple[str, ...]:
     """Names of the shipped models."""
-    return tuple(_modules())
+    return tuple(_shipped_by_name())
 
 
 def summaries() -> dict[str, str]:
     """One line on each shipped model."""
-    return {name: str(module.SUMMARY) for name, module in _modules().items()}  # type: ignore[attr-defined]
+    return {name: summary for name, (summary, _) in _shipped_by_name().items()}
 
 
 @cache
 def _shipped(name: str) -> Model:
-    return _modules()[name].model()  # type: ignore[attr-defined, no-any-return]
+    return _shipped_by_name()[name][1]()
 
 
 def load_model(source: str | Path, *, trust: bool = False) -> Model:
@@ -52,13 +61,19 @@ def load_model(source: str | Path, *, trust: bool = False) -> Model:
     if suffix == ".py":
         return _from_python(path, trust)
     if suffix or path.exists():
-        raise ModelError("this kind of model file cannot be read", where=text, expected="a model card (.toml) or a Python file (.py)")
+        raise ModelError(
+            "this kind of model file cannot be read", where=text, expected="a model card (.toml) or a Python file (.py)"
+        )
     raise unknown_name("shipped model", text, shipped_models())
 
 
 def _from_python(path: Path, trust: bool) -> Model:
     if not trust:
-        raise ModelError("a Python model runs its code", where=str(path), hint="read the file, then give --trust (or trust=True); a model card needs no trust")
+        raise ModelError(
+            "a Python model runs its code",
+            where=str(path),
+            hint="read the file, then give --trust (or trust=True); a model card needs no trust",
+        )
     if not path.is_file():
         raise ModelError("the model file is not there", where=str(path))
     namespace: dict[str, object] = {"__name__": "hvdc_ident_user_model", "__file__": str(path)}
@@ -66,5 +81,10 @@ def _from_python(path: Path, trust: bool) -> Model:
     found = namespace.get("model")
     result = found() if callable(found) else found
     if not isinstance(result, Model):
-        raise ModelError("the file defines no model", where=str(path), expected="a variable or function `model` that gives a Model", got=type(result).__name__)
+        raise ModelError(
+            "the file defines no model",
+            where=str(path),
+            expected="a variable or function `model` that gives a Model",
+            got=type(result).__name__,
+        )
     return result

@@ -54,11 +54,27 @@ def model() -> Model:
             }
         ),
         outputs=FrozenMap({n: Output(parse(n), "pu") for n in _OUTPUTS}),
-        parameterisations=FrozenMap({"gains": Parameterisation(FrozenMap(), FrozenMap(), "the controllers' gains"), "physical": _physical()}),
+        parameterisations=FrozenMap(
+            {"gains": Parameterisation(FrozenMap(), FrozenMap(), "the controllers' gains"), "physical": physical()}
+        ),
     )
 
 
-_OUTPUTS = ("Irorder1", "Iiorder1", "Irorder2", "Iiorder2", "Vdc1", "Vdc2", "P1", "Q1", "P2", "Q2", "Vac1", "Vac2", "Idc")
+_OUTPUTS = (
+    "Irorder1",
+    "Iiorder1",
+    "Irorder2",
+    "Iiorder2",
+    "Vdc1",
+    "Vdc2",
+    "P1",
+    "Q1",
+    "P2",
+    "Q2",
+    "Vac1",
+    "Vac2",
+    "Idc",
+)
 
 
 def _gains() -> dict[str, Parameter]:
@@ -92,7 +108,16 @@ def _plant() -> dict[str, Parameter]:
 
 def _signals() -> dict[str, str]:
     common = {"R": "Zg / sqrt(1 + XR**2)", "X": "XR * R"}
-    return common | _station(1) | _station(2) | _control_vdc() | _control_p() | _control_q("1", "KPQ", "KIQ") | _control_q("2", "KPQ2", "KIQ2") | _line()
+    return (
+        common
+        | _station(1)
+        | _station(2)
+        | _control_vdc()
+        | _control_p()
+        | _control_q("1", "KPQ", "KIQ")
+        | _control_q("2", "KPQ2", "KIQ2")
+        | _line()
+    )
 
 
 def _station(i: int) -> dict[str, str]:
@@ -139,16 +164,26 @@ def _line() -> dict[str, str]:
     return {"Idc": "(Vdc2 - Vdc1) / Rdc"}
 
 
-def _physical() -> Parameterisation:
+def physical() -> Parameterisation:
     """The gains from total capacitance J and settling time Ts: wn = 3/(z Ts), Kp = 2 z wn J, Ki = wn^2 J; 3/Ts for P and Q.
 
     The rule is reconstructed from Table I's numbers, which it gives digit for digit; it is not quoted from a manual.
     """
     wn = f"3/({DAMPING}*Ts)"
     integral = "3/Ts"
-    replaces = {"KPVDC": f"2*{DAMPING}*{wn}*J", "KIVDC": f"({wn})**2*J", "KIP": integral, "KIQ": integral, "KIQ2": integral}
+    replaces = {
+        "KPVDC": f"2*{DAMPING}*{wn}*J",
+        "KIVDC": f"({wn})**2*J",
+        "KIP": integral,
+        "KIQ": integral,
+        "KIQ2": integral,
+    }
     parameters = {
         "J": Parameter(0.4, "s", min=1e-6, description="total dc capacitance the controller is designed for"),
         "Ts": Parameter(0.1, "s", min=1e-6, description="settling time the controllers are designed for"),
     }
-    return Parameterisation(FrozenMap(parameters), FrozenMap({n: parse(e) for n, e in replaces.items()}), "design values: capacitance J and settling time Ts")
+    return Parameterisation(
+        FrozenMap(parameters),
+        FrozenMap({n: parse(e) for n, e in replaces.items()}),
+        "design values: capacitance J and settling time Ts",
+    )

@@ -166,7 +166,12 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
     yd = np.zeros(max(n, 1))
     jac, matrix, small = np.zeros((n, n)), np.zeros((n, n)), np.zeros((nz, nz))
     pivots, small_pivots = np.zeros(n, np.int64), np.zeros(max(nz, 1), np.int64)
-    hess = np.zeros(max(hess_row.size * width, 1))
+    hess = np.zeros((max(hess_row.size, 1), max(width, 1)))
+    mass, c_sum = np.zeros(size), np.zeros(size)
+    for q in range(nx):
+        mass[q] = 1.0
+    for q in range(nx * width):
+        mass[n + q] = 1.0
     m = np.zeros(max(ns, 1))
     slack, sv, top = np.zeros(ns), np.zeros(ns), np.zeros(ns)
     sws = np.zeros(ns * (1 + width) + 1)
@@ -300,6 +305,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         still = whole
         for i in range(nu):
             still = still and wd[1 + i] == 0.0
+        quiet = still and nd == 0  # only time itself changes within the segment
         forced = dims[10] > 0 or nd > 0 or not still
         if not forced:
             ft[:] = 0.0
@@ -346,7 +352,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             # One step into yn, with the error in e.
             regular = True
             if method == ROSENBROCK:
-                outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                if quiet:
+                    w[0] = t
+                else:
+                    outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                 if not rejected:
                     call(address[JAC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, jac.ctypes)
                     if forced:
@@ -364,11 +373,14 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     share = stage_time(method, s)
                     ts = step_end if share == 1.0 else t + share * hs
                     if s < 6 or method == EXPLICIT:
-                        outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                        if quiet:
+                            w[0] = ts
+                        else:
+                            outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                     counts[EVALUATIONS] += 1
                     if method == ROSENBROCK:
                         rodas_point(s, y, k, u)
-                        rodas_stage(address, s, hs, forced, nx, n, width, hess_row, hess_column, hess, ft, matrix, pivots, u, k, yd, w, wd, p, m)
+                        rodas_stage(address, s, hs, forced, nx, n, width, mass, hess_row, hess_column, hess, ft, matrix, pivots, u, k, c_sum, yd, w, wd, p, m)
                     else:
                         dopri_point(s, hs, y, k, u)
                         if s == 5:
@@ -425,7 +437,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         for q in range(n):
                             u[q] = yn[q]
                     ts = step_end if share == 1.0 else t + share * hs
-                    outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                    if quiet:
+                        w[0] = ts
+                    else:
+                        outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                     call(address[SW], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
                     event = violation(sv, m, slack)
                     if event >= 0:
@@ -437,7 +452,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     for _ in range(60):
                         middle = 0.5 * (good + bad)
                         interpolate(y, dense, middle, n, u)
-                        outside(t + middle * hs, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                        if quiet:
+                            w[0] = t + middle * hs
+                        else:
+                            outside(t + middle * hs, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                         call(address[SW], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
                         which = violation(sv, m, slack)
                         if which >= 0:
@@ -465,7 +483,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             # --- outputs ---
             while i_out < t_out.size and (t_out[i_out] < step_end or (t_out[i_out] == step_end and step_end < tb)):
                 interpolate(y, dense, (t_out[i_out] - t) / hs, size, u)
-                outside(t_out[i_out], t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                if quiet:
+                    w[0] = t_out[i_out]
+                else:
+                    outside(t_out[i_out], t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                 call(address[OUTS if width else OUT], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out[i_out].ctypes)
                 i_out += 1
             # --- the history of delayed signals ---
@@ -474,7 +495,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     share = j / (NODES - 1.0) * (step_end - t) / hs
                     interpolate(y, dense, share, size, u)
                     ts = min(t + share * hs, step_end)
-                    outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                    if quiet:
+                        w[0] = ts
+                    else:
+                        outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                     call(address[SRCS if width else SRC], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, src.ctypes)
                     for i in range(nd):
                         node_values[j, i, 0] = src[i]
@@ -508,7 +532,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             else:
                 chatter = 0
             last_event, last_switch = t, event
-            outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+            if quiet:
+                w[0] = t
+            else:
+                outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
             consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots)
             if width:
                 rates(address, y, w, wd, p, m, nx, nz, yd, f_before, jac, small, small_pivots)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.simulate.result import Simulation, Statistics
@@ -67,15 +67,16 @@ class Engine:
         s = self.structure.sizes
         n, extra = s.nx + s.nz, s.nd + s.nq
         m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
-        for guess in self._guesses(p):
+        for guess in self._guesses:
             y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width))
             y[:n], w[1 : 1 + s.nu] = guess, u
             jac = np.zeros((n + extra, n + extra))
             if rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst) == FOUND:
                 return y, w
-        return fallback(self.structure, self._address, self._dims, p, u, next(iter(self._guesses(p))))
+        return fallback(self.structure, self._address, self._dims, p, u, self._guesses[0])
 
-    def _guesses(self, p: Array) -> list[Array]:
+    @cached_property
+    def _guesses(self) -> list[Array]:
         """Where the search begins: the model's own guesses, then the unknown ones at 0, at 1 and at seeded random places."""
         m = self.structure.model
         given = [s.guess for s in m.states.values()]
@@ -118,14 +119,13 @@ class Engine:
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
         # "At the first row" is what stood before anything happened: the value from the left.
-        u = np.array([float(i.values[0]) if i.times[0] >= begin else float(i(np.nextafter(begin, -np.inf))) for i in inputs])
+        u = np.array([i.values[0] if i.times.size == 1 or i.times[0] >= begin else float(i(np.nextafter(begin, -np.inf))) for i in inputs])
         y, w = self.start(p, u)
         constants = self.constants(p)
         pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
         times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
         values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
-        breaks = np.unique(np.concatenate([np.empty(0), *(i.breaks for i in inputs)]))
-        breaks = breaks[(breaks > begin) & (breaks < end)]
+        breaks = np.array(sorted({b for i in inputs if i.breaks.size for b in i.breaks.tolist() if begin < b < end}))
         out = np.zeros((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else scale
         tol = tolerance
@@ -226,6 +226,11 @@ def engine(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[st
     return _engine(_Key(model.structure, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs), model))
 
 
+@lru_cache(maxsize=256)
+def _constant(value: float) -> InputSignal:
+    return InputSignal.constant(value)
+
+
 def simulate(
     model: Model,
     experiment: Experiment,
@@ -258,9 +263,7 @@ def simulate(
     if not np.isfinite(p).all():
         bad = [n for n, v in zip(plant.parameters, p, strict=True) if not np.isfinite(v)]
         raise ModelError(f"the value of parameter '{bad[0]}' is not finite", where=f"model '{model.name}'", hint="an effect at an infinite neutral value is left out: do not set it")
-    from hvdc_ident.experiment import InputSignal
-
-    signals = [experiment.inputs.get(n) or InputSignal.constant(given.get(n, i.value)) for n, i in plant.inputs.items()]
+    signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
     tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
     scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities] or [1.0])
     try:

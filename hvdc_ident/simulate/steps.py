@@ -24,14 +24,7 @@ from hvdc_ident.simulate.tableaus import (
 F, FS, JAC, HESS, FT, SW, SWS, SWD, MODES, OUT, OUTS, SRC, SRCS, SRCD, REST, REST_JAC, REST_P, CONST = range(18)
 
 
-@njit(cache=True, error_model="numpy")
-def add_scaled(target, factor, source, start, stop):  # type: ignore[no-untyped-def]
-    """target[start:stop] += factor source[start:stop]."""
-    for k in range(start, stop):
-        target[k] += factor * source[k]
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def error_norm(e, y, yn, n, rows, width, count, rtol, atol, scale):  # type: ignore[no-untyped-def]
     """The largest weighted RMS error over the first `rows` of the n unknowns and of each parameter's sensitivities; > 1 is a rejection."""
     total = 0.0
@@ -39,26 +32,31 @@ def error_norm(e, y, yn, n, rows, width, count, rtol, atol, scale):  # type: ign
         r = e[k] / (atol + rtol * max(abs(y[k]), abs(yn[k])))
         total += r * r
     worst = total
-    for c in range(count):
-        floor = atol / scale[c]
-        total = 0.0
+    if width:
+        es, ys, yns = e[n:].reshape(n, width), y[n:].reshape(n, width), yn[n:].reshape(n, width)
+        totals, floors = np.zeros(width), np.full(width, np.inf)
+        for c in range(count):
+            floors[c] = atol / scale[c]
         for i in range(rows):
-            k = n + i * width + c
-            r = e[k] / (floor + rtol * max(abs(y[k]), abs(yn[k])))
-            total += r * r
-        if not total <= worst:
-            worst = total
+            for c in range(width):
+                a, b = abs(ys[i, c]), abs(yns[i, c])
+                r = es[i, c] / (floors[c] + rtol * (a if a > b else b))
+                totals[c] += r * r
+        for c in range(count):
+            if not totals[c] <= worst:
+                worst = totals[c]
     return np.sqrt(worst / rows)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def interpolate(y, dense, x, size, u):  # type: ignore[no-untyped-def]
     """Writes the first `size` elements of y + x (c1 + x (c2 + x (c3 + x c4))), the rows of dense, into u."""
+    a, b, c, d = dense[0], dense[1], dense[2], dense[3]
     for k in range(size):
-        u[k] = y[k] + x * (dense[0, k] + x * (dense[1, k] + x * (dense[2, k] + x * dense[3, k])))
+        u[k] = y[k] + x * (a[k] + x * (b[k] + x * (c[k] + x * d[k])))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def rodas_matrix(address, y, w, wd, p, m, h, nx, jac, matrix, pivots):  # type: ignore[no-untyped-def]
     """Factors M/(h gamma) - J in `matrix`; jac (n, n) holds the Jacobian already."""
     n = jac.shape[0]
@@ -70,30 +68,38 @@ def rodas_matrix(address, y, w, wd, p, m, h, nx, jac, matrix, pivots):  # type: 
     return lu(matrix, pivots)
 
 
-@njit(cache=True, error_model="numpy")
-def rodas_stage(address, stage, h, forced, nx, n, width, hess_row, hess_column, hess, ft, matrix, pivots, u, k, yd, w, wd, p, m):  # type: ignore[no-untyped-def]
-    """Computes k[stage] from the stage's values u, with w set for the stage's time."""
-    size = u.size
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def rodas_stage(address, stage, h, forced, nx, n, width, mass, hess_row, hess_column, hess, ft, matrix, pivots, u, k, c, yd, w, wd, p, m):  # type: ignore[no-untyped-def]
+    """Computes k[stage] from the stage's values u, with w set for the stage's time; mass is 1 where a row has a derivative."""
     row = k[stage]
     call(address[FS if width else F], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, row.ctypes)
-    for j in range(stage):
-        factor = RODAS_C[stage, j] / h
-        add_scaled(row, factor, k[j], 0, nx)
-        add_scaled(row, factor, k[j], n, n + nx * width)
+    if stage > 0:
+        for q in range(c.size):
+            c[q] = RODAS_C[stage, 0] * k[0, q]
+        for j in range(1, stage):
+            factor = RODAS_C[stage, j]
+            for q in range(c.size):
+                c[q] += factor * k[j, q]
+        inverse = 1.0 / h
+        for q in range(c.size):
+            k[stage, q] += inverse * mass[q] * c[q]
     if forced and RODAS_D[stage] != 0.0:
-        add_scaled(row, h * RODAS_D[stage], ft, 0, size)
+        factor = h * RODAS_D[stage]
+        for q in range(c.size):
+            k[stage, q] += factor * ft[q]
     solve(matrix, pivots, row[:n])
     if width:
+        rows = row[n:].reshape(n, width)
         for q in range(hess_row.size):
             value = row[hess_column[q]]
             if value != 0.0:
-                at = n + hess_row[q] * width
-                for c in range(width):
-                    row[at + c] += hess[q * width + c] * value
-        solve_rows(matrix, pivots, row[n:].reshape(n, width))
+                i = hess_row[q]
+                for r in range(width):
+                    rows[i, r] += hess[q, r] * value
+        solve_rows(matrix, pivots, rows)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def rodas_dense(k, y, yn, dense):  # type: ignore[no-untyped-def]
     """Writes the four rows of the step's quartic."""
     size = y.size
@@ -102,18 +108,19 @@ def rodas_dense(k, y, yn, dense):  # type: ignore[no-untyped-def]
         dense[1, q] = 0.0
         dense[2, q] = 0.0
         dense[3, q] = 0.0
+    d0, d1, d2, d3 = dense[0], dense[1], dense[2], dense[3]
     for s in range(8):
         a, b, c = RODAS_H[0, s], RODAS_H[1, s], RODAS_H[2, s]
         ks = k[s]
         for q in range(size):
             v = ks[q]
-            dense[0, q] += a * v
-            dense[1, q] += (b - a) * v
-            dense[2, q] += (c - b) * v
-            dense[3, q] -= c * v
+            d0[q] += a * v
+            d1[q] += (b - a) * v
+            d2[q] += (c - b) * v
+            d3[q] -= c * v
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def dopri_dense(k, y, yn, h, dense):  # type: ignore[no-untyped-def]
     """Writes the four rows of the step's quartic."""
     for q in range(y.size):
@@ -130,39 +137,46 @@ def dopri_dense(k, y, yn, h, dense):  # type: ignore[no-untyped-def]
         dense[3, q] = last
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def rodas_point(stage, y, k, u):  # type: ignore[no-untyped-def]
     """Writes y + sum a_ij k_j of the stage into u; stages 6 and 7 add to what stage 5 left there."""
     if stage >= 6:
-        add_scaled(u, 1.0, k[stage - 1], 0, u.size)
+        for q in range(u.size):
+            u[q] += k[stage - 1, q]
         return
     for q in range(u.size):
         u[q] = y[q]
     for j in range(stage):
-        add_scaled(u, RODAS_A[stage, j], k[j], 0, u.size)
+        factor = RODAS_A[stage, j]
+        for q in range(u.size):
+            u[q] += factor * k[j, q]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def dopri_point(stage, h, y, k, u):  # type: ignore[no-untyped-def]
     """Writes y + h sum a_ij k_j of the stage into u."""
     for q in range(u.size):
         u[q] = y[q]
     for j in range(stage):
-        if DOPRI_A[stage, j] != 0.0:
-            add_scaled(u, h * DOPRI_A[stage, j], k[j], 0, u.size)
+        factor = h * DOPRI_A[stage, j]
+        if factor != 0.0:
+            for q in range(u.size):
+                u[q] += factor * k[j, q]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def dopri_error(h, k, e):  # type: ignore[no-untyped-def]
     """Writes the embedded error into e."""
     for q in range(e.size):
         e[q] = 0.0
     for s in range(7):
-        if DOPRI_E[s] != 0.0:
-            add_scaled(e, h * DOPRI_E[s], k[s], 0, e.size)
+        factor = h * DOPRI_E[s]
+        if factor != 0.0:
+            for q in range(e.size):
+                e[q] += factor * k[s, q]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def stage_time(method, stage):  # type: ignore[no-untyped-def]
     """The stage's share of the step."""
     return RODAS_TIME[stage] if method == 1 else DOPRI_TIME[stage]
