@@ -45,7 +45,7 @@ def _shipped(name: str) -> Model:
 
 
 def load_model(source: str | Path, *, trust: bool = False) -> Model:
-    """A shipped model by name, or the model of a file: a model card (.toml), or Python (.py, runs code: only with trust).
+    """A shipped model by name, or the model of a file: a model card (.toml), or Python (.py, needs trust: runs code).
 
     Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
     """

@@ -165,7 +165,7 @@ def _line() -> dict[str, str]:
 
 
 def physical() -> Parameterisation:
-    """The gains from total capacitance J and settling time Ts: wn = 3/(z Ts), Kp = 2 z wn J, Ki = wn^2 J; 3/Ts for P and Q.
+    """The gains from total capacitance J and settling time Ts: wn = 3/(z Ts), Kp = 2 z wn J, Ki = wn^2 J, else 3/Ts.
 
     The rule is reconstructed from Table I's numbers, which it gives digit for digit; it is not quoted from a manual.
     """
