@@ -60,6 +60,12 @@ def study(tmp_path: Path) -> Path:
     return tmp_path / "study.toml"
 
 
+def said(result: Result) -> str:
+    """What stood on stderr, but for the integrators' compilation, which an installation announces once."""
+    lines = [s for s in result.stderr.splitlines() if not s.startswith("hvdc_ident: compiling")]
+    return "\n".join(lines)
+
+
 def call(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(a) for a in arguments])
 
@@ -86,7 +92,8 @@ def test_fit_finds_the_gain_and_writes_every_file(study: Path) -> None:
 
 
 def test_run_then_report_from_the_folder_alone(study: Path, tmp_path: Path) -> None:
-    assert call("run", study, "--out", tmp_path / "r", "--quiet").output == ""
+    result = call("run", study, "--out", tmp_path / "r", "--quiet")
+    assert result.stdout == said(result) == ""
     page = (tmp_path / "r" / "report.html").read_text()
     (tmp_path / "r" / "report.html").unlink()
     study.unlink()
@@ -112,7 +119,7 @@ def test_json_is_all_there_is_on_stdout(study: Path, command: str) -> None:
     result = call(command, study, "--json")
     found = json.loads(result.stdout)
     assert found["study"] == "first" and found["schema"] == 1 and found["seed"] == 0
-    assert result.stderr == ""
+    assert said(result) == ""
 
 
 def test_two_seeds_two_headings_one_seed_one_result(study: Path) -> None:

