@@ -344,6 +344,9 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             last = t + 1.000001 * h >= tb
             step_end = tb if last else t + h
             hs = step_end - t
+            if last and not hs > 1e-15 * max(abs(t), abs(end)):
+                t = tb  # two breaks that differ by rounding alone
+                break
             if not hs > 4e-16 * max(abs(t), abs(end)) or h < 1e-14 * (end - start):
                 return NOT_FINITE, t
             # An unknown may have an infinite slope for an instant, as sqrt(1.1^2 - i^2) where i meets its limit. The

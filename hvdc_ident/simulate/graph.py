@@ -377,11 +377,20 @@ class Graph:
         return [(x, slope)]
 
     def evaluate(self, roots: Iterable[int], leaves: Mapping[int, float]) -> list[float]:
-        """The roots' values for given leaf values, in Python numbers: slow, for checks."""
+        """The roots' values for given leaf values, in Python numbers, conditions by comparison: slow, for checks."""
         roots = list(roots)
         values: dict[int, float] = {}
-        for n in self.reachable([*roots, *self.switches]):
-            values[n] = _evaluate(self, n, values, leaves)
+        stack = list(roots)
+        while stack:
+            n = stack[-1]
+            key = self.nodes[n]
+            needed = (self.switches[key[1]],) if key[0] == "switch" else self.arguments(n)
+            missing = [a for a in needed if a not in values]
+            if missing:
+                stack.extend(missing)
+            else:
+                values[n] = values[needed[0]] < 0.0 if key[0] == "switch" else _evaluate(self, n, values, leaves)
+                stack.pop()
         return [values[r] for r in roots]
 
 
@@ -391,8 +400,6 @@ def _evaluate(graph: Graph, n: int, values: dict[int, float], leaves: Mapping[in
         return a[0]
     if op == "leaf":
         return leaves[n]
-    if op == "switch":
-        return graph.evaluate([graph.switches[a[0]]], leaves)[0] < 0.0
     x = [values[k] for k in a]
     if op == "select":
         return x[1] if x[0] else x[2]

@@ -27,6 +27,8 @@ F, FS, JAC, HESS, FT, SW, SWS, SWD, MODES, OUT, OUTS, SRC, SRCS, SRCD, REST, RES
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def error_norm(e, y, yn, n, rows, width, count, rtol, atol, scale):  # type: ignore[no-untyped-def]
     """The largest weighted RMS error over the first `rows` of the n unknowns and of each parameter's sensitivities; > 1 is a rejection."""
+    if rows == 0:
+        return 0.0
     total = 0.0
     for k in range(rows):
         r = e[k] / (atol + rtol * max(abs(y[k]), abs(yn[k])))
