@@ -277,6 +277,34 @@ def report(
 
 @app.command()
 @guarded
+def export(
+    study: StudyFile,
+    to: Annotated[
+        Path,
+        typer.Option(
+            "--to",
+            metavar="FILE",
+            help=".toml (the model); .mat .json .csv .m .tex .zpk .mo (the linear model).",
+            show_default=False,
+        ),
+    ],
+    linear: Annotated[bool, typer.Option("--linear", help="The linear model, whatever the ending.")] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    trust: Trust = False,
+) -> None:
+    """Write the model or its linear model in the format of FILE's ending."""
+    from hvdc_ident.study.export import export as write
+    from hvdc_ident.study.study import load_study
+
+    written = write(load_study(study, trust), to, linear)
+    if json:
+        _print_json({"schema": 1, "file": written.as_posix(), "bytes": written.stat().st_size})
+    _say(f"{written}: {written.stat().st_size} bytes", json=json, quiet=quiet)
+
+
+@app.command()
+@guarded
 def convert(
     data: Annotated[
         Path, typer.Argument(metavar="DATA", help="A file of waveforms in any known format.", show_default=False)

@@ -1,0 +1,66 @@
+"""MATLAB .mat version 5: A, B, C, D, E, names, units, x0, u0, y0 as variables of their own."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import ModelError
+from hvdc_ident.files import write_bytes
+from hvdc_ident.linearize.linear_model import LinearModel
+
+SUFFIX = ".mat"
+SUMMARY = "MATLAB version 5: A, B, C, D, E, x0, u0, y0, names and units; sys = ss(A, B, C, D)"
+
+
+def write(model: LinearModel, path: Path) -> Path:
+    """The path, written: doubles as they are, names as cell arrays."""
+    import scipy.io
+
+    def cells(names: tuple[str, ...]) -> Any:
+        cell = np.empty((len(names), 1), dtype=object)
+        for k, n in enumerate(names):
+            cell[k, 0] = n
+        return cell
+
+    content: dict[str, Any] = {k: getattr(model, k) for k in "ABCDE"}
+    for kind in ("state", "input", "output"):
+        content[f"{kind}_names"] = cells(getattr(model, f"{kind}_names"))
+        content[f"{kind}_units"] = cells(getattr(model, f"{kind}_units"))
+    content |= {k: np.array(getattr(model, k), dtype=float).reshape(-1, 1) for k in ("x0", "u0", "y0")}
+    content["name"] = model.name
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, content, format="5", oned_as="column")
+    return write_bytes(path, stream.getvalue())
+
+
+def read(path: Path) -> LinearModel:
+    """The linear model of a file. Raises ModelError."""
+    import scipy.io
+
+    try:
+        data = scipy.io.loadmat(path)
+    except (OSError, ValueError, NotImplementedError, TypeError) as e:
+        raise ModelError("the file cannot be read as MATLAB version 5", where=str(path), got=str(e)[:200]) from None
+    missing = [k for k in ("A", "B", "C", "D", "state_names", "input_names", "output_names") if k not in data]
+    if missing:
+        raise ModelError(
+            "the file holds no linear model", where=str(path), expected="A, B, C, D and names", got=f"no {missing[0]}"
+        )
+
+    def names(key: str) -> tuple[str, ...]:
+        return tuple(str(np.ravel(c)[0]) if np.size(c) else "" for c in np.ravel(data.get(key, [])))
+
+    def numbers(key: str) -> tuple[float, ...]:
+        return tuple(float(v) for v in np.ravel(data.get(key, [])))
+
+    return LinearModel(
+        *(np.asarray(data[k], dtype=float) for k in "ABCD"),
+        np.asarray(data.get("E", np.eye(data["A"].shape[0])), dtype=float),
+        names("state_names"), names("input_names"), names("output_names"),
+        names("state_units"), names("input_units"), names("output_units"),
+        name=str(np.ravel(data.get("name", ["model"]))[0]), x0=numbers("x0"), u0=numbers("u0"), y0=numbers("y0"),
+    )  # fmt: skip

@@ -1,0 +1,239 @@
+"""Frequency responses: exact with delays, with bands and sensitivities, singular values, impedances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    import xarray
+
+    from hvdc_ident.linearize.linear_model import LinearModel
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A frequency response. omega: (n,) rad/s; values: (n, outputs, inputs) complex, in output unit per input unit.
+
+    std: (n, outputs, inputs) of the modulus of the error, 0 where no uncertainty was asked for or measured; coherence: 1 for a model.
+    """
+
+    omega: Array
+    values: Array
+    output_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    units: tuple[tuple[str, str], ...] = ()
+    std: Array | None = None
+    coherence: Array | None = None
+    source: str = "model"
+
+    @property
+    def frequency_hz(self) -> Array:
+        """(n,) Hz."""
+        return self.omega / (2 * np.pi)
+
+    @property
+    def magnitude(self) -> Array:
+        """(n, outputs, inputs) modulus."""
+        return np.abs(self.values)
+
+    @property
+    def magnitude_db(self) -> Array:
+        """(n, outputs, inputs) dB; a channel that is 0 has -inf, which is its value."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(20 * np.log10(self.magnitude))
+
+    @property
+    def phase_deg(self) -> Array:
+        """(n, outputs, inputs) degrees, unwrapped along the frequency."""
+        return np.asarray(np.degrees(np.unwrap(np.angle(self.values), axis=0)))
+
+    def channel(self, input: str, output: str) -> Array:
+        """(n,) complex response of one channel."""
+        if input not in self.input_names:
+            raise unknown_name("input", input, self.input_names)
+        if output not in self.output_names:
+            raise unknown_name("output", output, self.output_names)
+        return np.asarray(self.values[:, self.output_names.index(output), self.input_names.index(input)])
+
+    @property
+    def array(self) -> xarray.DataArray:
+        """The response with labelled axes omega, output, input."""
+        import xarray
+
+        axes = {"omega": self.omega, "output": list(self.output_names), "input": list(self.input_names)}
+        return xarray.DataArray(self.values, coords=axes, dims=tuple(axes), name="response")
+
+    def plot(self) -> Any:
+        """A Bode figure."""
+        from hvdc_ident.linearize.plots.bode import bode
+
+        return bode([self])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The response as plain lists."""
+        return {
+            "omega": self.omega.tolist(),
+            "outputs": list(self.output_names),
+            "inputs": list(self.input_names),
+            "real": self.values.real.tolist(),
+            "imag": self.values.imag.tolist(),
+            "source": self.source,
+        }
+
+
+def transfer(model: LinearModel, s: Array) -> Array:
+    """(points, outputs, inputs) transfer matrix at complex frequencies s, rad/s; delays exact.
+
+    Raises LinearizationError exactly on a pole.
+    """
+    s = np.atleast_1d(np.asarray(s, dtype=complex))
+    if model.delay_free is not None:
+        return model.delay_free.response(s)
+    if model.A.shape[0] == 0:
+        return np.broadcast_to(model.D.astype(complex), (s.size, *model.D.shape)).copy()
+    pencil = s[:, None, None] * model.E - model.A
+    try:
+        inner = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
+    except np.linalg.LinAlgError:
+        raise LinearizationError(
+            "a frequency lies exactly on a pole", where=f"linear model '{model.name}'", hint="leave this frequency out"
+        ) from None
+    return np.asarray(model.C @ inner + model.D)
+
+
+def default_omega(model: LinearModel, points: int = 400) -> Array:
+    """(n,) rad/s: logarithmic from a decade below the slowest to a decade above the fastest pole and zero."""
+    sizes = np.abs(model.poles())
+    fastest = sizes.max(initial=1.0)
+    sizes = sizes[(sizes > 1e-6 * max(fastest, 1e-12)) & (sizes > 1e-6)]
+    low, high = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
+    grid = np.logspace(np.log10(low) - 1.5, np.log10(high) + 1.5, points)
+    inside = np.abs(model.poles().imag)
+    return np.unique(np.concatenate([grid, inside[(inside > grid[0]) & (inside < grid[-1])]]))
+
+
+def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> Response:
+    """The response of every channel at omega in rad/s (default: around the poles)."""
+    w = default_omega(model) if omega is None else _checked(omega)
+    units = tuple((o, i) for o in model.output_units for i in model.input_units)
+    return Response(w, transfer(model, 1j * w), model.output_names, model.input_names, units)
+
+
+def _checked(omega: Array | Sequence[float]) -> Array:
+    w = np.atleast_1d(np.asarray(omega, dtype=float))
+    if w.ndim != 1 or w.size == 0 or not np.isfinite(w).all() or (w < 0).any():
+        raise LinearizationError("frequencies that cannot be used", expected="finite omega >= 0 in rad/s, at least one")
+    return w
+
+
+def sigma(model: LinearModel, omega: Array | Sequence[float] | None = None) -> tuple[Array, Array]:
+    """(omega, (n, k) singular values, largest first) of the transfer matrix."""
+    w = default_omega(model) if omega is None else _checked(omega)
+    return w, np.linalg.svd(transfer(model, 1j * w), compute_uv=False)
+
+
+def sensitivity(
+    model: LinearModel, omega: Array | Sequence[float], parameters: Sequence[str] | None = None
+) -> dict[str, Array]:
+    """By parameter: (n, outputs, inputs) derivatives of the response, the operating point's shift and delays included."""
+    from hvdc_ident.linearize.modal import gradient_of
+
+    w = _checked(omega)
+    s = 1j * w
+    names = list(model.gradients) if parameters is None else list(parameters)
+    found = {}
+    for name in names:
+        g = gradient_of(model, name)
+        if model.delay_free is not None and g.delay_free is not None:
+            found[name] = model.delay_free.response_along(s, g.delay_free, g.times)
+            continue
+        pencil = s[:, None, None] * model.E - model.A
+        right = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
+        left = np.swapaxes(
+            np.linalg.solve(
+                np.swapaxes(pencil, 1, 2), np.broadcast_to(model.C.T.astype(complex), (s.size, *model.C.T.shape))
+            ),
+            1,
+            2,
+        )
+        found[name] = np.asarray(g.C @ right + left @ (g.A @ right) + left @ g.B + g.D)
+    return found
+
+
+def bands(model: LinearModel, omega: Array | Sequence[float], covariance: Array, parameters: Sequence[str]) -> Response:
+    """The response with, as std, the first-order standard deviation of its modulus of error from a parameter covariance.
+
+    covariance: (k, k) in the parameters' units, in the order of `parameters`, whose derivatives the model must have.
+    """
+    cov = np.asarray(covariance, dtype=float)
+    k = len(parameters)
+    if cov.shape != (k, k) or not np.isfinite(cov).all():
+        raise LinearizationError(
+            "the covariance does not fit", expected=f"a finite ({k}, {k}) matrix", got=f"{cov.shape}"
+        )
+    plain = frequency_response(model, omega)
+    slopes = sensitivity(model, plain.omega, parameters)
+    stacked = np.array([slopes[n] for n in parameters])
+    variance = np.einsum("a...,ab,b...->...", stacked.conj(), cov, stacked).real
+    return Response(
+        plain.omega,
+        plain.values,
+        plain.output_names,
+        plain.input_names,
+        plain.units,
+        np.sqrt(np.maximum(variance, 0.0)),
+    )
+
+
+def impedance(
+    model: LinearModel,
+    voltages: Sequence[str],
+    currents: Sequence[str],
+    omega: Array | Sequence[float],
+    *,
+    into: bool = True,
+) -> Response:
+    """The impedance matrix voltages/currents seen at a port: outputs over inputs that are injected currents.
+
+    voltages: outputs; currents: inputs, in matching order (d, q). into: False where the current input is drawn from the
+    port, as a load is: the sign is then turned so that a passive network has a positive real part.
+    """
+    part = model.channel(list(currents), list(voltages))
+    found = frequency_response(part, omega)
+    sign = 1.0 if into else -1.0
+    return Response(
+        found.omega, sign * found.values, found.output_names, found.input_names, found.units, source="impedance"
+    )
+
+
+def admittance(
+    model: LinearModel,
+    voltages: Sequence[str],
+    currents: Sequence[str],
+    omega: Array | Sequence[float],
+    *,
+    into: bool = True,
+) -> Response:
+    """The inverse of `impedance`; raises LinearizationError where the impedance is singular."""
+    z = impedance(model, voltages, currents, omega, into=into)
+    if z.values.shape[1] != z.values.shape[2]:
+        raise LinearizationError("an admittance needs as many voltages as currents", got=f"{z.values.shape[1:]}")
+    try:
+        values = np.linalg.inv(z.values)
+    except np.linalg.LinAlgError:
+        raise LinearizationError("the impedance is singular at one of the frequencies") from None
+    return Response(z.omega, values, z.input_names, z.output_names, source="admittance")
+
+
+def values_at(model: LinearModel, changes: Mapping[str, float], omega: Array) -> Array:
+    """The response after small changes of parameters, to first order: what a band is made of."""
+    slopes = sensitivity(model, omega, list(changes))
+    start = transfer(model, 1j * _checked(omega))
+    return np.asarray(start + sum(slopes[n] * v for n, v in changes.items()))

@@ -1,0 +1,331 @@
+"""The linear model at an operating point: exact A, B, C, D from the model's expression graph, and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.delays import Channel, DelayFree, channels
+from hvdc_ident.linearize.limits import in_use, structure_roots
+from hvdc_ident.linearize.linear_model import Gradient, LinearModel
+from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
+from hvdc_ident.linearize.pade import pade
+from hvdc_ident.linearize.schur import Eliminated, eliminate
+from hvdc_ident.linearize.system import System, system
+from hvdc_ident.model.definition import Model
+from hvdc_ident.trajectory import Array
+
+Side = Literal["refuse", "below", "above"]
+WELL_POSED = 1e12
+"""Largest condition number of the algebraic part that is eliminated; beyond it the model stays a descriptor."""
+ON_KINK = 1e-9
+
+
+def linearize(
+    model: Model,
+    point: OperatingPoint | None = None,
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    pade_order: int = 5,
+    sensitivities: Sequence[str] = (),
+    side: Side = "refuse",
+    descriptor: bool = False,
+) -> LinearModel:
+    """The linear model between inputs and outputs (of outputs or named signals; default all) at an operating point.
+
+    point: default, the steady state found from the model's values. pade_order: of every delay in the state space (the
+    frequency response takes the delays exactly). sensitivities: parameters whose exact total derivatives of A, B, C, D
+    come along, the shift of the operating point included. side: what to do where the point lies on a kink: "refuse",
+    or the Jacobian "below" or "above" the limit. descriptor: keep the algebraic unknowns as states, with E.
+
+    Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
+    """
+    at = find_operating_point(model) if point is None else point
+    s = system(model, model.outputs if outputs is None else outputs)
+    chosen = _chosen(s, inputs, model.name)
+    for name in sensitivities:
+        if name not in s.parameters:
+            raise unknown_name("parameter", name, s.parameters, where=f"model '{model.name}'")
+    y, w, p = at.y, at.w, at.p
+    modes = modes_at(s, y, w, p, side)
+    jac = s.jacobian(y, w, p, modes)[: s.layout.main]
+    if not np.isfinite(jac).all():
+        raise _not_finite(s, jac, model.name)
+    parts = _Parts(s, channels(model, s, p), pade_order)
+    reduced = eliminate(parts.matrix(jac), parts.rows, parts.columns)
+    keep = descriptor or reduced.condition > WELL_POSED
+    if keep and parts.channels:
+        raise LinearizationError(
+            "the algebraic loop through a delay's direct part is ill-posed",
+            where=f"model '{model.name}'",
+            got=f"condition number {reduced.condition:.2g}",
+            hint="choose another pade_order, or open the loop at a signal in it",
+        )
+    gradient = _gradient(s, at, parts, jac, modes, reduced, sensitivities, chosen) if sensitivities and not keep else {}
+    return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side)
+
+
+def one_sided(model: Model, point: OperatingPoint, **options: object) -> tuple[LinearModel, LinearModel]:
+    """The linear models below and above the limit on which a point lies; equal where it lies on none."""
+    below = linearize(model, point, side="below", **options)  # type: ignore[arg-type]
+    return below, linearize(model, point, side="above", **options)  # type: ignore[arg-type]
+
+
+def jacobian_error(model: Model, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
+    """The largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
+    s = system(model, model.outputs if outputs is None else outputs)
+    y, w, p = point.y, point.w, point.p
+    exact = s.jacobian(y, w, p, s.modes(y, w, p))[: s.layout.main]
+    other = s.complex_step(y, w, p)
+    scale = np.maximum(np.abs(exact).max(axis=1, initial=0.0), 1e-300)
+    return float((np.abs(exact - other) / scale[:, None]).max(initial=0.0))
+
+
+def modes_at(s: System, y: Array, w: Array, p: Array, side: Side) -> Array:
+    """The branch of every switch at a point. Raises LinearizationError on a kink unless a side is chosen."""
+    values = s.switches(y, w, p)
+    modes = s.modes(y, w, p)
+    near = np.flatnonzero(np.abs(values) <= ON_KINK)
+    if near.size == 0:
+        return modes
+    used = in_use(s.structure, structure_roots(s.structure), values < 0.0)
+    kinks = [k for k in near if k in used and _matters(s, y, w, p, modes, int(k))]
+    if kinks and side == "refuse":
+        c = s.conditions[kinks[0]]
+        raise LinearizationError(
+            f"the operating point lies on a kink: '{c.signal}' is just at its limit",
+            where=f"model '{s.structure.model.name}'",
+            expected=f"{c.expression} clear of {c.level}",
+            got=f"a distance of {values[kinks[0]]:.3g}",
+            hint='move an input a little, or ask for side="below" or "above" (one_sided gives both)',
+        )
+    modes = modes.copy()
+    for k in kinks:
+        # A switch is negative beyond a limiter's end, whose margin is sign * value.
+        inside = 0.0 if s.conditions[k].sign > 0 else 1.0
+        beyond = 1.0 - inside
+        upper = s.conditions[k].kind == "upper"
+        modes[k] = (inside if upper else beyond) if side == "below" else (beyond if upper else inside)
+    return modes
+
+
+def _matters(s: System, y: Array, w: Array, p: Array, modes: Array, k: int) -> bool:
+    other = modes.copy()
+    other[k] = 1.0 - other[k]
+    with np.errstate(all="ignore"):
+        a, b = s.jacobian(y, w, p, modes), s.jacobian(y, w, p, other)
+    main = s.layout.main
+    return not np.allclose(a[:main], b[:main], rtol=1e-12, atol=1e-12)
+
+
+class _Parts:
+    """Where states, Pade states, inputs, unknowns and delayed values stand in the matrix that is reduced."""
+
+    def __init__(self, s: System, found: tuple[Channel, ...], order: int) -> None:
+        self.size, self.channels, self.order = s.layout, found, order
+        self.pade = pade(order) if found else (np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0)
+        self.n_pade = order * len(found)
+        self.n = self.size.nx + self.n_pade
+        self.rows, self.columns = self.n + self.size.no, self.n + self.size.nu
+
+    def spread(self, jac: Array) -> Array:
+        """The Jacobian's rows f, outputs, g and columns [x, Pade, u, z, e] in place; Pade and delay rows are 0."""
+        z, k = self.size, self.n_pade
+        total = np.zeros((*jac.shape[:-2], z.nx + k + z.no + z.nz + z.ne, z.nx + k + z.nu + z.nz + z.ne))
+        rows = [*range(z.nx), *range(z.n + z.ne, z.main), *range(z.nx, z.n)]
+        to_rows = [*range(z.nx), *range(self.n, self.n + z.no + z.nz)]
+        columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
+        to_columns = [*range(z.nx), *range(self.n, self.n + z.nu + z.nz + z.ne)]
+        total[..., np.array(to_rows)[:, None], to_columns] = jac[..., np.array(rows)[:, None], columns]
+        return total
+
+    def sources(self, jac: Array) -> Array:
+        """The rows of what is delayed, over the columns [x, Pade, u, z, e]."""
+        z = self.size
+        total = np.zeros((*jac.shape[:-2], z.ne, z.nx + self.n_pade + z.nu + z.nz + z.ne))
+        columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
+        to_columns = [*range(z.nx), *range(self.n, self.n + z.nu + z.nz + z.ne)]
+        total[..., to_columns] = jac[..., z.n : z.n + z.ne, columns]
+        return total
+
+    def matrix(self, jac: Array) -> Array:
+        """The matrix to reduce: rows [x', Pade', outputs | g, delays], columns [x, Pade, u | z, e]."""
+        total = self.spread(jac)
+        if self.channels:
+            a, _, c, through = self.pade
+            z, sources = self.size, self.sources(jac)
+            self._add_sources(total, sources, through)
+            for i, channel in enumerate(self.channels):
+                block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
+                total[block, block] += a / channel.total
+                total[-z.ne + i, block] += c
+                total[-z.ne + i, -z.ne + i] -= 1.0
+        return total
+
+    def _add_sources(self, total: Array, sources: Array, through: float) -> None:
+        z, b = self.size, self.pade[1]
+        for i, channel in enumerate(self.channels):
+            block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
+            total[..., block, :] += b[:, None] / channel.total * sources[..., i : i + 1, :]
+            total[..., total.shape[-2] - z.ne + i, :] += through * sources[..., i, :]
+
+    def matrix_along(self, djac: Array, jac: Array, dtime: Array) -> Array:
+        """(directions, ...) the derivative of `matrix`; djac: of the Jacobian; dtime: (channels, directions) of times."""
+        total = self.spread(djac)
+        if self.channels:
+            a, b, _, through = self.pade
+            z = self.size
+            self._add_sources(total, self.sources(djac), through)
+            sources = self.sources(jac)
+            for i, channel in enumerate(self.channels):
+                block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
+                change = -dtime[i] / channel.total**2
+                total[:, block, block] += change[:, None, None] * a
+                total[:, block, :] += change[:, None, None] * b[:, None] * sources[i]
+        return total
+
+    def split(self, total: Array, inputs: list[int]) -> tuple[Array, Array, Array, Array]:
+        """A, B, C, D of a reduced matrix for the chosen inputs."""
+        n = self.n
+        through = [n + k for k in inputs]
+        return total[..., :n, :n], total[..., :n, through], total[..., n:, :n], total[..., n:, through]
+
+
+def _gradient(
+    s: System,
+    at: OperatingPoint,
+    parts: _Parts,
+    jac: Array,
+    modes: Array,
+    reduced: Eliminated,
+    names: Sequence[str],
+    chosen: list[int],
+) -> dict[str, Gradient]:
+    """The total derivatives of A, B, C, D by parameters."""
+    which = [s.parameters.index(n) for n in names]
+    directions = shift(s, at, which)
+    djac = s.jacobian_along(at.y, at.w, at.p, modes, directions)
+    by_p = s.timing_by_parameters(at.p)[:, which] if parts.channels else np.zeros((0, len(which)))
+    dtime = np.array([c.weights @ by_p[list(c.places)] for c in parts.channels]).reshape(
+        len(parts.channels), len(which)
+    )
+    along = parts.matrix_along(djac, jac, dtime)
+    r, c = parts.rows, parts.columns
+    changes = reduced.derivative(along[:, :r, :c], along[:, :r, c:], along[:, r:, :c], along[:, r:, c:])
+    core = DelayFree.derivative(s.layout, jac, djac, chosen) if parts.channels else None
+    found = {}
+    for k, name in enumerate(names):
+        a, b, c_, d = parts.split(changes[k], chosen)
+        free = None if core is None else core[k]
+        found[name] = Gradient(a, b, c_, d, free, tuple(by_p[list(ch.places), k] for ch in parts.channels))
+    return found
+
+
+def shift(s: System, at: OperatingPoint, which: list[int]) -> Array:
+    """(columns + parameters, k) how the point and the parameters move for each of the chosen parameters."""
+    size = s.layout
+    total = np.zeros((size.columns + size.np, len(which)))
+    total[[size.columns + k for k in which], range(len(which))] = 1.0
+    search = at.search
+    if search is None:
+        return total
+    v = np.concatenate(
+        [
+            at.y,
+            at.w[1 + size.nu :],
+            at.w[[1 + k for k in search.freed_u]],
+            at.p[list(search.freed_p)],
+            np.zeros(len(search.bounded_rows)),
+        ]
+    )
+    slope = search.by_parameters(v, which)
+    inner = size.n + size.ne
+    total[: size.n] = slope[: size.n]
+    total[size.n + size.nu : size.columns] = slope[size.n : inner]
+    for i, k in enumerate(search.freed_u):
+        total[size.n + k] = slope[inner + i]
+    for i, k in enumerate(search.freed_p):
+        total[size.columns + k] += slope[inner + len(search.freed_u) + i]
+    return total
+
+
+def _model(
+    model: Model,
+    s: System,
+    at: OperatingPoint,
+    parts: _Parts,
+    jac: Array,
+    reduced: Eliminated,
+    chosen: list[int],
+    keep: bool,
+    gradient: dict[str, Gradient],
+    side: Side,
+) -> LinearModel:
+    names = [*s.states, *(f"{c.name}.pade{k + 1}" for c in parts.channels for k in range(parts.order))]
+    units = [model.states[n].unit for n in s.states] + [""] * parts.n_pade
+    if keep:
+        z = s.layout
+        through = [z.n + k for k in chosen]
+        a, b = jac[: z.n, : z.n], jac[: z.n, through]
+        c, d = jac[z.n :, : z.n], jac[z.n :, through]
+        e = np.diag([1.0] * z.nx + [0.0] * z.nz)
+        names = [*s.states, *s.unknowns]
+        units = [*units, *(model.algebraic[n].unit for n in s.unknowns)]
+    else:
+        a, b, c, d = parts.split(reduced.result, chosen)
+        e = np.eye(a.shape[0])
+    notes = {
+        "method": "symbolic",
+        "condition of the algebraic part": f"{reduced.condition:.3g}",
+        "algebraic part": "kept, descriptor" if keep else "eliminated" if s.layout.nz else "none",
+        "limits": "held as at the point" if side == "refuse" else f"one-sided: {side} the limit",
+    }
+    if parts.channels:
+        kinds = {c.kind for c in parts.channels}
+        notes["delays"] = f"Pade of order {parts.order} in A, B, C, D; exact in the frequency response"
+        if "sampled" in kinds:
+            notes["sampled blocks"] = (
+                "as a delay of half a period (the hold) plus the compute time: 1.5 periods in all when computing takes one"
+            )
+    outputs = {n: o.unit for n, o in model.outputs.items()} | {
+        n: x.unit for n, x in model.signals.items() if n not in model.outputs
+    }
+    return LinearModel(
+        a, b, c, d, e,
+        tuple(names),
+        tuple(s.inputs[k] for k in chosen),
+        s.outputs,
+        tuple(units),
+        tuple(model.inputs[s.inputs[k]].unit for k in chosen),
+        tuple(outputs.get(n, "") for n in s.outputs),
+        point=at,
+        name=model.name,
+        provenance=FrozenMap(notes),
+        gradients=FrozenMap(gradient),
+        delay_free=DelayFree.of(s.layout, jac, chosen, parts.channels) if parts.channels else None,
+    )  # fmt: skip
+
+
+def _chosen(s: System, inputs: Sequence[str] | None, model: str) -> list[int]:
+    names = s.inputs if inputs is None else tuple(inputs)
+    for n in names:
+        if n not in s.inputs:
+            raise unknown_name("input", n, s.inputs, where=f"model '{model}'")
+    return [s.inputs.index(n) for n in names]
+
+
+def _not_finite(s: System, jac: Array, model: str) -> LinearizationError:
+    i, j = (int(k) for k in np.argwhere(~np.isfinite(jac))[0])
+    rows = [f"d({n})/dt" for n in s.states] + [*s.unknowns, *s.extras] + [f"output {n}" for n in s.outputs]
+    columns = [*s.states, *s.unknowns, *s.inputs, *s.extras]
+    return LinearizationError(
+        f"the derivative of {rows[i]} by {columns[j]} is not finite",
+        where=f"model '{model}'",
+        got=f"{jac[i, j]}",
+        hint="the point lies where a root or a quotient has no slope: move an input a little",
+    )

@@ -1,0 +1,225 @@
+"""The linear model: matrices with names, units, the operating point and how they came about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.delays import DelayFree
+from hvdc_ident.linearize.operating_point import OperatingPoint
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    import control
+
+    from hvdc_ident.linearize.frequency import Response
+    from hvdc_ident.linearize.modal import Mode
+    from hvdc_ident.linearize.zeros import TransferFunction
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """The derivatives of A, B, C, D by one parameter; delay_free and times: those of the exact delayed model."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    delay_free: Array | None = None
+    times: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """E x' = A x + B u, y = C x + D u: deviations from the operating point, in the model's units, time in s.
+
+    E is the identity unless the algebraic part had to stay. gradients: derivatives by parameter name. delay_free: the
+    model before its delays were approximated, where it has any: what frequency responses are exact with.
+
+    Raises LinearizationError where the matrices' sizes do not fit, or an entry is not finite.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    E: Array
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    point: OperatingPoint | None = None
+    name: str = "model"
+    provenance: FrozenMap[str] = field(default_factory=FrozenMap)
+    gradients: FrozenMap[Gradient] = field(default_factory=FrozenMap)
+    delay_free: DelayFree | None = None
+    x0: tuple[float, ...] = ()
+    u0: tuple[float, ...] = ()
+    y0: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        n, m, o = len(self.state_names), len(self.input_names), len(self.output_names)
+        for key, shape in (("A", (n, n)), ("B", (n, m)), ("C", (o, n)), ("D", (o, m)), ("E", (n, n))):
+            array = np.array(getattr(self, key), dtype=float)
+            if array.shape != shape:
+                if array.size != shape[0] * shape[1]:
+                    raise LinearizationError(
+                        f"{key} does not fit the names", where=self.name, expected=f"{shape}", got=f"{array.shape}"
+                    )
+                array = array.reshape(shape)
+            if not np.isfinite(array).all():
+                raise LinearizationError(f"{key} has an entry that is not finite", where=self.name)
+            array.setflags(write=False)
+            object.__setattr__(self, key, array)
+        for key, size in (("state_units", n), ("input_units", m), ("output_units", o)):
+            if not getattr(self, key):
+                object.__setattr__(self, key, ("",) * size)
+        self._fill_values()
+
+    def _fill_values(self) -> None:
+        point = self.point
+        known: dict[str, float] = {}
+        if point is not None:
+            known = {**point.states, **point.unknowns, **point.extras}
+        if not self.x0:
+            object.__setattr__(self, "x0", tuple(known.get(s, 0.0) for s in self.state_names))
+        inputs = {} if point is None else point.inputs
+        if not self.u0:
+            object.__setattr__(self, "u0", tuple(inputs.get(s, 0.0) for s in self.input_names))
+        if not self.y0:
+            outputs = {} if point is None else {**known, **point.inputs, **point.outputs}
+            object.__setattr__(self, "y0", tuple(outputs.get(s, 0.0) for s in self.output_names))
+
+    # --- views ---
+
+    @property
+    def is_descriptor(self) -> bool:
+        """Whether E is not the identity."""
+        return not np.array_equal(self.E, np.eye(self.A.shape[0]))
+
+    def standard(self) -> tuple[Array, Array, Array, Array]:
+        """A, B, C, D with E = 1; raises LinearizationError for a descriptor whose algebraic part cannot be eliminated."""
+        if not self.is_descriptor:
+            return self.A, self.B, self.C, self.D
+        from hvdc_ident.linearize.descriptor import standard
+
+        return standard(self)
+
+    def channel(self, inputs: Sequence[str] | str, outputs: Sequence[str] | str) -> LinearModel:
+        """The model between some of its inputs and outputs; the states stay."""
+        i = [self._index("input", n) for n in ([inputs] if isinstance(inputs, str) else inputs)]
+        o = [self._index("output", n) for n in ([outputs] if isinstance(outputs, str) else outputs)]
+        core = self.delay_free
+        rows = columns = np.zeros(0, dtype=int)
+        if core is not None:
+            n = core.nx
+            rows = np.array([*range(n), *(n + k for k in o), *range(n + core.no, core.matrix.shape[0])])
+            columns = np.array([*range(n), *(n + k for k in i), *range(n + core.nu, core.matrix.shape[1])])
+            core = replace(core, matrix=core.matrix[np.ix_(rows, columns)], no=len(o), nu=len(i))
+        gradients = {
+            k: Gradient(
+                g.A,
+                g.B[:, i],
+                g.C[o],
+                g.D[np.ix_(o, i)],
+                None if g.delay_free is None else g.delay_free[np.ix_(rows, columns)],
+                g.times,
+            )
+            for k, g in self.gradients.items()
+        }
+        return replace(
+            self,
+            B=self.B[:, i],
+            C=self.C[o],
+            D=self.D[np.ix_(o, i)],
+            input_names=tuple(self.input_names[k] for k in i),
+            output_names=tuple(self.output_names[k] for k in o),
+            input_units=tuple(self.input_units[k] for k in i),
+            output_units=tuple(self.output_units[k] for k in o),
+            u0=tuple(self.u0[k] for k in i),
+            y0=tuple(self.y0[k] for k in o),
+            gradients=FrozenMap(gradients),
+            delay_free=core,
+        )
+
+    def _index(self, kind: str, name: str) -> int:
+        names = self.input_names if kind == "input" else self.output_names
+        if name not in names:
+            raise unknown_name(kind, name, names, where=f"linear model '{self.name}'")
+        return names.index(name)
+
+    def to_control(self) -> control.StateSpace:
+        """A python-control StateSpace with the same names; delays are in their Pade form."""
+        import control
+
+        a, b, c, d = self.standard()
+        names = self.state_names[: a.shape[0]]
+        return control.StateSpace(
+            a, b, c, d, states=list(names), inputs=list(self.input_names), outputs=list(self.output_names), name=self.name,
+            remove_useless_states=False,
+        )  # fmt: skip
+
+    # --- analysis ---
+
+    def poles(self) -> Array:
+        """(states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor."""
+        from hvdc_ident.linearize.modal import poles
+
+        return poles(self)
+
+    def zeros(self) -> Array:
+        """Complex invariant zeros of the whole system, rad/s."""
+        from hvdc_ident.linearize.zeros import zeros
+
+        return zeros(*self.standard())
+
+    def modes(self) -> tuple[Mode, ...]:
+        """Every mode: eigenvalue, frequency, damping, participation, shape, and its derivative by known parameters."""
+        from hvdc_ident.linearize.modal import modes
+
+        return modes(self)
+
+    def transfer_function(self, input: str | None = None, output: str | None = None) -> TransferFunction:
+        """Zeros, poles and gain from an input to an output; the names may be left out where there is only one."""
+        from hvdc_ident.linearize.zeros import transfer_function
+
+        return transfer_function(self, input or self._only("input"), output or self._only("output"))
+
+    def _only(self, kind: str) -> str:
+        names = self.input_names if kind == "input" else self.output_names
+        if len(names) != 1:
+            raise LinearizationError(
+                f"which {kind}?", where=f"linear model '{self.name}'", expected=f"one of {', '.join(names)}"
+            )
+        return names[0]
+
+    def response(self, omega: Array) -> Array:
+        """(frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
+        from hvdc_ident.linearize.frequency import transfer
+
+        return transfer(self, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
+
+    def bode(self, omega: Array | None = None) -> Response:
+        """The frequency response at omega in rad/s (default: around the poles and zeros), with units; it draws itself."""
+        from hvdc_ident.linearize.frequency import frequency_response
+
+        return frequency_response(self, omega)
+
+    def plot(self, kind: str = "bode") -> Any:
+        """A figure: "bode", "nyquist", "poles" or "participation"."""
+        from hvdc_ident.linearize.plots import draw
+
+        return draw(self, kind)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The model as plain lists, with names, units, operating point and provenance."""
+        from hvdc_ident.linearize.export.json_text import to_dict
+
+        return to_dict(self)

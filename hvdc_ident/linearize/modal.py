@@ -1,0 +1,195 @@
+"""Modes: eigenvalues with damping and frequency, participation, shapes, and how they move with parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+
+from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    from hvdc_ident.linearize.linear_model import Gradient, LinearModel
+
+ZERO = 1e-8
+"""An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """One eigenvalue in rad/s with what it means.
+
+    frequency_hz: of the oscillation, 0 for a real one. damping: -Re/|lambda|, 0 for a zero eigenvalue.
+    participation: share of each state, they sum to 1. shape: the right eigenvector, its largest entry 1.
+    sensitivity: d(lambda)/dp by parameter. kind: "oscillation", "decay", "growth", "growing oscillation",
+    or what a zero eigenvalue is: "free integrator", "hidden integrator" (no input or output reaches it).
+    """
+
+    eigenvalue: complex
+    frequency_hz: float
+    damping: float
+    participation: FrozenMap[float]
+    shape: FrozenMap[complex]
+    sensitivity: FrozenMap[complex]
+    kind: str
+
+    @property
+    def time_constant(self) -> float:
+        """1/|Re lambda| in s, infinite on the imaginary axis."""
+        return 1.0 / abs(self.eigenvalue.real) if self.eigenvalue.real else float("inf")
+
+    @property
+    def dominant(self) -> str:
+        """The state that takes part most."""
+        return max(self.participation, key=lambda n: self.participation[n])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The mode as plain numbers."""
+        pair = {n: [v.real, v.imag] for n, v in self.sensitivity.items()}
+        return {
+            "eigenvalue": [self.eigenvalue.real, self.eigenvalue.imag],
+            "frequency_hz": self.frequency_hz,
+            "damping": self.damping,
+            "participation": dict(self.participation),
+            "kind": self.kind,
+            **({"sensitivity": pair} if pair else {}),
+        }
+
+
+def poles(model: LinearModel) -> Array:
+    """(n,) complex eigenvalues, rad/s; for a descriptor those of the pencil without the infinite ones."""
+    if model.A.shape[0] == 0:
+        return np.zeros(0, dtype=complex)
+    if not model.is_descriptor:
+        return np.asarray(np.linalg.eigvals(model.A), dtype=complex)
+    alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
+    return np.asarray(alpha[finite(alpha, beta)] / beta[finite(alpha, beta)], dtype=complex)
+
+
+def finite(alpha: Array, beta: Array) -> Array:
+    """Which of the generalised eigenvalues alpha/beta are finite."""
+    return np.asarray(np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), np.abs(beta)).clip(1e-300) * 1e-2)
+
+
+def eigen(a: Array) -> tuple[Array, Array, Array]:
+    """(eigenvalues, right vectors in columns, left vectors in rows) with left @ right = 1.
+
+    The left ones are the inverse of the right ones where that is well conditioned, else LAPACK's own.
+    """
+    values, right = np.linalg.eig(a)
+    with np.errstate(all="ignore"):
+        try:
+            left = np.linalg.inv(right)
+        except np.linalg.LinAlgError:
+            left = np.full(right.shape, np.inf, dtype=complex)
+    if not np.isfinite(left).all() or np.abs(left).max(initial=0.0) > 1e12:
+        left = np.linalg.pinv(right, rcond=1e-12)
+    return values.astype(complex), right.astype(complex), left.astype(complex)
+
+
+def modes(model: LinearModel) -> tuple[Mode, ...]:
+    """Every mode of a model, by falling real part; conjugates follow each other, the upper one first."""
+    from dataclasses import replace
+
+    names = model.state_names
+    if model.is_descriptor:
+        a, b, c, d = model.standard()
+        names = names[: a.shape[0]]
+        model = replace(
+            model,
+            A=a,
+            B=b,
+            C=c,
+            D=d,
+            E=np.eye(a.shape[0]),
+            state_names=names,
+            state_units=(),
+            x0=model.x0[: len(names)],
+        )
+    if model.A.shape[0] == 0:
+        return ()
+    values, right, left = eigen(model.A)
+    slopes = {n: sensitivities(values, right, left, g.A) for n, g in model.gradients.items()}
+    share = np.abs(left.T * right)
+    share = share / np.maximum(share.sum(axis=0), 1e-300)
+    zero = ZERO * max(1.0, float(np.abs(values).max()))
+    order = sorted(range(values.size), key=lambda k: (-round(values[k].real, 9), abs(values[k].imag), -values[k].imag))
+    found = []
+    for k in order:
+        v = right[:, k] / right[np.argmax(np.abs(right[:, k])), k]
+        found.append(
+            Mode(
+                complex(values[k]),
+                abs(float(values[k].imag)) / (2 * np.pi),
+                0.0 if abs(values[k]) <= zero else float(-values[k].real / abs(values[k])),
+                FrozenMap(zip(names, (float(x) for x in share[:, k]), strict=True)),
+                FrozenMap(zip(names, (complex(x) for x in v), strict=True)),
+                FrozenMap({n: complex(s[k]) for n, s in slopes.items()}),
+                _kind(model, complex(values[k]), right[:, k], left[k], zero),
+            )
+        )
+    return tuple(found)
+
+
+def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: float) -> str:
+    if abs(value) <= zero:
+        driven = np.abs(left @ model.B).max(initial=0.0) > 1e-9 * np.abs(left).max() * np.abs(model.B).max(
+            initial=1e-300
+        )
+        seen = np.abs(model.C @ right).max(initial=0.0) > 1e-9 * np.abs(right).max() * np.abs(model.C).max(
+            initial=1e-300
+        )
+        if driven and seen:
+            return "free integrator"
+        return _hidden(model, right, bool(driven), bool(seen))
+    if value.imag:
+        return "oscillation" if value.real <= 0 else "growing oscillation"
+    return "decay" if value.real < 0 else "growth"
+
+
+def _hidden(model: LinearModel, right: Array, driven: bool, seen: bool) -> str:
+    """A zero eigenvalue that the chosen inputs and outputs do not both reach."""
+    if model.point is not None and model.point.active_limits:
+        state = model.state_names[int(np.argmax(np.abs(right)))]
+        row = model.A[model.state_names.index(state)]
+        if not row.any():
+            return "saturated state"
+    if not driven and not seen:
+        return "hidden integrator"
+    return "angle reference or unobserved integrator" if driven else "undriven integrator"
+
+
+def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
+    """(n,) d(lambda)/dp for a derivative of A: w' dA v, and within a cluster of equal eigenvalues those of the block.
+
+    A defective cluster has no derivative (it moves like a root): the mean of the cluster is given for each of its members.
+    """
+    slope = np.einsum("ki,ij,jk->k", left, da, right)
+    scale = 1e-7 * max(1.0, float(np.abs(values).max(initial=0.0)))
+    done = np.zeros(values.size, dtype=bool)
+    for k in range(values.size):
+        cluster = np.flatnonzero((np.abs(values - values[k]) < min(scale, 1e-6 * max(1.0, abs(values[k])))) & ~done)
+        if cluster.size < 2:
+            continue
+        done[cluster] = True
+        block = left[cluster] @ da @ right[:, cluster]
+        sound = np.linalg.norm(left[cluster], axis=1).max() * np.linalg.norm(right[:, cluster], axis=0).max() < 1e6
+        slope[cluster] = np.linalg.eigvals(block) if sound else np.trace(block) / cluster.size
+    return np.asarray(slope)
+
+
+def gradient_of(model: LinearModel, parameter: str) -> Gradient:
+    """The derivatives of A, B, C, D by a parameter; raises where the model was linearised without it."""
+    if parameter not in model.gradients:
+        if model.point is not None and parameter in model.point.parameters:
+            raise LinearizationError(
+                f"the derivatives by '{parameter}' were not asked for",
+                where=f"linear model '{model.name}'",
+                hint=f"linearize(..., sensitivities=['{parameter}'])",
+            )
+        raise unknown_name("parameter", parameter, model.gradients, where=f"linear model '{model.name}'")
+    return model.gradients[parameter]

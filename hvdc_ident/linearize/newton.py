@@ -1,0 +1,143 @@
+"""Scaled damped Newton with bounds, and pseudo-transient continuation, for equations with an exact Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.trajectory import Array
+
+Equations = Callable[[Array], tuple[Array, Array]]
+ACCURACY = 1e-10
+"""Largest scaled residual that counts as solved: each equation against the size of its own terms."""
+
+
+@dataclass(frozen=True)
+class Root:
+    """Where the iteration ended. shares: (equations,) scaled residuals; method: "newton" or "pseudo-transient"."""
+
+    v: Array
+    residual: Array
+    shares: Array
+    iterations: int
+    method: str
+
+    @property
+    def found(self) -> bool:
+        """Whether every scaled residual is below ACCURACY."""
+        return bool((self.shares < ACCURACY).all())
+
+
+def weights(jacobian: Array, v: Array) -> Array:
+    """(equations,) the size of each equation's terms, 1 for an equation without any."""
+    if v.size == 0:
+        return np.ones(jacobian.shape[0])
+    size = np.abs(jacobian) @ np.maximum(np.abs(v), 1e-3)
+    return np.where(size > 0.0, size, 1.0)
+
+
+def newton(equations: Equations, v: Array, low: Array, high: Array, limit: int = 60) -> Root:
+    """The root near v within [low, high], or the best point reached: read `found`.
+
+    Steps are exact Newton steps where the Jacobian is square and regular, else of least norm; each is halved until the
+    scaled residual falls. A variable on a bound that the step would leave is held there.
+    """
+    bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
+    v = np.clip(v, low, high) if bounded else v
+    r, jac = equations(v)
+    small = 0
+    k = 0
+    for k in range(1, limit + 1):
+        if not (np.isfinite(r).all() and np.isfinite(jac).all()):
+            break
+        weight = weights(jac, v)
+        before = np.abs(r / weight).max(initial=0.0)
+        step = _step(jac, r, weight, v, low, high) if bounded else _free_step(jac, r, weight)
+        change = np.abs(step / (np.abs(v) + 1e-3)).max(initial=0.0)
+        damping = 1.0
+        while True:
+            trial = np.clip(v + damping * step, low, high) if bounded else v + damping * step
+            r_new, jac_new = equations(trial)
+            after = np.abs(r_new / weight).max(initial=0.0)
+            if after < before or after < 1e-13 or (change < 1e-9 and np.isfinite(after)):
+                break
+            damping /= 2
+            if damping < 2e-4:
+                return _root(v, r, jac, k, "newton")
+        v, r, jac = trial, r_new, jac_new
+        if damping == 1.0 and change < 1e-10:
+            small += 2 if change < 1e-13 else 1
+        if small >= 2 or (change == 0.0):
+            break
+    return _root(v, r, jac, k, "newton")
+
+
+def _root(v: Array, r: Array, jac: Array, iterations: int, method: str) -> Root:
+    with np.errstate(all="ignore"):
+        shares = np.abs(r) / weights(jac, v)
+    return Root(v, r, np.where(np.isfinite(shares), shares, np.inf), iterations, method)
+
+
+def _free_step(jac: Array, r: Array, weight: Array) -> Array:
+    if jac.shape[0] == jac.shape[1]:
+        try:
+            step = np.linalg.solve(jac, -r)
+        except np.linalg.LinAlgError:
+            pass
+        else:
+            if np.isfinite(step).all() and np.abs(step).max(initial=0.0) < 1e9:
+                return np.asarray(step)
+    return np.asarray(np.linalg.lstsq(jac / weight[:, None], -r / weight, rcond=1e-12)[0])
+
+
+def _step(jac: Array, r: Array, weight: Array, v: Array, low: Array, high: Array) -> Array:
+    free = np.ones(v.size, dtype=bool)
+    step = np.zeros(v.size)
+    for _ in range(v.size + 1):
+        step = np.zeros(v.size)
+        if not free.any():
+            break
+        step[free] = _free_step(jac[:, free], r, weight)
+        stuck = free & (((v <= low) & (step < 0.0)) | ((v >= high) & (step > 0.0)))
+        if not stuck.any():
+            break
+        free &= ~stuck
+    return step
+
+
+def pseudo_transient(equations: Equations, v: Array, moving: int, low: Array, high: Array) -> Root:
+    """The rest that implicit Euler steps of growing length lead to, polished by Newton's method: read `found`.
+
+    moving: the first so many equations are derivatives of the first so many unknowns.
+    """
+    if v.size == 0:
+        return newton(equations, v, low, high)
+    r, jac = equations(v)
+    if jac.shape[0] != jac.shape[1]:
+        return newton(equations, v, low, high)
+    mass = np.zeros(v.size)
+    mass[:moving] = 1.0
+    h, steps = 1e-4, 0
+    for _ in range(400):
+        steps += 1
+        try:
+            step = np.linalg.solve(np.diag(mass / h) - jac, r)
+        except np.linalg.LinAlgError:
+            h *= 0.3
+            continue
+        trial = np.clip(v + step, low, high)
+        r_new, jac_new = equations(trial)
+        before, after = np.linalg.norm(r / weights(jac, v)), np.linalg.norm(r_new / weights(jac_new, trial))
+        if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
+            v, r, jac = trial, r_new, jac_new
+            h = min(h * max(1.5, before / max(float(after), 1e-300)), 1e9)
+            if after < 1e-12:
+                break
+        else:
+            h *= 0.2
+            if h < 1e-12:
+                break
+    polished = newton(equations, v, low, high)
+    return Root(polished.v, polished.residual, polished.shares, steps + polished.iterations, "pseudo-transient")

@@ -1,0 +1,238 @@
+"""Operating points: any state, unknown, input, output or parameter fixed, free or bounded, solved with exact Jacobians."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from hvdc_ident.errors import SteadyStateError, unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.limits import Limit, limits
+from hvdc_ident.linearize.newton import ACCURACY, Root, newton, pseudo_transient
+from hvdc_ident.linearize.search import At, Search
+from hvdc_ident.linearize.system import System, system
+from hvdc_ident.model.definition import Model
+from hvdc_ident.trajectory import Array
+
+Bounds = Mapping[str, tuple[float, float]]
+Side = Literal["here", "below", "above"]
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingPoint:
+    """A point of a model: values by name, in the model's units.
+
+    extras: values of delays and sampled blocks. residual: the largest scaled residual of the equations that define it.
+    limits: every limiter in use with its margin. at: "steady", or "start" where states stand at their given start.
+    method: "newton" or "pseudo-transient"; underdetermined points say "newton, least norm".
+    """
+
+    model: Model
+    states: FrozenMap[float]
+    unknowns: FrozenMap[float]
+    extras: FrozenMap[float]
+    inputs: FrozenMap[float]
+    outputs: FrozenMap[float]
+    parameters: FrozenMap[float]
+    residual: float
+    limits: tuple[Limit, ...]
+    iterations: int
+    method: str
+    at: At = "steady"
+    time: float = 0.0
+    search: Search | None = field(default=None, repr=False)
+
+    @property
+    def active_limits(self) -> tuple[Limit, ...]:
+        """The limiters that hold their signal here."""
+        return tuple(x for x in self.limits if x.active)
+
+    @property
+    def y(self) -> Array:
+        """(states + unknowns,) as the machine code takes them."""
+        return np.array([*self.states.values(), *self.unknowns.values()], dtype=float)
+
+    @property
+    def w(self) -> Array:
+        """(1 + inputs + delays + sampled,) as the machine code takes them, time first."""
+        return np.array([self.time, *self.inputs.values(), *self.extras.values()], dtype=float)
+
+    @property
+    def p(self) -> Array:
+        """(parameters,) as the machine code takes them."""
+        return np.array([*self.parameters.values()], dtype=float)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The point as plain numbers; active limits with what is limited, by what, and the margin."""
+        return {
+            "states": dict(self.states),
+            "unknowns": dict(self.unknowns),
+            "inputs": dict(self.inputs),
+            "outputs": dict(self.outputs),
+            "parameters": dict(self.parameters),
+            "residual": self.residual,
+            "active_limits": [x.to_dict() for x in self.active_limits],
+            "margins": [x.to_dict() for x in self.limits if not x.active and x.kind != "branch"],
+            "at": self.at,
+            "method": self.method,
+            "iterations": self.iterations,
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{n} = {v:.6g}" for n, v in (*self.states.items(), *self.inputs.items(), *self.outputs.items())]
+        held = [x.text for x in self.active_limits] or ["no limit is active"]
+        return "\n".join([f"operating point of '{self.model.name}' ({self.at}, {self.method})", *lines, *held])
+
+
+def find_operating_point(
+    model: Model,
+    fixed: Mapping[str, float] | None = None,
+    free: Collection[str] = (),
+    bounds: Bounds | None = None,
+    guess: Mapping[str, float] | None = None,
+    *,
+    at: At = "steady",
+    moving: Collection[str] = (),
+    time: float = 0.0,
+) -> OperatingPoint:
+    """The operating point at which every derivative is 0 and what is fixed holds.
+
+    fixed: values of inputs, parameters, states, unknowns, signals or outputs. free: inputs and parameters to be found.
+    bounds: (low, high) of anything but a fixed name. guess: where the search begins. moving: states whose derivative
+    need not be 0. at="start": states with a given start stand there instead, and only the rest is solved.
+    All in the model's units; an input that is not named keeps the model's value.
+
+    Raises UnknownNameError for a name the model lacks and SteadyStateError, with the worst equation, where there is none.
+    """
+    search = Search.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
+    return solve(model, search, guess or {})
+
+
+def solve(model: Model, search: Search, guess: Mapping[str, float] | None = None) -> OperatingPoint:
+    """The point a search leads to; SteadyStateError with the worst equation where it leads to none."""
+    best: Root | None = None
+    starts = search.guesses(guess or {})
+    with np.errstate(all="ignore"):
+        for v in starts:
+            root = newton(search.equations, v, search.low, search.high)
+            if root.found:
+                return point_of(model, search, root)
+            best = root if best is None or root.shares.max() < best.shares.max() else best
+        for v in starts[:2]:
+            root = pseudo_transient(search.equations, v, search.leading, search.low, search.high)
+            if root.found:
+                return point_of(model, search, root)
+            best = root if best is None or root.shares.max() < best.shares.max() else best
+    assert best is not None
+    raise _not_found(model, search, best)
+
+
+def _not_found(model: Model, search: Search, root: Root) -> SteadyStateError:
+    worst = int(np.argmax(root.shares))
+    names = search.variables
+    on_bound = [n for n, v, a, b in zip(names, root.v, search.low, search.high, strict=True) if v in (a, b)]
+    bound = f"; on its bound: {', '.join(on_bound)}" if on_bound else ""
+    hint = "check the fixed values and limits, give a guess near the solution, or free another input"
+    return SteadyStateError(
+        "no operating point was found",
+        where=f"model '{model.name}'",
+        expected=f"every equation met to {ACCURACY:g} of its terms",
+        got=f"{search.rows[worst]} left with {root.residual[worst]:.3g} (scaled {root.shares[worst]:.2g}){bound}",
+        hint=hint if search.at == "start" else hint + "; states that need not rest can be named in `moving`",
+    )
+
+
+def point_of(model: Model, search: Search, root: Root) -> OperatingPoint:
+    """The point of a solved search."""
+    y, w, p = search.vectors(root.v)
+    s, size = search.system, search.system.layout
+    values = s.values(y, w, p, s.modes(y, w, p))
+    shown = values[size.n + size.ne : size.main]
+    wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
+    n_extra = 1 + size.nu
+    method = root.method + (", least norm" if len(search.rows) < len(search.variables) else "")
+    return OperatingPoint(
+        model,
+        _named(s.states, y[: size.nx]),
+        _named(s.unknowns, y[size.nx :]),
+        _named(s.extras, w[n_extra:]),
+        _named(s.inputs, w[1:n_extra]),
+        FrozenMap(wanted),
+        _named(s.parameters, p),
+        float(root.shares.max(initial=0.0)),
+        limits(s.structure, s.conditions, s.switches(y, w, p)),
+        root.iterations,
+        method,
+        search.at,
+        search.time,
+        search,
+    )
+
+
+def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
+    return FrozenMap(zip(names, (float(v) for v in values), strict=True))
+
+
+def point_at(
+    model: Model,
+    states: Mapping[str, float],
+    inputs: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | None = None,
+    *,
+    time: float = 0.0,
+) -> OperatingPoint:
+    """The operating point at given states, which need not be at rest; unknowns are solved for.
+
+    Raises UnknownNameError for a name that is not a state, input or parameter, or a state left out; SteadyStateError
+    where the unknowns have no solution.
+    """
+    missing = [n for n in model.states if n not in states]
+    if missing:
+        raise unknown_name("value given for state", missing[0], list(states), where=f"model '{model.name}'")
+    fixed = {**(inputs or {}), **(parameters or {}), **states}
+    return find_operating_point(model, fixed, moving=tuple(model.states), time=time)
+
+
+def continuation(
+    model: Model, name: str, values: Sequence[float], fixed: Mapping[str, float] | None = None
+) -> tuple[OperatingPoint, ...]:
+    """The operating points along values of one parameter or input, each searched from the one before.
+
+    A step that fails is halved up to ten times on the way. Raises SteadyStateError with the last value reached.
+    """
+    known: System = system(model)
+    if name not in known.parameters and name not in known.inputs:
+        raise unknown_name("parameter or input", name, (*known.parameters, *known.inputs), where="continuation")
+    points: list[OperatingPoint] = []
+    guess: dict[str, float] = {}
+    last: float | None = None
+    for value in values:
+        point = _step_to(model, name, last, float(value), {**(fixed or {})}, guess, 0)
+        points.append(point)
+        guess = {**point.states, **point.unknowns, **point.extras}
+        last = float(value)
+    return tuple(points)
+
+
+def _step_to(
+    model: Model,
+    name: str,
+    last: float | None,
+    value: float,
+    fixed: dict[str, float],
+    guess: dict[str, float],
+    depth: int,
+) -> OperatingPoint:
+    try:
+        return find_operating_point(model, {**fixed, name: value}, guess=guess)
+    except SteadyStateError as e:
+        if last is None or depth == 10:
+            reached = f", reached {last:g}" if last is not None else ""
+            raise e.at(f"continuation along '{name}' at {value:g}{reached}") from None
+        half = _step_to(model, name, last, 0.5 * (last + value), fixed, guess, depth + 1)
+        return _step_to(
+            model, name, 0.5 * (last + value), value, fixed, {**half.states, **half.unknowns, **half.extras}, depth + 1
+        )

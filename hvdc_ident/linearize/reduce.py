@@ -1,0 +1,166 @@
+"""Minimal realisation with the list of what was removed, and balanced reduction with a stated H-infinity bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.trajectory import Array
+
+TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on |G - Gr| over all frequencies."""
+
+    model: LinearModel
+    removed: tuple[complex, ...]
+    hankel: tuple[float, ...]
+    bound: float
+
+
+def staircase(a: Array, b: Array, tolerance: float = TOLERANCE) -> tuple[Array, int]:
+    """(orthogonal basis, k): its first k columns span what the inputs reach."""
+    n = a.shape[0]
+    basis, at, reached = np.eye(n), a.copy(), 0
+    block, size = b.copy(), max(float(np.linalg.norm(b)), 1e-300)
+    while reached < n and block.size:
+        u, values, _ = np.linalg.svd(block)
+        r = int((values > tolerance * size).sum())
+        if r == 0:
+            break
+        turn = scipy.linalg.block_diag(np.eye(reached), u)
+        basis, at = basis @ turn, turn.T @ at @ turn
+        block = at[reached + r :, reached : reached + r]
+        size = max(float(np.linalg.norm(a)), 1e-300)
+        reached += r
+    return basis, reached
+
+
+def minimal(model: LinearModel, tolerance: float = TOLERANCE) -> Reduction:
+    """The controllable and observable part, and the eigenvalues that were removed.
+
+    Raises LinearizationError where an unstable or undamped mode would be cancelled: it is hidden, not gone.
+    """
+    a, b, c, d = _scaled(model)
+    removed: list[complex] = []
+    for transposed in (False, True):
+        left, right = (a.T, c.T) if transposed else (a, b)
+        basis, k = staircase(left, right, tolerance)
+        hidden = np.linalg.eigvals((basis.T @ a @ basis)[k:, k:]) if k < a.shape[0] else np.zeros(0)
+        _refuse_unstable(model, hidden, "observe" if transposed else "control")
+        removed += [complex(v) for v in hidden]
+        keep = basis[:, :k]
+        a, b, c = keep.T @ a @ keep, keep.T @ b, c @ keep
+    return Reduction(_renamed(model, a, b, c, d, "minimal"), tuple(removed), (), 0.0)
+
+
+def uncontrollable_unobservable(a: Array, b: Array, c: Array) -> Array:
+    """Eigenvalues of the modes that no input reaches or no output sees, by orthogonal staircases."""
+    a, b, c = _scale(a, b, c)
+    found: list[complex] = []
+    for transposed in (False, True):
+        basis, k = staircase(a.T if transposed else a, c.T if transposed else b)
+        if k < a.shape[0]:
+            found += list(np.linalg.eigvals((basis.T @ a @ basis)[k:, k:]))
+        keep = basis[:, :k]
+        a, b, c = keep.T @ a @ keep, keep.T @ b, c @ keep
+    return np.array(found, dtype=complex)
+
+
+def _scale(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+    """The same system with states scaled by powers of two so that rows and columns of A are alike."""
+    if a.shape[0] == 0:
+        return a, b, c
+    _, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
+    return a * scale[None, :] / scale[:, None], b / scale[:, None], c * scale[None, :]
+
+
+def _scaled(model: LinearModel) -> tuple[Array, Array, Array, Array]:
+    a, b, c, d = model.standard()
+    return *_scale(a, b, c), d
+
+
+def _refuse_unstable(model: LinearModel, hidden: Array, verb: str) -> None:
+    bad = hidden[hidden.real > -1e-9 * np.maximum(1.0, np.abs(hidden))]
+    if bad.size:
+        raise LinearizationError(
+            f"a mode that the {'outputs' if verb == 'observe' else 'inputs'} do not {verb} is not stable",
+            where=f"linear model '{model.name}'",
+            expected="only stable modes to cancel",
+            got=f"eigenvalue {bad[0]:.6g}",
+            hint="choose inputs and outputs that reach it, or keep the model whole",
+        )
+
+
+def _renamed(model: LinearModel, a: Array, b: Array, c: Array, d: Array, how: str) -> LinearModel:
+    names = tuple(f"{how}{k + 1}" for k in range(a.shape[0]))
+    return replace(
+        model,
+        A=a,
+        B=b,
+        C=c,
+        D=d,
+        E=np.eye(a.shape[0]),
+        state_names=names,
+        state_units=(),
+        x0=(0.0,) * len(names),
+        delay_free=None,
+        gradients=type(model.gradients)(),
+        provenance=model.provenance | {"reduction": how},
+    )
+
+
+def hankel(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
+    """(singular values, left and right square-root balancing matrices) of a stable system."""
+    p = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
+    q = scipy.linalg.solve_continuous_lyapunov(a.T, -c.T @ c)
+    root_p, root_q = _root(p), _root(q)
+    u, values, v = np.linalg.svd(root_q.T @ root_p)
+    return values, root_q @ u, root_p @ v.T
+
+
+def _root(p: Array) -> Array:
+    values, vectors = np.linalg.eigh(0.5 * (p + p.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def balanced(model: LinearModel, order: int | None = None, bound: float | None = None) -> Reduction:
+    """The model of fewer states by balanced truncation, with the bound 2 sum(removed Hankel values) on its error.
+
+    Give the order, or the largest H-infinity error allowed (in output per input units). Raises LinearizationError for
+    an unstable model or an order out of range.
+    """
+    source = minimal(model)
+    a, b, c, d = source.model.standard()
+    values_a = np.linalg.eigvals(a)
+    if (values_a.real >= 0).any():
+        raise LinearizationError(
+            "an unstable model has no balanced reduction",
+            where=f"linear model '{model.name}'",
+            got=f"eigenvalue {values_a[np.argmax(values_a.real)]:.6g}",
+            hint="close a stabilising loop first, or reduce the stable part alone",
+        )
+    values, left, right = hankel(a, b, c)
+    tails = 2.0 * np.concatenate([np.cumsum(values[::-1])[::-1], [0.0]])
+    if order is None:
+        if bound is None:
+            raise LinearizationError(
+                "neither an order nor a bound", where="balanced reduction", hint="give one of them"
+            )
+        order = int(np.argmax(tails <= bound))
+    if not 0 <= order <= values.size:
+        raise LinearizationError("the order is out of range", expected=f"0 to {values.size}", got=f"{order}")
+    usable = int((values > 1e-14 * values[0]).sum()) if values.size else 0
+    order = min(order, usable)
+    scale = 1.0 / np.sqrt(values[:order])
+    w, t = left[:, :order] * scale, right[:, :order] * scale
+    reduced = _renamed(source.model, w.T @ a @ t, w.T @ b, c @ t, d, "balanced")
+    kept = np.linalg.eigvals(reduced.A) if order else np.zeros(0)
+    gone = [complex(v) for v in values_a if not kept.size or np.abs(kept - v).min() > 1e-9 * max(1.0, abs(v))]
+    return Reduction(reduced, (*source.removed, *gone), tuple(float(v) for v in values), float(tails[order]))

@@ -1,0 +1,300 @@
+"""The equations of an operating point: what is fixed, what is free, and the residual with its exact Jacobian."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
+from hvdc_ident.linearize.system import System, system
+from hvdc_ident.model.definition import Model
+from hvdc_ident.trajectory import Array
+
+At = Literal["steady", "start"]
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The unknowns v = [x, z, delays and sampled, freed inputs, freed parameters, bounded signals] and their equations.
+
+    equation_rows: which rows of the system are asked to be 0, after that come the fixed signals, then the bounded ones.
+    """
+
+    system: System
+    at: At
+    time: float
+    u: Array
+    p: Array
+    freed_u: tuple[int, ...]
+    freed_p: tuple[int, ...]
+    equation_rows: tuple[int, ...]
+    fixed_places: tuple[int, ...]
+    fixed_rows: tuple[int, ...]
+    fixed_values: Array
+    bounded_rows: tuple[int, ...]
+    low: Array
+    high: Array
+    start: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        fixed: Mapping[str, float],
+        free: Collection[str],
+        bounds: Mapping[str, tuple[float, float]],
+        *,
+        at: At,
+        moving: Collection[str],
+        time: float,
+    ) -> Search:
+        """The search for a model. Raises UnknownNameError, ModelError for a value or bounds that cannot be."""
+        signals = [n for n in (*fixed, *bounds) if not _is_variable(model, n)]
+        s = system(model, tuple(dict.fromkeys((*model.outputs, *signals))))
+        _check(model, s, fixed, free, bounds, moving)
+        size = s.layout
+        inner = {n: k for k, n in enumerate((*s.states, *s.unknowns, *s.extras))}
+        u = np.array([fixed.get(n, i.value) for n, i in model.inputs.items()], dtype=float)
+        p = np.array([fixed.get(n, q.value) for n, q in model.parameters.items()], dtype=float)
+        first = size.n + size.ne
+        fixed_inner = [n for n in fixed if n in inner]
+        fixed_signals = [n for n in fixed if n not in inner and n not in s.inputs and n not in s.parameters]
+        bounded_signals = [n for n in bounds if n not in inner and n not in s.inputs and n not in s.parameters]
+        freed_u = tuple(k for k, n in enumerate(s.inputs) if n in free)
+        freed_p = tuple(k for k, n in enumerate(s.parameters) if n in free)
+        variables = [*inner, *(s.inputs[k] for k in freed_u), *(s.parameters[k] for k in freed_p), *bounded_signals]
+        low = np.array([bounds.get(n, (-np.inf, np.inf))[0] for n in variables], dtype=float)
+        high = np.array([bounds.get(n, (-np.inf, np.inf))[1] for n in variables], dtype=float)
+        return cls(
+            s,
+            at,
+            time,
+            u,
+            p,
+            freed_u,
+            freed_p,
+            _equation_rows(s, at, moving),
+            tuple(inner[n] for n in fixed_inner),
+            tuple(first + s.outputs.index(n) for n in fixed_signals),
+            np.array([fixed[n] for n in (*fixed_inner, *fixed_signals)], dtype=float),
+            tuple(first + s.outputs.index(n) for n in bounded_signals),
+            low,
+            high,
+            _starts(model, s, p, bounds),
+        )
+
+    @property
+    def leading(self) -> int:
+        """How many of the first equations are the derivatives of the states in order."""
+        size = self.system.layout
+        return size.nx if len(self.equation_rows) == size.n + size.ne else 0
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of what is solved for."""
+        s = self.system
+        names = [*s.states, *s.unknowns, *s.extras, *(s.inputs[k] for k in self.freed_u)]
+        first = s.layout.n + s.layout.ne
+        names += [s.parameters[k] for k in self.freed_p]
+        return (*names, *(s.outputs[k - first] for k in self.bounded_rows))
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """What each equation says, in words."""
+        s, size = self.system, self.system.layout
+        inner = [*s.states, *s.unknowns, *s.extras]
+        first = size.n + size.ne
+        main = [f"d({n})/dt = 0" for n in s.states] + [f"the equation of unknown '{n}'" for n in s.unknowns]
+        main += [f"the rest of '{n}'" for n in s.extras] + [""] * size.no
+        main += [f"the rest of state '{s.states[k]}'" for k in s.with_rest]
+        main += [f"the start of state '{s.states[k]}'" for k in s.with_start]
+        rows = [main[k] for k in self.equation_rows]
+        names = [inner[k] for k in self.fixed_places] + [s.outputs[k - first] for k in self.fixed_rows]
+        rows += [f"'{n}' = {v:g}" for n, v in zip(names, self.fixed_values, strict=True)]
+        return (*rows, *(f"the bounds of '{s.outputs[k - first]}'" for k in self.bounded_rows))
+
+    def vectors(self, v: Array) -> tuple[Array, Array, Array]:
+        """(y, w, p) at the unknowns v."""
+        size = self.system.layout
+        w = np.empty(1 + size.nu + size.ne)
+        w[0] = self.time
+        w[1 : 1 + size.nu] = self.u
+        w[1 + size.nu :] = v[size.n : size.n + size.ne]
+        at = size.n + size.ne
+        p = self.p
+        if self.freed_u:
+            w[[1 + k for k in self.freed_u]] = v[at : at + len(self.freed_u)]
+        if self.freed_p:
+            p = self.p.copy()
+            p[list(self.freed_p)] = v[at + len(self.freed_u) : at + len(self.freed_u) + len(self.freed_p)]
+        return v[: size.n].copy(), w, p
+
+    def equations(self, v: Array) -> tuple[Array, Array]:
+        """(residual, Jacobian) at v, modes from the values."""
+        s, size = self.system, self.system.layout
+        y, w, p = self.vectors(v)
+        m = s.modes(y, w, p)
+        values, full = s.values(y, w, p, m), self._columns(y, w, p, m)
+        if size.ne:
+            extra = slice(size.n, size.n + size.ne)
+            values[extra] -= v[extra]
+            full[extra, extra] -= np.eye(size.ne)
+        rows = [*self.equation_rows, *self.fixed_rows]
+        r, jac = values[rows], full[rows]
+        n_equations, n_inner = len(self.equation_rows), len(self.fixed_places)
+        if not (n_inner or self.fixed_rows or self.bounded_rows):
+            return r, jac
+        r[n_equations:] -= self.fixed_values[n_inner:]
+        own = np.zeros((n_inner, v.size))
+        own[range(n_inner), self.fixed_places] = 1.0
+        places = list(self.fixed_places)
+        r = np.concatenate([r[:n_equations], v[places] - self.fixed_values[:n_inner], r[n_equations:]])
+        jac = np.concatenate([jac[:n_equations], own, jac[n_equations:]])
+        if self.bounded_rows:
+            k = len(self.bounded_rows)
+            r = np.concatenate([r, values[list(self.bounded_rows)] - v[-k:]])
+            slack = full[list(self.bounded_rows)]
+            slack[range(k), range(v.size - k, v.size)] -= 1.0
+            jac = np.concatenate([jac, slack])
+        return r, jac
+
+    def _columns(self, y: Array, w: Array, p: Array, m: Array) -> Array:
+        """(all rows, unknowns) of the Jacobian."""
+        s, size = self.system, self.system.layout
+        jac = s.jacobian(y, w, p, m)
+        if not (self.freed_u or self.freed_p or self.bounded_rows or size.ne):
+            return jac[:, : size.n]
+        columns = [*range(size.n), *range(size.n + size.nu, size.columns), *(size.n + k for k in self.freed_u)]
+        parts = [jac[:, columns]]
+        if self.freed_p:
+            parts.append(s.by_parameters(y, w, p, m)[:, list(self.freed_p)])
+        parts.append(np.zeros((size.rows, len(self.bounded_rows))))
+        return np.concatenate(parts, axis=1)
+
+    def by_parameters(self, v: Array, which: list[int]) -> Array:
+        """(unknowns, parameters) derivatives of the solution by parameters that stay fixed, by implicit differentiation.
+
+        Where the Jacobian is singular (a state that rests anywhere) the change of least norm.
+        """
+        s = self.system
+        y, w, p = self.vectors(v)
+        m = s.modes(y, w, p)
+        jac = self.equations(v)[1]
+        full = s.by_parameters(y, w, p, m)[:, which]
+        n_inner = len(self.fixed_places)
+        right = np.concatenate(
+            [
+                full[list(self.equation_rows)],
+                np.zeros((n_inner, len(which))),
+                full[list(self.fixed_rows)],
+                full[list(self.bounded_rows)],
+            ]
+        )
+        if jac.shape[0] == jac.shape[1]:
+            try:
+                slope = np.linalg.solve(jac, -right)
+            except np.linalg.LinAlgError:
+                pass
+            else:
+                if np.isfinite(slope).all() and np.linalg.cond(jac) < 1e13:
+                    return np.asarray(slope)
+        return np.asarray(np.linalg.lstsq(jac, -right, rcond=1e-12)[0])
+
+    def guesses(self, given: Mapping[str, float]) -> list[Array]:
+        """Places where the search begins: what is given, the model's own, then 0, 1 and seeded random places."""
+        s = self.system
+        places: list[Array] = []
+        known = {**self.start, **given}
+        names = self.variables
+        unknown = [k for k, n in enumerate(names) if n in s.states and n not in known]
+        fills = [0.0] if not unknown else [0.0, 1.0, *np.random.default_rng(0).normal(size=4)]
+        for fill in fills:
+            v = np.array([known.get(n, fill if n in s.states else 0.0) for n in names], dtype=float)
+            for k, place in enumerate(self.fixed_places):
+                v[place] = self.fixed_values[k]
+            places.append(np.clip(self._with_signals(v), self.low, self.high))
+        return places
+
+    def _with_signals(self, v: Array) -> Array:
+        """The guess with delays, sampled values and bounded signals set to what they show."""
+        s, size = self.system, self.system.layout
+        k = len(self.bounded_rows)
+        for _ in range(3 if size.ne or k else 0):
+            y, w, p = self.vectors(v)
+            values = s.values(y, w, p, s.modes(y, w, p))
+            v = v.copy()
+            if size.ne:
+                v[size.n : size.n + size.ne] = np.nan_to_num(values[size.n : size.n + size.ne])
+            if k:
+                v[-k:] = np.nan_to_num(values[list(self.bounded_rows)])
+        return v
+
+
+def _is_variable(model: Model, name: str) -> bool:
+    return any(name in group for group in (model.states, model.inputs, model.parameters, model.delays, model.sampled))
+
+
+def _starts(model: Model, s: System, p: Array, bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Where each variable's search begins, as far as the model says."""
+    found = {n: st.guess for n, st in model.states.items() if st.guess is not None}
+    found |= {s.states[k]: v for k, v in s.start_values(p).items() if np.isfinite(v)}
+    found |= {n: model.algebraic[n].start for n in s.unknowns}
+    found |= {n: i.value for n, i in model.inputs.items()} | {n: q.value for n, q in model.parameters.items()}
+    for n, (low, high) in bounds.items():
+        if n not in found and np.isfinite(low + high):
+            found[n] = 0.5 * (low + high)
+    return found
+
+
+def _equation_rows(s: System, at: At, moving: Collection[str]) -> tuple[int, ...]:
+    size = s.layout
+    rest = {k: size.main + i for i, k in enumerate(s.with_rest)}
+    start = {k: size.main + size.n_rest + i for i, k in enumerate(s.with_start)} if at == "start" else {}
+    states = [start.get(k, rest.get(k, k)) for k, n in enumerate(s.states) if n not in moving]
+    return (*states, *range(size.nx, size.n + size.ne))
+
+
+def _check(
+    model: Model,
+    s: System,
+    fixed: Mapping[str, float],
+    free: Collection[str],
+    bounds: Mapping[str, tuple[float, float]],
+    moving: Collection[str],
+) -> None:
+    where = f"operating point of model '{model.name}'"
+    for n in moving:
+        if n not in model.states:
+            raise unknown_name("state", n, model.states, where=where)
+    for n in free:
+        if n in model.states or n in s.unknowns or n in model.outputs or n in model.signals:
+            continue  # free by nature
+        if n not in model.inputs and n not in model.parameters:
+            raise unknown_name("input or parameter", n, [*model.inputs, *model.parameters], where=where)
+        if n in fixed:
+            raise ModelError(f"'{n}' is both fixed and free", where=where, hint="leave it out of one of them")
+    for n, value in fixed.items():
+        if not np.isfinite(value):
+            raise ModelError(f"the fixed value of '{n}' is not finite", where=where, got=f"{value}")
+    for n, (low, high) in bounds.items():
+        if not low <= high:
+            raise ModelError(
+                f"the bounds of '{n}' are the wrong way round",
+                where=where,
+                expected="low <= high",
+                got=f"{low}, {high}",
+            )
+        if (n in model.inputs or n in model.parameters) and n not in free:
+            raise ModelError(f"'{n}' has bounds but is not free", where=where, hint=f"name it in `free`: free=['{n}']")
+    constraints = [n for n in fixed if n not in model.inputs and n not in model.parameters]
+    room = sum(n in model.inputs or n in model.parameters for n in free) + len(set(moving))
+    if len(constraints) > room:
+        raise SteadyStateError(
+            f"{len(constraints)} fixed values ({', '.join(constraints)}) for {room} that may move",
+            where=where,
+            expected="as many freed inputs, parameters or moving states as fixed states and outputs",
+            hint=f"free {len(constraints) - room} more input or parameter",
+        )

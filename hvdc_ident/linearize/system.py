@@ -1,0 +1,249 @@
+"""A model's values and exact derivatives at a point, as machine code: what linearisation and operating points are made of.
+
+Rows of every matrix here: [f (states), g (unknowns), sources (delays, sampled), outputs, rest, start]; columns:
+[x, z, inputs, delays and sampled values] and, in the parameters' own matrix, the parameters.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import ModelError
+from hvdc_ident.linearize.limits import Condition, conditions
+from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.machine import Code, Function
+from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.trajectory import Array
+
+_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things stand: counts of states, unknowns, inputs, delays and sampled values, outputs, parameters."""
+
+    nx: int
+    nz: int
+    nu: int
+    ne: int
+    no: int
+    np: int
+    n_rest: int
+    n_start: int
+
+    @property
+    def n(self) -> int:
+        """States and unknowns."""
+        return self.nx + self.nz
+
+    @property
+    def rows(self) -> int:
+        """All rows."""
+        return self.n + self.ne + self.no + self.n_rest + self.n_start
+
+    @property
+    def main(self) -> int:
+        """Rows of f, g, sources and outputs."""
+        return self.n + self.ne + self.no
+
+    @property
+    def columns(self) -> int:
+        """States, unknowns, inputs, delays and sampled values."""
+        return self.n + self.nu + self.ne
+
+
+class System:
+    """Compiled values and derivatives of one model structure for one list of outputs; reusable for any values."""
+
+    def __init__(self, model: Model, outputs: Sequence[str]) -> None:
+        self.structure = s = Structure(model, (), outputs)
+        g, m = s.graph, model
+        self.outputs = s.outputs
+        self.states, self.unknowns = s.states, s.unknowns
+        self.inputs, self.extras = tuple(m.inputs), (*m.delays, *m.sampled)
+        self.parameters = tuple(m.parameters)
+        self.conditions: tuple[Condition, ...] = conditions(s)
+        self.with_rest = tuple(i for i, r in enumerate(s.rests) if r is not None)
+        self.with_start = tuple(i for i, r in enumerate(s.starts) if r is not None)
+        rest = [g.sub(g.leaf("y", i), s.rests[i]) for i in self.with_rest]
+        start = [g.sub(g.leaf("y", i), s.starts[i]) for i in self.with_start]
+        self.nodes = [*s.rhs, *s.sources, *s.observed, *rest, *start]
+        self.layout = Layout(
+            len(s.states), len(s.unknowns), len(m.inputs), len(self.extras), len(s.observed), len(m.parameters),
+            len(rest), len(start),
+        )  # fmt: skip
+        self._compile()
+
+    def _entries(self) -> list[tuple[int, int, int]]:
+        """(row, column, node) of every derivative over y and w that is not 0 by structure."""
+        n = self.layout.n
+        found = []
+        for i, v in enumerate(self.nodes):
+            found += [(i, j, d) for j, d in self.structure.partial(v, "y").items()]
+            found += [(i, n + j - 1, d) for j, d in self.structure.partial(v, "w").items() if j > 0]
+        return found
+
+    def _compile(self) -> None:
+        s, g, size = self.structure, self.structure.graph, self.layout
+        self._by_yw = self._entries()
+        by_p = [(i * size.np + j, d) for i, v in enumerate(self.nodes) for j, d in s.partial(v, "p").items()]
+        switches = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
+        timing = [(i * size.np + j, d) for i, v in enumerate(s.timing) for j, d in s.partial(v, "p").items()]
+        functions = [
+            Function("timing_p", timing),
+            Function("values", list(enumerate(self.nodes))),
+            Function("jac", [(i * size.columns + j, d) for i, j, d in self._by_yw]),
+            Function("jac_p", by_p),
+            Function("modes", list(enumerate(switches)), live=True),
+            Function("switches", list(enumerate(g.switches)), live=True),
+            Function("timing", list(enumerate(s.timing))),
+        ]
+        self._code = Code(g, functions, 1)
+        self._call = {f.name: _SIGNATURE(self._code.address[f.name]) for f in functions}
+        self._zero = np.zeros(size.n + size.nu + size.ne + 2)
+        self.n_switches = len(g.switches)
+
+    def _run(self, name: str, length: int, y: Array, w: Array, p: Array, m: Array) -> Array:
+        out = np.zeros(max(length, 1))
+        at = (y.ctypes.data, y.ctypes.data, w.ctypes.data, self._zero.ctypes.data, p.ctypes.data, m.ctypes.data)
+        self._call[name](*at, out.ctypes.data)
+        return out[:length]
+
+    # --- values and derivatives ---
+
+    def modes(self, y: Array, w: Array, p: Array) -> Array:
+        """One number a switch: 1 where the switch is negative at the point, else 0."""
+        return self._run("modes", self.n_switches, y, w, p, self._zero)
+
+    def switches(self, y: Array, w: Array, p: Array) -> Array:
+        """The values whose signs decide the switches."""
+        return self._run("switches", self.n_switches, y, w, p, self._zero)
+
+    def values(self, y: Array, w: Array, p: Array, m: Array) -> Array:
+        """(rows,) values of every row."""
+        return self._run("values", self.layout.rows, y, w, p, m)
+
+    def jacobian(self, y: Array, w: Array, p: Array, m: Array) -> Array:
+        """(rows, columns) derivatives over [x, z, inputs, delays, sampled]."""
+        size = self.layout
+        return self._run("jac", size.rows * size.columns, y, w, p, m).reshape(size.rows, size.columns)
+
+    def by_parameters(self, y: Array, w: Array, p: Array, m: Array) -> Array:
+        """(rows, parameters) partial derivatives over the parameters."""
+        size = self.layout
+        return self._run("jac_p", size.rows * size.np, y, w, p, m).reshape(size.rows, size.np)
+
+    @cached_property
+    def _second(self) -> tuple[Code, Any, Any, Any, Any]:
+        """Code of the second derivatives, and the row, column and variable each of them belongs to."""
+        s, size = self.structure, self.layout
+        variables = {"y": 0, "w": size.n - 1, "p": size.columns}
+        found = []
+        for i, j, d in self._by_yw:
+            if i >= size.main:
+                continue
+            for leaf, slope in s.graph.gradient(d).items():
+                _, group, index = s.graph.nodes[leaf]
+                if not (group == "w" and index == 0):
+                    found.append((i, j, variables[group] + index, slope))
+        code = Code(s.graph, [Function("hess", [(k, e[3]) for k, e in enumerate(found)])], 1)
+        rows, columns, over = (np.array([e[k] for e in found], dtype=np.intp) for k in range(3))
+        return code, _SIGNATURE(code.address["hess"]), rows, columns, over
+
+    def jacobian_along(self, y: Array, w: Array, p: Array, m: Array, directions: Array) -> Array:
+        """(directions, main rows, columns) derivatives of the Jacobian along given directions.
+
+        directions: (columns + parameters, k), in the order [x, z, inputs, delays, sampled, parameters].
+        """
+        _, call, rows, columns, over = self._second
+        size = self.layout
+        out = np.zeros(max(rows.size, 1))
+        zero = self._zero.ctypes.data
+        call(y.ctypes.data, y.ctypes.data, w.ctypes.data, zero, p.ctypes.data, m.ctypes.data, out.ctypes.data)
+        result = np.zeros((directions.shape[1], size.main, size.columns))
+        contribution = out[: rows.size, None] * directions[over]
+        for k in range(directions.shape[1]):
+            np.add.at(result[k], (rows, columns), contribution[:, k])
+        return result
+
+    def timing(self, p: Array) -> Array:
+        """Delay times, then sampling periods, then compute times, s. Raises ModelError where one is not usable."""
+        model = self.structure.model
+        nd, nq = len(model.delays), len(model.sampled)
+        if nd + nq == 0:
+            return np.zeros(0)
+        zero = self._zero
+        t = self._run("timing", nd + 2 * nq, zero, zero, p, zero)
+        for name, value in zip((*model.delays, *model.sampled), t[: nd + nq], strict=True):
+            if not value > 0.0:
+                raise ModelError(
+                    f"the delay or sampling period of '{name}' is not above 0",
+                    where=f"model '{model.name}'",
+                    got=f"{value:g} s",
+                    hint="leave the effect out, or give it a positive time",
+                )
+        return t
+
+    def timing_by_parameters(self, p: Array) -> Array:
+        """(times, parameters) derivatives of the delay times, periods and compute times."""
+        count = len(self.structure.timing)
+        zero = self._zero
+        return self._run("timing_p", count * p.size, zero, zero, p, zero).reshape(count, p.size)
+
+    def start_values(self, p: Array) -> dict[int, float]:
+        """The states' given start values by their place; they may depend on parameters."""
+        size = self.layout
+        if not self.with_start:
+            return {}
+        y, w = np.zeros(size.n + 1), np.zeros(1 + size.nu + size.ne)
+        tail = self.values(y, w, p, self.modes(y, w, p))[size.rows - size.n_start :]
+        return {i: -float(v) for i, v in zip(self.with_start, tail, strict=True)}
+
+    def complex_step(self, y: Array, w: Array, p: Array) -> Array:
+        """(main rows, columns) the Jacobian once more, by complex steps of 1e-30 through the values alone: a check."""
+        from hvdc_ident.linearize.complex_step import evaluate
+
+        size, g = self.layout, self.structure.graph
+        eye = 1e-30j * np.eye(size.columns)
+        leaves: dict[int, Any] = {g.leaf("w", 0): np.full(size.columns, w[0], dtype=complex)}
+        leaves |= {g.leaf("y", k): y[k] + eye[k] for k in range(size.n)}
+        leaves |= {g.leaf("w", k + 1): w[k + 1] + eye[size.n + k] for k in range(size.nu + size.ne)}
+        leaves |= {g.leaf("p", k): np.full(size.columns, v, dtype=complex) for k, v in enumerate(p)}
+        values = evaluate(g, self.nodes[: size.main], leaves, size.columns)
+        return np.array([v.imag for v in values]).reshape(size.main, size.columns) / 1e-30
+
+
+@dataclass(frozen=True)
+class _Key:
+    """What decides the machine code: the equations, not the values."""
+
+    structure: tuple[Any, ...]
+    outputs: tuple[str, ...]
+    model: Model
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self.outputs == other.outputs and self.structure == other.structure
+
+    def __hash__(self) -> int:
+        return hash((self.structure, self.outputs))
+
+
+@lru_cache(maxsize=32)
+def _system(key: _Key) -> System:
+    return System(key.model, key.outputs)
+
+
+@lru_cache(maxsize=64)
+def _by_identity(model: Model, outputs: tuple[str, ...]) -> System:
+    return _system(_Key(model.structure, outputs, model))
+
+
+def system(model: Model, outputs: Sequence[str] | None = None) -> System:
+    """The compiled system of a model's structure (outputs: of outputs or signals; default all), kept for later calls."""
+    return _by_identity(model, tuple(model.outputs if outputs is None else outputs))

@@ -1,0 +1,60 @@
+"""The stage `linearize`: the operating point, the linear model and its modes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from hvdc_ident.study.stage import Options, Outcome, Stage
+
+if TYPE_CHECKING:
+    from hvdc_ident.linearize import LinearModel
+    from hvdc_ident.study.study import Study
+
+
+def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+    """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for."""
+    from hvdc_ident.linearize import jacobian_error
+
+    model = linear_model(study)
+    point = model.point
+    assert point is not None
+    options.progress(1, 2, "modes and transfer functions")
+    functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
+    data = {
+        **model.to_dict(),
+        "operating_point": point.to_dict(),
+        "modes": [m.to_dict() for m in model.modes()],
+        "transfer_functions": [f.to_dict() for f in functions],
+        "method": "symbolic",
+        "jacobian_error": jacobian_error(point.model, point, model.output_names),
+        "jacobian_check": "complex step of 1e-30 through the equations, relative to each row's largest entry",
+    }
+    for key in ("schema", "kind", "model"):
+        data.pop(key, None)
+    return Outcome(data)
+
+
+def linear_model(study: Study) -> LinearModel:
+    """The linear model that a study's [linearize] asks for; without that table between all inputs and outputs."""
+    from hvdc_ident.linearize import find_operating_point, linearize
+
+    asked = study.settings.linearize
+    point = find_operating_point(study.model, study.values, at=asked.at if asked else "steady")
+    return linearize(
+        study.model,
+        point,
+        inputs=asked.inputs if asked else None,
+        outputs=asked.outputs if asked else None,
+        sensitivities=list(study.candidates),
+    )
+
+
+STAGE = Stage(
+    name="linearize",
+    file="linearization.json",
+    summary="The operating point, the linear model with its modes, and its transfer functions.",
+    run=run,
+    wanted=lambda study: study.settings.linearize is not None,
+    order=20,
+)
