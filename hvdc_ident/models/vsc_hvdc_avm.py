@@ -1,9 +1,9 @@
 """The average-value link: the phasor link's plant and controls with currents, PLL, inner loops and dc inductance.
 
-Balanced quantities as complex numbers in a frame that turns with the grid, x + jy, per unit, time in s. Station 1
-controls dc voltage and reactive power, station 2 active and reactive power; positive power flows from a grid into its
-converter. Names shared with the phasor link mean the same there. Facts (circuit, controls, numbers): Murad and
-Vanfretti, "Average-value model of a VSC-HVDC link", Modelica Conference 2017; the gains' rule as in the phasor link.
+Balanced quantities in the frame of each station's PLL, per unit, time in s: current Ir - j Ii, voltage vd + j vq.
+Station 1 controls dc voltage and reactive power, station 2 active and reactive power; positive power flows from a grid
+into its converter. Names shared with the phasor link mean the same there. Facts (circuit, controls, numbers): Murad and
+Vanfretti, Modelica Conference 2017; the gains follow the phasor link's rule.
 """
 
 from __future__ import annotations
@@ -74,7 +74,14 @@ def model(
     rated = RATINGS[rating]
     starts = _guesses(rated)
     derivatives = _dc_derivatives() | _control_derivatives()
-    signals = {"w0": "2*pi*F0", "R": "Zg / sqrt(1 + XR**2)", "X": "XR * R", "Xall": "X + XT + XA", "Rall": "R + RT"}
+    signals = {
+        "w0": "2*pi*F0",
+        "R": "Zg / sqrt(1 + XR**2)",
+        "X": "XR * R",
+        "Xall": "X + XT + XA",
+        "Rall": "R + RT",
+        "kx": "X/Xall",
+    }
     signals |= _dc() | _control_vdc() | _control_p() | _orders(priority)
     for i in (1, 2):
         derivatives |= _station_derivatives(i)
@@ -138,7 +145,15 @@ _MEASUREMENTS = {
 def _unit(name: str) -> str:
     if name.startswith("psi"):
         return "rad"
-    return {"w0": "rad/s", "wm": "1/s", "wb": "1/s", "xpll1": "pu s", "xpll2": "pu s"}.get(name, "pu")
+    return {
+        "w0": "rad/s",
+        "wpll1": "rad/s",
+        "wpll2": "rad/s",
+        "wm": "1/s",
+        "wb": "1/s",
+        "xpll1": "pu s",
+        "xpll2": "pu s",
+    }.get(name, "pu")
 
 
 def _inputs(rated: Rating) -> dict[str, Input]:
@@ -201,19 +216,15 @@ def _inside(filtered: bool) -> dict[str, Parameter]:
 
 
 def _circuit(i: int) -> dict[str, str]:
-    """Converter and terminal voltage, current in the PLL's frame, powers; di/dt is eliminated from the voltage."""
+    """Terminal voltage, di/dt eliminated from it (kx: the grid's share of the reactance), and powers."""
     return {
-        f"vcx{i}": f"vcd{i}*cos(psi{i}) - vcq{i}*sin(psi{i})",
-        f"vcy{i}": f"vcd{i}*sin(psi{i}) + vcq{i}*cos(psi{i})",
-        f"vx{i}": f"E{i} - X/Xall*(E{i} - vcx{i}) - (R - X/Xall*Rall)*Ix{i}",
-        f"vy{i}": f"X/Xall*vcy{i} - (R - X/Xall*Rall)*Iy{i}",
-        f"vd{i}": f"vx{i}*cos(psi{i}) + vy{i}*sin(psi{i})",
-        f"vq{i}": f"vy{i}*cos(psi{i}) - vx{i}*sin(psi{i})",
-        f"Ir{i}": f"Ix{i}*cos(psi{i}) + Iy{i}*sin(psi{i})",
-        f"Ii{i}": f"Ix{i}*sin(psi{i}) - Iy{i}*cos(psi{i})",
-        f"Vac{i}": f"sqrt(vx{i}**2 + vy{i}**2)",
-        f"P{i}": f"vx{i}*Ix{i} + vy{i}*Iy{i}",
-        f"Q{i}": f"vy{i}*Ix{i} - vx{i}*Iy{i}",
+        f"Ed{i}": f"E{i}*cos(psi{i})",
+        f"Eq{i}": f"-E{i}*sin(psi{i})",
+        f"vd{i}": f"Ed{i} + kx*(vcd{i} - Ed{i}) - (R - kx*Rall)*Ir{i}",
+        f"vq{i}": f"Eq{i} + kx*(vcq{i} - Eq{i}) + (R - kx*Rall)*Ii{i}",
+        f"Vac{i}": f"sqrt(vd{i}**2 + vq{i}**2)",
+        f"P{i}": f"vd{i}*Ir{i} - vq{i}*Ii{i}",
+        f"Q{i}": f"vq{i}*Ir{i} + vd{i}*Ii{i}",
         f"Pdc{i}": f"vcd{i}*Ir{i} - vcq{i}*Ii{i}",
     }
 
@@ -232,15 +243,15 @@ def _inner(i: int) -> dict[str, str]:
         f"mod{i}": f"{RATIO!r} * min(1, 1.5*Vdc{i} / sqrt(vsd{i}**2 + vsq{i}**2))",
         f"vcd{i}": f"mod{i}*vsd{i}",
         f"vcq{i}": f"mod{i}*vsq{i}",
-        f"dpsi{i}": f"clip(KIPLL*xpll{i} + KPPLL*vqa{i}, 0.75*w0, 1.25*w0) - w0",
+        f"wpll{i}": f"clip(KIPLL*xpll{i} + KPPLL*vqa{i}, 0.75*w0, 1.25*w0)",
     }
 
 
 def _station_derivatives(i: int) -> dict[str, str]:
     return {
-        f"Ix{i}": f"w0/Xall * (E{i} - vcx{i} - Rall*Ix{i} + Xall*Iy{i})",
-        f"Iy{i}": f"w0/Xall * (-vcy{i} - Rall*Iy{i} - Xall*Ix{i})",
-        f"psi{i}": f"dpsi{i}",
+        f"Ir{i}": f"w0/Xall * (Ed{i} - vcd{i} - Rall*Ir{i}) - wpll{i}*Ii{i}",
+        f"Ii{i}": f"w0/Xall * (vcq{i} - Eq{i} - Rall*Ii{i}) + wpll{i}*Ir{i}",
+        f"psi{i}": f"wpll{i} - w0",
         f"xpll{i}": f"vqa{i}",
         f"xd{i}": f"KII * (ed{i} + pd{i} - pd{i}_u)",
         f"xqi{i}": f"KII * (eqi{i} + pq{i} - pq{i}_u)",
@@ -335,7 +346,7 @@ def _guesses(rated: Rating) -> dict[str, float]:
         i_dq, turn = i_grid * cmath.exp(-1j * psi), cmath.exp(-1j * psi)
         v_star = (v - complex(R_TRANSFORMER, X_TRANSFORMER + X_ARM) * i_grid) * turn / RATIO
         inner = abs(v) - v_star - 1j * (X_TRANSFORMER + X_ARM) * i_dq
-        found |= {f"Ix{i}": i_grid.real, f"Iy{i}": i_grid.imag, f"psi{i}": psi, f"xpll{i}": math.pi / 16.0}
+        found |= {f"Ir{i}": i_dq.real, f"Ii{i}": -i_dq.imag, f"psi{i}": psi, f"xpll{i}": math.pi / 16.0}
         found |= {f"xd{i}": inner.real, f"xqi{i}": inner.imag, f"fd{i}": abs(v), f"fq{i}": 0.0}
         found |= {f"Vf{i}": abs(v), f"Vf{i}_s": 0.0, f"Vac{i}_m_g": abs(v), f"Q{i}_m_g": 0.0}
         found |= {"xv": i_dq.real} if i == 1 else {"xp": power, "P2_m_g": power}
