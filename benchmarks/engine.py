@@ -43,7 +43,7 @@ def _timed(function):
 @njit(error_model="numpy")
 def _many(address, y, w, p, m, out, count):
     for _ in range(count):
-        call(address, y.ctypes, y.ctypes, w.ctypes, w.ctypes, p.ctypes, m.ctypes, out.ctypes)
+        call(address, y, y, w, w, p, m, out)
 
 
 def cost(code, name):

@@ -10,18 +10,23 @@ from numba.extending import intrinsic
 
 from hvdc_ident.simulate.machine import ARGUMENTS
 
-_POINTERS = len(ARGUMENTS)
-
 
 @intrinsic
 def call(typing_context: Any, address: Any, y: Any, yd: Any, w: Any, wd: Any, p: Any, m: Any, out: Any) -> Any:
-    """Calls `void f(y, yd, w, wd, p, m, out)`, pointers to doubles, at an address known only at run time."""
-    signature = types.void(types.intp, *[types.CPointer(types.float64)] * _POINTERS)
+    """Calls `void f(y, yd, w, wd, p, m, out)`, pointers to doubles, at an address known only at run time.
+
+    The arguments are arrays of doubles; only their data pointers are passed, without touching reference counts.
+    """
+    arrays = (y, yd, w, wd, p, m, out)
+    if not all(isinstance(a, types.Array) and a.dtype == types.float64 for a in arrays):
+        return None
+    signature = types.void(types.intp, *arrays)
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = ir.DoubleType().as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [pointer] * _POINTERS).as_pointer()
-        builder.call(builder.inttoptr(arguments[0], kind), arguments[1:])
+        kind = ir.FunctionType(ir.VoidType(), [pointer] * len(ARGUMENTS)).as_pointer()
+        data = [context.make_array(t)(context, builder, a).data for t, a in zip(signature.args[1:], arguments[1:], strict=True)]
+        builder.call(builder.inttoptr(arguments[0], kind), data)
         return context.get_dummy_value()
 
     return signature, code

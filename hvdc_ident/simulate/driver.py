@@ -35,6 +35,7 @@ from hvdc_ident.simulate.steps import (
     rodas_matrix,
     rodas_point,
     rodas_stage,
+    rodas_stages,
     stage_time,
 )
 
@@ -51,13 +52,13 @@ def consistent(address, live, y, yd, w, wd, p, m, nx, nz, width, out, jac, small
     """
     n = nx + nz
     if live:
-        call(address[MODES], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, m.ctypes)
+        call(address[MODES], y, yd, w, wd, p, m, m)
     if nz == 0:
         return True
     converged = False
     for iteration in range(60):
-        call(address[F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out.ctypes)
-        call(address[JAC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, jac.ctypes)
+        call(address[F], y, yd, w, wd, p, m, out)
+        call(address[JAC], y, yd, w, wd, p, m, jac)
         for i in range(nz):
             for j in range(nz):
                 small[i, j] = jac[nx + i, nx + j]
@@ -72,7 +73,7 @@ def consistent(address, live, y, yd, w, wd, p, m, nx, nz, width, out, jac, small
         if not largest < np.inf:
             return False
         if live:
-            call(address[MODES], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, m.ctypes)
+            call(address[MODES], y, yd, w, wd, p, m, m)
         if largest < 1e-14 or (converged and largest < 1e-12):
             break
         converged = largest < 1e-12
@@ -81,7 +82,7 @@ def consistent(address, live, y, yd, w, wd, p, m, nx, nz, width, out, jac, small
     if width:
         for q in range(n + nx * width, n + n * width):
             y[q] = 0.0
-        call(address[FS], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out.ctypes)
+        call(address[FS], y, yd, w, wd, p, m, out)
         rows = out[n + nx * width : n + n * width].reshape(nz, width)
         solve_rows(small, pivots, rows)
         for i in range(nz):
@@ -94,13 +95,13 @@ def consistent(address, live, y, yd, w, wd, p, m, nx, nz, width, out, jac, small
 def rates(address, y, w, wd, p, m, nx, nz, yd, out, jac, small, pivots):  # type: ignore[no-untyped-def]
     """Writes the rates of states and unknowns into yd; needs modes and values that are consistent."""
     n = nx + nz
-    call(address[F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out.ctypes)
+    call(address[F], y, yd, w, wd, p, m, out)
     for i in range(nx):
         yd[i] = out[i]
     if nz == 0:
         return True
-    call(address[JAC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, jac.ctypes)
-    call(address[FT], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out.ctypes)
+    call(address[JAC], y, yd, w, wd, p, m, jac)
+    call(address[FT], y, yd, w, wd, p, m, out)
     for i in range(nz):
         total = -out[nx + i]
         for j in range(nx):
@@ -167,6 +168,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
     jac, matrix, small = np.zeros((n, n)), np.zeros((n, n)), np.zeros((nz, nz))
     pivots, small_pivots = np.zeros(n, np.int64), np.zeros(max(nz, 1), np.int64)
     hess = np.zeros((max(hess_row.size, 1), max(width, 1)))
+    totals, floors = np.zeros(width), np.zeros(width)
+    factors, shift, kind = np.zeros(max(dims[11], 1)), np.zeros(1), 0
     mass, c_sum = np.zeros(size), np.zeros(size)
     for q in range(nx):
         mass[q] = 1.0
@@ -231,7 +234,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         if not consistent(address, True, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
             return INCONSISTENT, t
         if not first and width and echo_now:
-            call(address[FS], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, f_after.ctypes)
+            call(address[FS], y, yd, w, wd, p, m, f_after)
             for r in range(nx):
                 for c in range(width):
                     y[n + r * width + c] += (f_before[r] - f_after[r]) * jump_p[c]
@@ -240,9 +243,9 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         # --- samples are taken and published ---
         for i in range(nq):
             if tick[i] == t and not final:
-                call(address[SRCS if width else SRC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, src.ctypes)
+                call(address[SRCS if width else SRC], y, yd, w, wd, p, m, src)
                 rates(address, y, w, wd, p, m, nx, nz, yd, u, jac, small, small_pivots)
-                call(address[SRCD], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, src_rate.ctypes)
+                call(address[SRCD], y, yd, w, wd, p, m, src_rate)
                 pending[i] = src[nd + i]
                 for c in range(width):
                     own = ticks[i] * constants[row0 + (nd + i) * width + c]
@@ -255,14 +258,14 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         for i in range(nq):
             if publish[i] == t and not final:
                 if width:
-                    call(address[F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, f_before.ctypes)
+                    call(address[F], y, yd, w, wd, p, m, f_before)
                 w[1 + nu + nd + i] = pending[i]
                 for c in range(width):
                     w[nw + (nd + i) * width + c] = pending_p[i, c]
                 if not consistent(address, True, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
                     return INCONSISTENT, t
                 if width:
-                    call(address[F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, f_after.ctypes)
+                    call(address[F], y, yd, w, wd, p, m, f_after)
                     for r in range(nx):
                         for c in range(width):
                             y[n + r * width + c] += (f_before[r] - f_after[r]) * publish_p[i, c]
@@ -281,7 +284,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             tb = min(tb, min(tick[i], publish[i]))
         # --- jumps and corners of a delayed signal's source come back after the delay ---
         if nd and (first or published or disturbed):
-            call(address[SRC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, src.ctypes)
+            call(address[SRC], y, yd, w, wd, p, m, src)
             for i in range(nd):
                 source_before = before[i, 0] if first else src_left[i]
                 following = 0.0 if abs(src[i] - source_before) > 1e-12 * (1.0 + abs(src[i])) else order + 1.0
@@ -296,7 +299,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         for c in range(width):
             jump_p[c] = 0.0
         while i_out < t_out.size and t_out[i_out] <= t:
-            call(address[OUTS if width else OUT], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out[i_out].ctypes)
+            call(address[OUTS if width else OUT], y, yd, w, wd, p, m, out[i_out])
             i_out += 1
         if final:
             break
@@ -310,14 +313,14 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         if not forced:
             ft[:] = 0.0
         if ns:
-            call(address[SW], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
+            call(address[SW], y, yd, w, wd, p, m, sv)
             for i in range(ns):
                 if abs(sv[i]) < np.inf:
                     top[i] = max(top[i], abs(sv[i]))
                 slack[i] = 0.01 * rtol * top[i] + 1e-14
 
         # --- the first step's length ---
-        call(address[FS if width else F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, k[0].ctypes)
+        call(address[FS if width else F], y, yd, w, wd, p, m, k[0])
         counts[EVALUATIONS] += 1
         d0, d1 = 0.0, 0.0
         for i in range(nx):
@@ -360,14 +363,18 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 else:
                     outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
                 if not rejected:
-                    call(address[JAC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, jac.ctypes)
+                    call(address[JAC], y, yd, w, wd, p, m, jac)
                     if forced:
-                        call(address[FT], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, ft.ctypes)
+                        call(address[FT], y, yd, w, wd, p, m, ft)
                     if hess_row.size:
-                        call(address[HESS], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, hess.ctypes)
-                regular = rodas_matrix(address, y, w, wd, p, m, hs, nx, jac, matrix, pivots)
+                        call(address[HESS], y, yd, w, wd, p, m, hess)
+                kind = rodas_matrix(address, dims[11], hs, nx, jac, factors, shift, yd, m, matrix, pivots)
+                regular = kind > 0
             if regular:
-                for s in range(stages):
+                if quiet and method == ROSENBROCK:
+                    counts[EVALUATIONS] += 8
+                    rodas_stages(address, hs, forced, n, width, mass, hess_row, hess_column, hess, ft, kind, factors, matrix, pivots, y, u, k, c_sum, yd, w, wd, p, m, t, step_end)
+                for s in range(stages if not (quiet and method == ROSENBROCK) else 0):
                     if method == EXPLICIT and s == 0:
                         if not fresh:
                             for q in range(size):
@@ -383,17 +390,17 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     counts[EVALUATIONS] += 1
                     if method == ROSENBROCK:
                         rodas_point(s, y, k, u)
-                        rodas_stage(address, s, hs, forced, nx, n, width, mass, hess_row, hess_column, hess, ft, matrix, pivots, u, k, c_sum, yd, w, wd, p, m)
+                        rodas_stage(address, s, hs, forced, n, width, mass, hess_row, hess_column, hess, ft, kind, factors, matrix, pivots, u, k, c_sum, yd, w, wd, p, m)
                     else:
                         dopri_point(s, hs, y, k, u)
                         if s == 5:
                             for q in range(nx):
                                 e[q] = u[q]
-                        call(address[FS if width else F], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, k[s].ctypes)
+                        call(address[FS if width else F], u, yd, w, wd, p, m, k[s])
                 if method == ROSENBROCK:
                     for q in range(size):
                         yn[q] = u[q] + k[7, q]
-                    error = error_norm(k[7], y, yn, n, rows, width, np_, rtol, atol, scale)
+                    error = error_norm(k[7], y, yn, n, rows, width, np_, rtol, atol, scale, totals, floors)
                 else:
                     top_change, bottom_change = 0.0, 0.0
                     for q in range(nx):
@@ -402,7 +409,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     for q in range(size):
                         yn[q] = u[q]
                     dopri_error(hs, k, e)
-                    error = error_norm(e, y, yn, n, rows, width, np_, rtol, atol, scale)
+                    error = error_norm(e, y, yn, n, rows, width, np_, rtol, atol, scale, totals, floors)
             else:
                 error = np.inf
             if error > 1.0 and hs <= 1e-10 * (end - start) and error < np.inf and counts[FORCED] < 50:
@@ -444,7 +451,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         w[0] = ts
                     else:
                         outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
-                    call(address[SW], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
+                    call(address[SW], u, yd, w, wd, p, m, sv)
                     event = violation(sv, m, slack)
                     if event >= 0:
                         bad = share
@@ -459,7 +466,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                             w[0] = t + middle * hs
                         else:
                             outside(t + middle * hs, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
-                        call(address[SW], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
+                        call(address[SW], u, yd, w, wd, p, m, sv)
                         which = violation(sv, m, slack)
                         if which >= 0:
                             bad, event = middle, which
@@ -490,7 +497,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     w[0] = t_out[i_out]
                 else:
                     outside(t_out[i_out], t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
-                call(address[OUTS if width else OUT], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out[i_out].ctypes)
+                call(address[OUTS if width else OUT], u, yd, w, wd, p, m, out[i_out])
                 i_out += 1
             # --- the history of delayed signals ---
             if nd:
@@ -502,7 +509,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         w[0] = ts
                     else:
                         outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
-                    call(address[SRCS if width else SRC], u.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, src.ctypes)
+                    call(address[SRCS if width else SRC], u, yd, w, wd, p, m, src)
                     for i in range(nd):
                         node_values[j, i, 0] = src[i]
                         for c in range(width):
@@ -544,20 +551,20 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 rates(address, y, w, wd, p, m, nx, nz, yd, f_before, jac, small, small_pivots)
                 for i in range(nx):
                     f_before[i] = yd[i]
-                call(address[SWS], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sws.ctypes)
-                call(address[SWD], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
+                call(address[SWS], y, yd, w, wd, p, m, sws)
+                call(address[SWD], y, yd, w, wd, p, m, sv)
                 speed = sv[event]
             m[event] = 1.0 - m[event]
             for _ in range(ns):
                 if not consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
                     return INCONSISTENT, t
-                call(address[SW], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, sv.ctypes)
+                call(address[SW], y, yd, w, wd, p, m, sv)
                 also = violation(sv, m, slack)
                 if also < 0 or also == event:
                     break
                 m[also] = 1.0 - m[also]
             if width:
-                call(address[F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, f_after.ctypes)
+                call(address[F], y, yd, w, wd, p, m, f_after)
                 biggest = 0.0
                 for i in range(nx):
                     biggest = max(biggest, abs(f_before[i] - f_after[i]) / (1e-9 + abs(f_before[i]) + abs(f_after[i])))
@@ -580,16 +587,16 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         tb = min(tb, t + lag[i])
             for c in range(width):
                 jump_p[c] = 0.0
-            call(address[FS if width else F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, k[0].ctypes)
+            call(address[FS if width else F], y, yd, w, wd, p, m, k[0])
             fresh = True
             h = min(h, hs)
 
         # --- the segment's end, seen from before its jump ---
         outside(t, start, t, False, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
         if nd:
-            call(address[SRC], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, src_left.ctypes)
+            call(address[SRC], y, yd, w, wd, p, m, src_left)
         while i_out + 1 < t_out.size and t_out[i_out] == t and t_out[i_out + 1] == t:
-            call(address[OUTS if width else OUT], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, out[i_out].ctypes)
+            call(address[OUTS if width else OUT], y, yd, w, wd, p, m, out[i_out])
             i_out += 1
         order, disturbed = 0.0, i_break < breaks.size and breaks[i_break] <= t
         kept = 0
@@ -605,7 +612,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 kept += 1
         echoes = kept
         if echo_now and width:
-            call(address[F], y.ctypes, yd.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, f_before.ctypes)
+            call(address[F], y, yd, w, wd, p, m, f_before)
         while i_break < breaks.size and breaks[i_break] <= t:
             i_break += 1
         first = False

@@ -47,7 +47,8 @@ class Engine:
         s = self.structure.sizes
         self._code = self.structure.compile()
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
-        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width, s.n_hess, self.structure.moves_by_itself], dtype=np.int64)
+        factors = self.structure.elimination.count if self.structure.elimination else 0
+        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width, s.n_hess, self.structure.moves_by_itself, factors], dtype=np.int64)
         second = self.structure.second
         self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
         self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import llvmlite.binding as llvm
@@ -47,17 +47,20 @@ class Function:
 class Code:
     """Compiled functions of one module: `address[name]`. The code lives as long as this object."""
 
-    def __init__(self, graph: Graph, functions: Sequence[Function], width: int) -> None:
+    def __init__(self, graph: Graph, functions: Sequence[Function], width: int, written: Mapping[str, Callable[[str], str]] | None = None) -> None:
+        """written: further hot functions as text, by name; each is called with the symbol it has to define."""
         serial = next(_serial)
-        names = {f.name: f"hvdcident_{serial}_{f.name}" for f in functions}
+        written = written or {}
+        names = {n: f"hvdcident_{serial}_{n}" for n in (*(f.name for f in functions), *written)}
         self._engines: list[llvm.ExecutionEngine] = []
         self.address: dict[str, int] = {}
         for hot in (True, False):
             chosen = [f for f in functions if f.hot == hot]
-            text = "\n".join([*_declarations(), *(_Emitter(graph, f, names[f.name], width).text() for f in chosen)])
+            text = "\n".join([*_declarations(), *(_Emitter(graph, f, names[f.name], width).text() for f in chosen), *(t(names[n]) for n, t in written.items() if hot)])
             engine = _compiled(text, hot)
             self._engines.append(engine)
-            self.address |= {f.name: engine.get_function_address(names[f.name]) for f in chosen}
+            kept = [f.name for f in chosen] + (list(written) if hot else [])
+            self.address |= {n: engine.get_function_address(names[n]) for n in kept}
 
     def __del__(self) -> None:
         for engine in getattr(self, "_engines", ()):
@@ -79,10 +82,12 @@ def _compiled(text: str, hot: bool) -> llvm.ExecutionEngine:
     target = llvm.Target.from_default_triple()
     machine = target.create_target_machine(opt=2 if hot else 0, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten())
     module.triple = llvm.get_default_triple()
-    tuning = llvm.create_pipeline_tuning_options(speed_level=2 if hot else 1)
-    tuning.slp_vectorization = hot
-    passes = llvm.create_pass_builder(machine, tuning)
-    passes.getModulePassManager().run(module, passes)
+    # The graph is free of common parts and its rows are vectors already: little is left for the optimiser. The ready-made
+    # pipelines would also keep 60 KiB of every module for ever.
+    if hot:
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_instruction_combine_pass()
+        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2)))
     engine = llvm.create_mcjit_compiler(module, machine)
     engine.finalize_object()
     return engine
@@ -90,6 +95,11 @@ def _compiled(text: str, hot: bool) -> llvm.ExecutionEngine:
 
 def _number(value: float) -> str:
     return f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}"
+
+
+def function_text(graph: Graph, function: Function, symbol: str, width: int) -> str:
+    """LLVM IR of one function of the graph under the given symbol."""
+    return _Emitter(graph, function, symbol, width).text()
 
 
 class _Emitter:

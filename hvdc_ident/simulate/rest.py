@@ -19,8 +19,8 @@ def residual(address, y, w, wd, p, m, n, inner, first, total, r):  # type: ignor
         w[first + i] = total[inner + i]
     for i in range(inner):
         y[i] = total[i]
-    call(address[MODES], y.ctypes, y.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, m.ctypes)
-    call(address[REST], y.ctypes, y.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, r.ctypes)
+    call(address[MODES], y, y, w, wd, p, m, m)
+    call(address[REST], y, y, w, wd, p, m, r)
 
 
 @njit(cache=True, error_model="numpy")
@@ -43,7 +43,7 @@ def rest(address, dims, p, y, w, wd, m, jac, worst):  # type: ignore[no-untyped-
     small = 0
     status = NOT_FOUND
     for _ in range(80):
-        call(address[REST_JAC], y.ctypes, y.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, jac.ctypes)
+        call(address[REST_JAC], y, y, w, wd, p, m, jac)
         weight, worst[1] = np.zeros(n), 0.0
         norm = 0.0
         for i in range(n):
@@ -93,14 +93,14 @@ def rest(address, dims, p, y, w, wd, m, jac, worst):  # type: ignore[no-untyped-
     if status != FOUND:
         return NOT_FOUND
     if width:
-        call(address[REST_JAC], y.ctypes, y.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, jac.ctypes)
+        call(address[REST_JAC], y, y, w, wd, p, m, jac)
         for i in range(n):
             for j in range(n):
                 matrix[i, j] = jac[i, j]
         if not lu(matrix, pivots):
             return SINGULAR
         rows = np.zeros((n, width))
-        call(address[REST_P], y.ctypes, y.ctypes, w.ctypes, wd.ctypes, p.ctypes, m.ctypes, rows.ctypes)
+        call(address[REST_P], y, y, w, wd, p, m, rows)
         solve_rows(matrix, pivots, rows)
         nw = 1 + nu + nd + nq
         for i in range(n):

@@ -9,7 +9,7 @@ Vectors (all double):
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,11 +18,12 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.elimination import Elimination, eliminate, solve_text
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.machine import Code, Function, Row
+from hvdc_ident.simulate.machine import Code, Function, Row, function_text
 
 # The order in which the integrators take the addresses.
-NAMES = ("f", "fs", "jac", "hess", "ft", "sw", "sws", "swd", "modes", "out", "outs", "src", "srcs", "srcd", "rest", "rest_jac", "rest_p", "const")
+NAMES = ("f", "fs", "jac", "hess", "ft", "sw", "sws", "swd", "modes", "out", "outs", "src", "srcs", "srcd", "rest", "rest_jac", "rest_p", "const", "lu", "solve", "solves")
 
 
 def torn(model: Model) -> tuple[str, ...]:
@@ -224,9 +225,23 @@ class Structure:
         by_p = [(i * s.width + position[k], d) for i, v in enumerate(residual) for k, d in self.partial(v, "p").items() if k in position]
         return [Function("rest", list(enumerate(residual))), Function("rest_jac", entries), Function("rest_p", by_p)]
 
+    @cached_property
+    def elimination(self) -> Elimination | None:
+        """Straight-line code for the linear systems of the Rosenbrock method, where the pattern allows it."""
+        n = len(self.rhs)
+        constant = {(i, j): self.graph.value(d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()}
+        return eliminate(constant, n, len(self.states)) if n else None
+
     def compile(self) -> Code:
         """The machine code; keep it as long as its addresses are used."""
-        return Code(self.graph, self.functions(), max(self.sizes.width, 1))
+        e, width = self.elimination, self.sizes.width
+        written: dict[str, Callable[[str], str]] = {}
+        if e is not None:
+            written["lu"] = lambda symbol: function_text(e.graph, e.function, symbol, 1)
+            written["solve"] = lambda symbol: solve_text(e, symbol, 0)
+            if width:
+                written["solves"] = lambda symbol: solve_text(e, symbol, width)
+        return Code(self.graph, self.functions(), max(width, 1), written)
 
 
 def _ordered(definitions: dict[str, sp.Expr], model: str) -> list[str]:
