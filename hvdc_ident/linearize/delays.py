@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.pade import response, response_slopes
 from hvdc_ident.linearize.schur import eliminate
 from hvdc_ident.linearize.system import Layout, System
 from hvdc_ident.model.definition import Model
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.schur import eliminate
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import LinearModel

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.trajectory import Array
+from hvdc_ident.linearize.arrays import Array
 
 if TYPE_CHECKING:
     import xarray
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Response:
     """A frequency response. omega: (n,) rad/s; values: (n, outputs, inputs) complex, in output unit per input unit.
 
-    std: (n, outputs, inputs) of the modulus of the error, 0 where no uncertainty was asked for or measured; coherence: 1 for a model.
+    std: (n, outputs, inputs) standard deviation of the error's modulus, where one is known. coherence: of a recording.
     """
 
     omega: Array

@@ -9,6 +9,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.delays import Channel, DelayFree, channels
 from hvdc_ident.linearize.limits import in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
@@ -17,7 +18,6 @@ from hvdc_ident.linearize.pade import pade
 from hvdc_ident.linearize.schur import Eliminated, eliminate
 from hvdc_ident.linearize.system import System, system
 from hvdc_ident.model.definition import Model
-from hvdc_ident.trajectory import Array
 
 Side = Literal["refuse", "below", "above"]
 WELL_POSED = 1e12
@@ -46,7 +46,7 @@ def linearize(
     Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
     """
     at = find_operating_point(model) if point is None else point
-    s = system(model, model.outputs if outputs is None else outputs)
+    s = system(model, outputs)
     chosen = _chosen(s, inputs, model.name)
     for name in sensitivities:
         if name not in s.parameters:
@@ -78,7 +78,7 @@ def one_sided(model: Model, point: OperatingPoint, **options: object) -> tuple[L
 
 def jacobian_error(model: Model, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
     """The largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
-    s = system(model, model.outputs if outputs is None else outputs)
+    s = system(model, outputs)
     y, w, p = point.y, point.w, point.p
     exact = s.jacobian(y, w, p, s.modes(y, w, p))[: s.layout.main]
     other = s.complex_step(y, w, p)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.expression.printer import to_text
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.simulate.structure import Structure
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ Note = Callable[..., None]
 
 @dataclass(frozen=True)
 class Limit:
-    """A limit at a point. margin: how far the expression is from the level, in the signal's unit, negative when past it.
+    """A limit at a point. margin: from the expression to the level, in the signal's unit, negative when past it.
 
     active: whether the limiter holds the signal, so that small changes do not pass.
     """
@@ -89,7 +90,7 @@ def conditions(structure: Structure) -> tuple[Condition, ...]:
                 note(g.sub(node(x), node(low)), name, "lower", x, low)
                 note(g.sub(node(high), node(x)), name, "upper", x, high)
             elif isinstance(e, (sp.Min, sp.Max)):
-                _extremum(e, name, structure, node, note)
+                _extremum(e, name, structure, _limiters(definition), node, note)
             elif isinstance(e, (sp.Abs, sp.sign)):
                 note(node(e.args[0]), name, "branch", e.args[0], 0)
                 note(g.neg(node(e.args[0])), name, "branch", e.args[0], 0)
@@ -101,23 +102,29 @@ def conditions(structure: Structure) -> tuple[Condition, ...]:
     return tuple(sorted((*found.values(), *rest), key=lambda c: c.index))
 
 
-def _text(e: object) -> str:
+def _text(e: Any) -> str:
     """The expression as engineers write it: numbers short."""
     if isinstance(e, (int, float)) or getattr(e, "is_number", False):
-        return f"{float(e):g}"  # type: ignore[arg-type]
-    return to_text(e)  # type: ignore[arg-type]
+        return f"{float(e):g}"
+    return to_text(e)
 
 
-def _extremum(e: sp.Expr, name: str, structure: Structure, node: Node, note: Note) -> None:
-    """Notes the pairwise comparisons of a min or max; against a number it is one end of a limiter."""
+def _extremum(
+    e: sp.Expr, name: str, structure: Structure, limiters: frozenset[sp.Basic], node: Node, note: Note
+) -> None:
+    """Notes the pairwise comparisons of a min or max; a min with a max inside (or the reverse) is a limiter's two ends.
+
+    A single min or max is a choice: which side of it is the limit nobody can tell.
+    """
     g = structure.graph
     values = [node(a) for a in e.args]
     smallest = isinstance(e, sp.Min)
+    limiter = e in limiters
     result, so_far = values[0], e.args[0]
     for v, a in zip(values[1:], e.args[1:], strict=True):
         difference = g.sub(result, v)
         first = g.negative(difference)
-        if so_far.is_number or a.is_number:
+        if (so_far.is_number or a.is_number) and limiter:
             moving, level = (a, so_far) if so_far.is_number else (so_far, a)
             # The switch's value is so_far - a; the margin is level - moving for min, moving - level for max.
             sign = 1.0 if (level is so_far) == smallest else -1.0
@@ -126,6 +133,17 @@ def _extremum(e: sp.Expr, name: str, structure: Structure, node: Node, note: Not
             note(difference, name, "branch", so_far, a, 1.0)
         result = g.select(first, result, v) if smallest else g.select(first, v, result)
         so_far = e.func(so_far, a)
+
+
+def _limiters(definition: sp.Basic) -> frozenset[sp.Basic]:
+    """Every min that holds a max against a number, or is held by one, and the reverse."""
+    found = set()
+    for e in definition.atoms(sp.Min, sp.Max):
+        other = sp.Max if isinstance(e, sp.Min) else sp.Min
+        for inner in e.args:
+            if isinstance(inner, other) and any(a.is_number for a in e.args) and any(a.is_number for a in inner.args):
+                found |= {e, inner}
+    return frozenset(found)
 
 
 def _definitions(structure: Structure) -> dict[str, sp.Basic]:

@@ -10,9 +10,9 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.delays import DelayFree
 from hvdc_ident.linearize.operating_point import OperatingPoint
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import control

@@ -10,7 +10,7 @@ import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.linearize.arrays import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import Gradient, LinearModel
@@ -26,7 +26,8 @@ class Mode:
     frequency_hz: of the oscillation, 0 for a real one. damping: -Re/|lambda|, 0 for a zero eigenvalue.
     participation: share of each state, they sum to 1. shape: the right eigenvector, its largest entry 1.
     sensitivity: d(lambda)/dp by parameter. kind: "oscillation", "decay", "growth", "growing oscillation",
-    or what a zero eigenvalue is: "free integrator", "hidden integrator" (no input or output reaches it).
+    or what a zero eigenvalue is: "free integrator", "hidden integrator" (nothing reaches it), "saturated state", "angle
+    reference or unobserved integrator", "undriven integrator", "sliding mean (cancelled by its delay)".
     """
 
     eigenvalue: complex
@@ -117,7 +118,9 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     share = np.abs(left.T * right)
     share = share / np.maximum(share.sum(axis=0), 1e-300)
     zero = ZERO * max(1.0, float(np.abs(values).max()))
-    order = sorted(range(values.size), key=lambda k: (-round(values[k].real, 9), abs(values[k].imag), -values[k].imag))
+    order = sorted(
+        range(values.size), key=lambda k: (-round(float(values[k].real), 9), abs(values[k].imag), -values[k].imag)
+    )
     found = []
     for k in order:
         v = right[:, k] / right[np.argmax(np.abs(right[:, k])), k]
@@ -145,6 +148,8 @@ def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: f
         )
         if driven and seen:
             return "free integrator"
+        if model.delay_free is not None:
+            return "sliding mean (cancelled by its delay)"
         return _hidden(model, right, bool(driven), bool(seen))
     if value.imag:
         return "oscillation" if value.real <= 0 else "growing oscillation"
@@ -164,9 +169,9 @@ def _hidden(model: LinearModel, right: Array, driven: bool, seen: bool) -> str:
 
 
 def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
-    """(n,) d(lambda)/dp for a derivative of A: w' dA v, and within a cluster of equal eigenvalues those of the block.
+    """(n,) d(lambda)/dp for a derivative of A: w' dA v, and in a cluster of equal eigenvalues those of the block.
 
-    A defective cluster has no derivative (it moves like a root): the mean of the cluster is given for each of its members.
+    A defective cluster has no derivative (it moves like a root): each of its members gets the mean of the cluster.
     """
     slope = np.einsum("ki,ij,jk->k", left, da, right)
     scale = 1e-7 * max(1.0, float(np.abs(values).max(initial=0.0)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.linearize.arrays import Array
 
 Equations = Callable[[Array], tuple[Array, Array]]
 ACCURACY = 1e-10
@@ -129,10 +129,11 @@ def pseudo_transient(equations: Equations, v: Array, moving: int, low: Array, hi
             continue
         trial = np.clip(v + step, low, high)
         r_new, jac_new = equations(trial)
-        before, after = np.linalg.norm(r / weights(jac, v)), np.linalg.norm(r_new / weights(jac_new, trial))
+        before = float(np.linalg.norm(r / weights(jac, v)))
+        after = float(np.linalg.norm(r_new / weights(jac_new, trial)))
         if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
             v, r, jac = trial, r_new, jac_new
-            h = min(h * max(1.5, before / max(float(after), 1e-300)), 1e9)
+            h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
             if after < 1e-12:
                 break
         else:

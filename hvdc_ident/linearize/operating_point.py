@@ -1,4 +1,4 @@
-"""Operating points: any state, unknown, input, output or parameter fixed, free or bounded, solved with exact Jacobians."""
+"""Operating points: any state, unknown, input, output or parameter fixed, free or bounded; exact Jacobians."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from hvdc_ident.errors import SteadyStateError, unknown_name
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.newton import ACCURACY, Root, newton, pseudo_transient
 from hvdc_ident.linearize.search import At, Search
 from hvdc_ident.linearize.system import System, system
 from hvdc_ident.model.definition import Model
-from hvdc_ident.trajectory import Array
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]
@@ -105,7 +105,7 @@ def find_operating_point(
     need not be 0. at="start": states with a given start stand there instead, and only the rest is solved.
     All in the model's units; an input that is not named keeps the model's value.
 
-    Raises UnknownNameError for a name the model lacks and SteadyStateError, with the worst equation, where there is none.
+    Raises UnknownNameError for a name the model lacks; SteadyStateError, with the worst equation, where there is none.
     """
     search = Search.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
     return solve(model, search, guess or {})
@@ -145,8 +145,8 @@ def _not_found(model: Model, search: Search, root: Root) -> SteadyStateError:
     )
 
 
-def point_of(model: Model, search: Search, root: Root) -> OperatingPoint:
-    """The point of a solved search."""
+def point_of(model: Model, search: Search, root: Root, with_limits: bool = True) -> OperatingPoint:
+    """The point of a solved search; without its limits where only the values matter, which is faster."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
     values = s.values(y, w, p, s.modes(y, w, p))
@@ -163,7 +163,7 @@ def point_of(model: Model, search: Search, root: Root) -> OperatingPoint:
         FrozenMap(wanted),
         _named(s.parameters, p),
         float(root.shares.max(initial=0.0)),
-        limits(s.structure, s.conditions, s.switches(y, w, p)),
+        limits(s.structure, s.conditions, s.switches(y, w, p)) if with_limits else (),
         root.iterations,
         method,
         search.at,

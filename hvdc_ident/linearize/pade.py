@@ -7,7 +7,7 @@ from math import factorial
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.trajectory import Array
+from hvdc_ident.linearize.arrays import Array
 
 MAX_ORDER = 12
 

@@ -8,15 +8,15 @@ import numpy as np
 import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.trajectory import Array
 
 TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on |G - Gr| over all frequencies."""
+    """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on max |G - Gr|."""
 
     model: LinearModel
     removed: tuple[complex, ...]

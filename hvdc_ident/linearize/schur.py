@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.linearize.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

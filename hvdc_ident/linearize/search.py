@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.system import System, system
 from hvdc_ident.model.definition import Model
-from hvdc_ident.trajectory import Array
 
 At = Literal["steady", "start"]
 

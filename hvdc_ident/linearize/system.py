@@ -1,4 +1,4 @@
-"""A model's values and exact derivatives at a point, as machine code: what linearisation and operating points are made of.
+"""A model's values and exact derivatives as machine code: what linearisation and operating points are made of.
 
 Rows of every matrix here: [f (states), g (unknowns), sources (delays, sampled), outputs, rest, start]; columns:
 [x, z, inputs, delays and sampled values] and, in the parameters' own matrix, the parameters.
@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import ModelError
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.model.definition import Model
 from hvdc_ident.simulate.machine import Code, Function
 from hvdc_ident.simulate.structure import Structure
-from hvdc_ident.trajectory import Array
 
 _SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
 
@@ -71,8 +71,8 @@ class System:
         self.conditions: tuple[Condition, ...] = conditions(s)
         self.with_rest = tuple(i for i, r in enumerate(s.rests) if r is not None)
         self.with_start = tuple(i for i, r in enumerate(s.starts) if r is not None)
-        rest = [g.sub(g.leaf("y", i), s.rests[i]) for i in self.with_rest]
-        start = [g.sub(g.leaf("y", i), s.starts[i]) for i in self.with_start]
+        rest = [g.sub(g.leaf("y", i), r) for i, r in enumerate(s.rests) if r is not None]
+        start = [g.sub(g.leaf("y", i), r) for i, r in enumerate(s.starts) if r is not None]
         self.nodes = [*s.rhs, *s.sources, *s.observed, *rest, *start]
         self.layout = Layout(
             len(s.states), len(s.unknowns), len(m.inputs), len(self.extras), len(s.observed), len(m.parameters),
@@ -245,5 +245,5 @@ def _by_identity(model: Model, outputs: tuple[str, ...]) -> System:
 
 
 def system(model: Model, outputs: Sequence[str] | None = None) -> System:
-    """The compiled system of a model's structure (outputs: of outputs or signals; default all), kept for later calls."""
+    """The compiled system of a model for a list of outputs or signals (default all outputs), kept for later calls."""
     return _by_identity(model, tuple(model.outputs if outputs is None else outputs))

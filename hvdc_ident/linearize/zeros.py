@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.linearize.arrays import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import LinearModel
@@ -18,7 +18,7 @@ RANK = 1e-11
 
 
 def zeros(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """The finite invariant zeros, complex, rad/s: the infinite ones are deflated by orthogonal steps before any is computed.
+    """The finite invariant zeros, complex, rad/s: infinite ones are deflated by orthogonal steps beforehand.
 
     Emami-Naeini and Van Dooren 1982 (doi 10.1016/0005-1098(82)90070-X): rank decisions on a balanced system, then a
     generalised eigenproblem. A system without any path from input to output has none by this definition.

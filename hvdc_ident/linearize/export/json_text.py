@@ -46,14 +46,12 @@ def from_dict(data: dict[str, Any], where: str = "linear model") -> LinearModel:
             "this is no linear model", where=where, expected=f"a JSON object with schema {SCHEMA} and A, B, C, D"
         )
     try:
-        return LinearModel(
-            *(data[k] for k in "ABCDE"),
-            *(tuple(data[f"{k}_names"]) for k in ("state", "input", "output")),
-            *(tuple(data[f"{k}_units"]) for k in ("state", "input", "output")),
-            name=data["model"],
-            provenance=FrozenMap(data.get("provenance", {})),
-            **{k: tuple(data[k]) for k in ("x0", "u0", "y0")},
-        )
+        fields: dict[str, Any] = {k: data[k] for k in "ABCDE"}
+        fields |= {
+            f"{k}_{w}": tuple(data[f"{k}_{w}"]) for k in ("state", "input", "output") for w in ("names", "units")
+        }
+        fields |= {k: tuple(data[k]) for k in ("x0", "u0", "y0")}
+        return LinearModel(**fields, name=data["model"], provenance=FrozenMap(data.get("provenance", {})))
     except (KeyError, TypeError, ValueError) as e:
         raise ModelError("the linear model is incomplete", where=where, got=f"{type(e).__name__}: {e}") from None
 

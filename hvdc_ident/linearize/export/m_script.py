@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_text
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.trajectory import Array
 
 SUFFIX = ".m"
 SUMMARY = "a MATLAB or Octave script that builds the state space, with names and operating point"
@@ -72,7 +73,8 @@ def read(path: Path) -> LinearModel:
             "the script is not one that was written here", where=str(path), got=f"{type(e).__name__}: {e}"
         ) from None
     tail = {k: tuple(float(v) for v in numbers[k].ravel()) for k in ("x0", "u0", "y0")}
-    return LinearModel(*(numbers[k] for k in "ABCDE"), **names, name=name, **tail)  # type: ignore[arg-type]
+    fields: dict[str, Any] = {**{k: numbers[k] for k in "ABCDE"}, **names, **tail}
+    return LinearModel(**fields, name=name)
 
 
 def _parse_matrix(text: str) -> Array:

@@ -57,10 +57,8 @@ def read(path: Path) -> LinearModel:
     def numbers(key: str) -> tuple[float, ...]:
         return tuple(float(v) for v in np.ravel(data.get(key, [])))
 
-    return LinearModel(
-        *(np.asarray(data[k], dtype=float) for k in "ABCD"),
-        np.asarray(data.get("E", np.eye(data["A"].shape[0])), dtype=float),
-        names("state_names"), names("input_names"), names("output_names"),
-        names("state_units"), names("input_units"), names("output_units"),
-        name=str(np.ravel(data.get("name", ["model"]))[0]), x0=numbers("x0"), u0=numbers("u0"), y0=numbers("y0"),
-    )  # fmt: skip
+    fields: dict[str, Any] = {k: np.asarray(data[k], dtype=float) for k in "ABCD"}
+    fields["E"] = np.asarray(data.get("E", np.eye(data["A"].shape[0])), dtype=float)
+    fields |= {f"{k}_{w}": names(f"{k}_{w}") for k in ("state", "input", "output") for w in ("names", "units")}
+    fields |= {k: numbers(k) for k in ("x0", "u0", "y0")}
+    return LinearModel(**fields, name=str(np.ravel(data.get("name", ["model"]))[0]))

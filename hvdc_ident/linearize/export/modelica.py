@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError, ModelError
 from hvdc_ident.files import write_text
+from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.trajectory import Array
 
 SUFFIX = ".mo"
 SUMMARY = "Modelica text of the state space: inputs and outputs in the plant's own values"
@@ -106,4 +107,5 @@ def read(path: Path) -> LinearModel:
         ) from None
     matrices = [np.array(rows[k]) for k in "ABCD"]
     name = re.sub(r"\\(.)", r"\1", title.group(1)) if title else "model"
-    return LinearModel(*matrices, np.eye(matrices[0].shape[0]), **names, name=name, **tail)  # type: ignore[arg-type]
+    fields: dict[str, Any] = {**dict(zip("ABCD", matrices, strict=True)), **names, **tail}
+    return LinearModel(**fields, E=np.eye(matrices[0].shape[0]), name=name)

@@ -1,0 +1,141 @@
+"""A loop opened at any named signal: its open-loop transfer, sensitivity and complementary sensitivity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.frequency import Response, default_omega, transfer
+from hvdc_ident.linearize.jacobian import linearize
+from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
+from hvdc_ident.model.definition import Model, Output, State
+from hvdc_ident.model.transform import driven, fresh
+from hvdc_ident.parameters import Input
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A loop opened at a signal. open: L, from what is injected to minus what comes back; 1 + L = 0 closes it."""
+
+    signal: str
+    open: LinearModel
+
+    def response(self, omega: Array | None = None) -> Response:
+        """L at omega in rad/s, delays exact."""
+        return self.open.bode(omega)
+
+    def closed_poles(self) -> Array:
+        """Poles with the loop closed, delays in their Pade form. Raises LinearizationError for an ill-posed loop."""
+        a, b, c, d = self.open.standard()
+        through = 1.0 + float(d[0, 0])
+        if abs(through) < 1e-12:
+            raise LinearizationError(
+                "the loop is ill-posed: its direct part is -1",
+                where=f"loop at '{self.signal}'",
+                hint="add the lag that is there",
+            )
+        return np.asarray(np.linalg.eigvals(a - b @ c / through), dtype=complex)
+
+    def sensitivity(self, omega: Array | None = None) -> Response:
+        """S = 1 / (1 + L)."""
+        return self._of(omega, lambda value: 1.0 / (1.0 + value), "S")
+
+    def complementary(self, omega: Array | None = None) -> Response:
+        """T = L / (1 + L)."""
+        return self._of(omega, lambda value: value / (1.0 + value), "T")
+
+    def _of(self, omega: Array | None, what: object, name: str) -> Response:
+        w = default_omega(self.open) if omega is None else np.atleast_1d(np.asarray(omega, dtype=float))
+        values = transfer(self.open, 1j * w)
+        return Response(w, what(values), (name,), (self.signal,), source=f"{name} at '{self.signal}'")  # type: ignore[operator]
+
+
+def open_model(model: Model, signal: str) -> tuple[Model, str]:
+    """(model, output): the model in which the signal is an input, and the output that shows what it would have been.
+
+    A state is opened between its integrator and its readers. Raises UnknownNameError, and LinearizationError for an
+    input, where there is nothing to open.
+    """
+    if signal in model.inputs:
+        raise LinearizationError(
+            f"'{signal}' is an input: no loop runs through it", where=f"model '{model.name}'", hint="open at a signal"
+        )
+    returned = fresh(model, f"{signal}_returned")
+    if signal in model.signals or signal in model.algebraic:
+        value = model.signals[signal].value if signal in model.signals else model.algebraic[signal].equation
+        unit = (model.signals | model.algebraic)[signal].unit  # type: ignore[operator]
+        opened = driven(model, (signal,))
+        return replace(opened, outputs=opened.outputs | {returned: Output(value, unit)}), returned
+    if signal in model.states:
+        old = model.states[signal]
+        opened = replace(
+            model,
+            states=FrozenMap({returned if n == signal else n: s for n, s in model.states.items()}),
+            inputs=model.inputs | {signal: Input(0.0, old.unit)},
+            outputs=model.outputs | {f"{returned}_shown": Output(symbol(returned), old.unit)},
+            parameters=model.parameters.without(f"{signal}_start") if old.start == "free" else model.parameters,
+        )
+        state = State(old.derivative, None, old.guess, None, old.unit, old.description)
+        return replace(opened, states=opened.states | {returned: state}), f"{returned}_shown"
+    raise unknown_name(
+        "signal", signal, [*model.signals, *model.algebraic, *model.states], where=f"model '{model.name}'"
+    )
+
+
+def loop(
+    model: Model,
+    signal: str,
+    point: OperatingPoint | None = None,
+    *,
+    sensitivities: Sequence[str] = (),
+    pade_order: int = 5,
+) -> Loop:
+    """The loop opened at a named signal, unknown or state, at the closed model's operating point."""
+    closed = find_operating_point(model) if point is None else point
+    opened, output = open_model(model, signal)
+    value = signal_value(model, closed, signal)
+    returned = fresh(model, f"{signal}_returned")
+    states = {**closed.states, **({returned: closed.states[signal]} if signal in closed.states else {})}
+    inputs = {**closed.inputs, signal: value}
+    parameters = {n: v for n, v in closed.parameters.items() if n in opened.parameters}
+    at = point_at(opened, {n: states[n] for n in opened.states}, inputs, parameters, time=closed.time)
+    if sensitivities:  # the derivatives need the shift of a point that is at rest
+        at = find_operating_point(opened, {**inputs, **parameters}, guess=states)
+    found = linearize(opened, at, inputs=[signal], outputs=[output], sensitivities=sensitivities, pade_order=pade_order)
+    return Loop(signal, negated(found))
+
+
+def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
+    """The value of any name at an operating point."""
+    from hvdc_ident.linearize.system import system
+
+    known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
+    if name in known:
+        return float(known[name])
+    s = system(model, (name,))
+    m = s.modes(point.y, point.w, point.p)
+    return float(s.values(point.y, point.w, point.p, m)[s.layout.n + s.layout.ne])
+
+
+def negated(model: LinearModel) -> LinearModel:
+    """The model whose outputs have the other sign."""
+    core = model.delay_free
+    if core is not None:
+        matrix = core.matrix.copy()
+        matrix[core.nx : core.nx + core.no] *= -1.0
+        core = replace(core, matrix=matrix)
+    gradients = {}
+    for n, g in model.gradients.items():
+        free = g.delay_free
+        if free is not None and core is not None:
+            free = free.copy()
+            free[core.nx : core.nx + core.no] *= -1.0
+        gradients[n] = replace(g, C=-g.C, D=-g.D, delay_free=free)
+    return replace(model, C=-model.C, D=-model.D, delay_free=core, gradients=FrozenMap(gradients))
