@@ -7,9 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.errors import InputError
+from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.files import write_text
 from hvdc_ident.models import load_model
-from hvdc_ident.study.demo import STEPS, recording
+from hvdc_ident.simulate import simulate
+from hvdc_ident.study.tables import csv_text
+
+NOISE = 1e-4  # pu, standard deviation
+SIGNALS = {  # name of the recording: set-point of the dc voltage
+    "step-up": InputSignal.step(0.1, 1.0, 1.019),
+    "ramp": InputSignal.ramp(0.1, 1.0, 0.4, 1.019),
+}
 
 TEXT = """\
 # A study: which model, which recordings, which questions. Check it with `hvdc-ident check study.toml`,
@@ -60,13 +68,19 @@ starts = 4                        # runs of the optimiser, from places spread ov
 def write_starter(folder: Path) -> Path:
     """The path of a commented study, once it and its data are in the folder. Raises InputError where one is there."""
     path = folder / "study.toml"
-    names = {"step-up": "vdc-step", "ramp": "vdc-ramp"}
-    for taken in (path, *(folder / f"{name}.csv" for name in names)):
+    for taken in (path, *(folder / f"{name}.csv" for name in SIGNALS)):
         if taken.exists():
             raise InputError("the folder already holds a file of this name", where=str(taken), hint="a new folder")
-    model = load_model("vsc-hvdc-link")
     random = np.random.default_rng(1)
-    tables = {name: recording(model, name, *STEPS[kind], ("Irorder1",), random) for name, kind in names.items()}
+    tables = {name: _recording(name, signal, random) for name, signal in SIGNALS.items()}
     for name, table in tables.items():
         write_text(folder / f"{name}.csv", table)
     return write_text(path, TEXT)
+
+
+def _recording(name: str, signal: InputSignal, random: np.random.Generator) -> str:
+    """CSV text: time, the set-point, and the order of the dc voltage control with noise."""
+    time = np.round(np.arange(1801) * 5e-4, 9)
+    run = simulate(load_model("vsc-hvdc-link"), experiment(name, time, {"Vdcref1": signal})).trajectory
+    noisy = np.round(run["Irorder1"] + NOISE * random.standard_normal(time.size), 8)
+    return csv_text(["time", "Vdcref1", "Irorder1"], np.column_stack([time, signal(time), noisy]).tolist())

@@ -56,10 +56,10 @@ def test_tables_quote_names_and_leave_nothing_for_none() -> None:
 
 def test_the_demo_is_the_same_for_a_seed_and_holds_together(tmp_path: Path) -> None:
     first, second, third = (write_demo(tmp_path / n, seed=s) for n, s in (("a", 0), ("b", 0), ("c", 1)))
-    assert (first.parent / "p-step.csv").read_bytes() == (second.parent / "p-step.csv").read_bytes()
-    assert (first.parent / "p-step.csv").read_bytes() != (third.parent / "p-step.csv").read_bytes()
+    assert (first.parent / "p-01-step.csv").read_bytes() == (second.parent / "p-01-step.csv").read_bytes()
+    assert (first.parent / "p-01-step.csv").read_bytes() != (third.parent / "p-01-step.csv").read_bytes()
     tomllib.loads(first.read_text())
     study = load_study(first)
-    assert list(study.candidates) == ["KIP", "KPVDC", "KIVDC", "KIQ"] and len(study.experiments) == 5
+    assert list(study.candidates) == ["KIP", "KIQ", "KPVDC", "KIVDC"] and len(study.experiments) == 12
     for notes in study.noise.values():
-        assert all(n.source == "estimated" and 5e-5 < n.std < 2e-4 for n in notes.values())
+        assert all(n.source == "given" and n.std == 1e-4 for n in notes.values())
