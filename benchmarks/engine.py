@@ -1,4 +1,4 @@
-"""The engine against its floor and against CasADi, in one run.
+"""The engine against its floor and against CasADi (cvodes, idas), in one run.
 
     python benchmarks/engine.py            (needs the extra `bench`)
 
@@ -10,12 +10,12 @@ several runs; only ratios of one run mean anything on a shared machine.
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import sympy as sp
 from numba import njit
 
-from hvdc_ident.expression.functions import symbol
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import Tolerance, engine, simulate
@@ -54,17 +54,20 @@ def cost(code, name):
     u = np.array([i.value for i in code.structure.model.inputs.values()])
     y, w = code.start(p, u)
     out, m = np.zeros(100_000), np.zeros(max(s.ns, 1))
+    if name in ("lu", "solve", "solves"):  # these take the Jacobian in y, the shift in w, the factors in p
+        y, w, p = np.eye(s.nx + s.nz).ravel(), np.full(w.size, 1e3), np.full(10_000, 1e-3)
     return best(lambda: _many(address, y, w, p, m, out, 20_000), 9) / 20_000
 
 
 def floor(model, sensitivities, statistics):
-    """Accepted steps x the method's evaluations x the generated functions' cost, s."""
+    """Two floors, s: accepted steps x right-hand sides (and Jacobians), and the same with the method's generated solves."""
     code = engine(model, sensitivities)
     rhs = cost(code, "fs" if sensitivities else "f")
     if statistics.method == "explicit":
-        return statistics.accepted * 6 * rhs
-    extra = cost(code, "jac") + (cost(code, "hess") if sensitivities else 0.0)
-    return statistics.accepted * (8 * rhs + extra)
+        return (statistics.accepted * 6 * rhs,) * 2
+    once = cost(code, "jac") + (cost(code, "hess") if sensitivities else 0.0)
+    solves = cost(code, "lu") + 8 * (cost(code, "solve") + (cost(code, "solves") if sensitivities else 0.0))
+    return statistics.accepted * (8 * rhs + once), statistics.accepted * (8 * rhs + once + solves)
 
 
 def smooth(link):
@@ -80,10 +83,17 @@ def casadi_run(model, sensitivities, rtol):
     code = engine(model, ())
     s = code.structure
     values = {n: ca.SX.sym(n) for n in (*s.states, *s.unknowns, *model.parameters, *model.inputs)}
-    rules = {"clip": lambda x, a, b: ca.fmin(ca.fmax(x, a), b), "Max": lambda *a: _fold(ca.fmax, a), "Min": lambda *a: _fold(ca.fmin, a), "sqrt": ca.sqrt}
+    rules = {
+        "clip": lambda x, a, b: ca.fmin(ca.fmax(x, a), b),
+        "Max": lambda *a: _fold(ca.fmax, a),
+        "Min": lambda *a: _fold(ca.fmin, a),
+        "sqrt": ca.sqrt,
+    }
     from hvdc_ident.simulate.structure import _ordered
 
-    definitions = {n: g.value for n, g in model.signals.items()} | {n: model.algebraic[n].equation for n in model.algebraic if n not in s.unknowns}
+    definitions = {n: g.value for n, g in model.signals.items()} | {
+        n: model.algebraic[n].equation for n in model.algebraic if n not in s.unknowns
+    }
     for name in _ordered(definitions, model.name):
         values[name] = _casadi(definitions[name], values, rules)
     ode = ca.vertcat(*(_casadi(x.derivative, values, rules) for x in model.states.values()))
@@ -91,8 +101,13 @@ def casadi_run(model, sensitivities, rtol):
     u = ca.vertcat(*(values[n] for n in model.inputs))
     dae = {"x": x, "ode": ode, "p": ca.vertcat(p, u)}
     if s.unknowns:
-        dae |= {"z": ca.vertcat(*(values[n] for n in s.unknowns)), "alg": ca.vertcat(*(_casadi(model.algebraic[n].equation, values, rules) - values[n] for n in s.unknowns))}
-    options = {"reltol": rtol, "abstol": rtol / 100, "max_num_steps": 200_000} | ({"calc_ic": True} if s.unknowns else {"linear_multistep_method": "bdf"})
+        dae |= {
+            "z": ca.vertcat(*(values[n] for n in s.unknowns)),
+            "alg": ca.vertcat(*(_casadi(model.algebraic[n].equation, values, rules) - values[n] for n in s.unknowns)),
+        }
+    options = {"reltol": rtol, "abstol": rtol / 100, "max_num_steps": 200_000} | (
+        {"calc_ic": True} if s.unknowns else {"linear_multistep_method": "bdf"}
+    )
     p0 = np.array(list(model.values.values()))
     u0 = np.array([i.value for i in model.inputs.values()])
     y, _ = code.start(p0, u0)
@@ -100,10 +115,24 @@ def casadi_run(model, sensitivities, rtol):
     stops = [0.0, *(t for t, _, _ in STEPS.values()), 1.5]
     plugin = "idas" if s.unknowns else "cvodes"
     parts = []
-    for a, b in zip(stops[:-1], stops[1:], strict=True):
+    for a, b in pairwise(stops):
         grid = CASE.time[(CASE.time > a) & (CASE.time <= b + 1e-12)]
         whole = ca.integrator("f", plugin, dae, a, list(grid), options)
-        parts.append((whole.factory("s", ["x0", "z0", "p", *(["fwd:x0", "fwd:p", "fwd:z0"] if columns else [])], ["xf", *(["fwd:xf"] if columns else [])], {}, {}) if not columns else whole.forward(len(columns)), whole, grid.size))
+        parts.append(
+            (
+                whole.factory(
+                    "s",
+                    ["x0", "z0", "p", *(["fwd:x0", "fwd:p", "fwd:z0"] if columns else [])],
+                    ["xf", *(["fwd:xf"] if columns else [])],
+                    {},
+                    {},
+                )
+                if not columns
+                else whole.forward(len(columns)),
+                whole,
+                grid.size,
+            )
+        )
     start_rows = engine(model, sensitivities).start(p0, u0)[0] if columns else None
 
     def run():
@@ -146,7 +175,12 @@ def fresh_structure():
     """Seconds from a model definition nobody compiled yet to its first trajectory with sensitivities."""
     link = load_model("vsc-hvdc-link")
     start = time.perf_counter()
-    model = link.with_effects([{"effect": "lag", "at": ["P2_m"], "parameters": {"T": 2e-3}}, {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.9}}])
+    model = link.with_effects(
+        [
+            {"effect": "lag", "at": ["P2_m"], "parameters": {"T": 2e-3}},
+            {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.9}},
+        ]
+    )
     simulate(model, CASE, sensitivities=GAINS)
     return time.perf_counter() - start
 
@@ -160,13 +194,21 @@ def main():
             for names in ((), GAINS):
                 tolerance = Tolerance(rtol, rtol / 100)
                 result = simulate(model, CASE, sensitivities=names, tolerance=tolerance)
-                mine = best(lambda model=model, names=names, tolerance=tolerance: simulate(model, CASE, sensitivities=names, tolerance=tolerance))
-                base = floor(model, names, result.statistics)
-                line = f"{label:6s} rtol {rtol:.0e} {len(names)} sensitivities: {mine * 1e3:7.2f} ms, {result.statistics.accepted} steps ({result.statistics.method}), floor {base * 1e3:5.2f} ms, ratio {mine / base:4.1f}"
+                mine = best(
+                    lambda model=model, names=names, tolerance=tolerance: simulate(
+                        model, CASE, sensitivities=names, tolerance=tolerance
+                    )
+                )
+                strict, whole = floor(model, names, result.statistics)
+                how = f"{result.statistics.accepted} steps, {result.statistics.method}"
+                line = f"{label:6s} rtol {rtol:.0e} {len(names)} sensitivities: {mine * 1e3:6.2f} ms ({how})"
+                line += f"; floor {strict * 1e3:5.2f} ms, {mine / strict:4.1f} x; with solves {whole * 1e3:5.2f} ms, {mine / whole:4.1f} x"
                 try:
                     peer = casadi_run(model, names, rtol)
                     theirs = best(peer, 3, 1)
-                    x, fx = peer()
+                    states = simulate(model, CASE, outputs=tuple(model.states), rtol=1e-10).trajectory.values[-1]
+                    apart = np.abs(np.asarray(peer()[0]).ravel() - states).max()
+                    assert apart < 1e-3, f"CasADi ended elsewhere: {apart}"
                     line += f"; casadi {theirs * 1e3:7.1f} ms, {theirs / mine:5.1f} x"
                 except ImportError:
                     line += "; casadi is not installed"

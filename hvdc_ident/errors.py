@@ -103,4 +103,6 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "")
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     shown = ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
     hint = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-    return UnknownNameError(f"no {kind} '{name}'", where=where, expected=f"one of {shown}" if names else f"no {kind}s at all", hint=hint)
+    return UnknownNameError(
+        f"no {kind} '{name}'", where=where, expected=f"one of {shown}" if names else f"no {kind}s at all", hint=hint
+    )

@@ -34,13 +34,20 @@ class InputSignal:
             object.__setattr__(self, name, array)
         t = self.times
         if t.ndim != 1 or t.size == 0 or t.shape != self.values.shape:
-            raise WaveformError("an input signal's times and values do not fit", expected="two vectors of one length, at least 1", got=f"shapes {t.shape} and {self.values.shape}")
+            raise WaveformError(
+                "an input signal's times and values do not fit",
+                expected="two vectors of one length, at least 1",
+                got=f"shapes {t.shape} and {self.values.shape}",
+            )
         if not (np.isfinite(t).all() and np.isfinite(self.values).all()):
             raise WaveformError("an input signal has a time or value that is not finite")
         if (np.diff(t) < 0).any():
             raise WaveformError("an input signal's times go back", expected="non-decreasing times")
         if t.size > 2 and (t[2:] == t[:-2]).any():
-            raise WaveformError("an input signal has one time more than twice", expected="at most two values at one instant: before and after a jump")
+            raise WaveformError(
+                "an input signal has one time more than twice",
+                expected="at most two values at one instant: before and after a jump",
+            )
 
     @classmethod
     def constant(cls, value: float) -> InputSignal:
@@ -107,14 +114,20 @@ class Experiment:
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
         if time.ndim != 1 or time.size == 0 or not np.isfinite(time).all() or (np.diff(time) < 0).any():
-            raise WaveformError("an experiment's times are wrong", where=f"experiment '{self.name}'", expected="finite, non-decreasing instants, at least one")
+            raise WaveformError(
+                "an experiment's times are wrong",
+                where=f"experiment '{self.name}'",
+                expected="finite, non-decreasing instants, at least one",
+            )
         time.setflags(write=False)
         object.__setattr__(self, "time", time)
         for name in ("inputs", "values", "noise"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
         if self.measured is not None and not np.array_equal(self.measured.time, time):
-            raise WaveformError("the measured outputs stand at other times than the experiment's", where=f"experiment '{self.name}'")
+            raise WaveformError(
+                "the measured outputs stand at other times than the experiment's", where=f"experiment '{self.name}'"
+            )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -133,7 +146,9 @@ class Experiment:
         return replace(self, **changes)
 
 
-def experiment(name: str, time: Any, inputs: Mapping[str, InputSignal | float] | None = None, **rest: Any) -> Experiment:
+def experiment(
+    name: str, time: Any, inputs: Mapping[str, InputSignal | float] | None = None, **rest: Any
+) -> Experiment:
     """An experiment whose inputs may be given as numbers too."""
     signals = {k: v if isinstance(v, InputSignal) else InputSignal.constant(v) for k, v in (inputs or {}).items()}
     return Experiment(name, np.asarray(time, dtype=float), FrozenMap(signals), **rest)

@@ -29,9 +29,17 @@ class Parameter:
         if math.isnan(self.value):
             raise ModelError("a parameter's value is not a number")
         if not self.min <= self.max or math.isnan(self.scale) or self.scale < 0:
-            raise ModelError("a parameter's bounds or scale are wrong", expected="min <= max and scale >= 0", got=f"min {self.min:g}, max {self.max:g}, scale {self.scale:g}")
+            raise ModelError(
+                "a parameter's bounds or scale are wrong",
+                expected="min <= max and scale >= 0",
+                got=f"min {self.min:g}, max {self.max:g}, scale {self.scale:g}",
+            )
         if not self.min <= self.value <= self.max:
-            raise ModelError("a parameter's value lies outside its own bounds", expected=f"a value in [{self.min:g}, {self.max:g}]", got=f"{self.value:g}")
+            raise ModelError(
+                "a parameter's value lies outside its own bounds",
+                expected=f"a value in [{self.min:g}, {self.max:g}]",
+                got=f"{self.value:g}",
+            )
 
     @property
     def size(self) -> float:

@@ -33,7 +33,11 @@ class Trajectory:
         names = tuple(self.names)
         units = tuple(self.units) or ("",) * len(names)
         if time.ndim != 1 or values.shape != (time.size, len(names)) or len(units) != len(names):
-            raise WaveformError("a trajectory's parts do not fit", expected=f"values of shape ({time.size}, {len(names)})", got=f"{values.shape} and {len(units)} units")
+            raise WaveformError(
+                "a trajectory's parts do not fit",
+                expected=f"values of shape ({time.size}, {len(names)})",
+                got=f"{values.shape} and {len(units)} units",
+            )
         time.setflags(write=False)
         values.setflags(write=False)
         for name, value in (("time", time), ("values", values), ("names", names), ("units", units)):
@@ -56,7 +60,12 @@ class Trajectory:
     def select(self, names: Iterable[str]) -> Trajectory:
         """The named signals alone, in the order given."""
         columns = [self._column(n) for n in names]
-        return Trajectory(self.time, self.values[:, columns], tuple(self.names[c] for c in columns), tuple(self.units[c] for c in columns))
+        return Trajectory(
+            self.time,
+            self.values[:, columns],
+            tuple(self.names[c] for c in columns),
+            tuple(self.units[c] for c in columns),
+        )
 
     def rows(self, mask: NDArray[np.bool_]) -> Trajectory:
         """The rows where the mask holds."""
@@ -64,7 +73,11 @@ class Trajectory:
 
     def to_dict(self) -> dict[str, Any]:
         """Time, signals and units as plain lists."""
-        return {"time": self.time.tolist(), "signals": {n: self[n].tolist() for n in self.names}, "units": dict(zip(self.names, self.units, strict=True))}
+        return {
+            "time": self.time.tolist(),
+            "signals": {n: self[n].tolist() for n in self.names},
+            "units": dict(zip(self.names, self.units, strict=True)),
+        }
 
     def _column(self, name: str) -> int:
         try:
@@ -73,8 +86,12 @@ class Trajectory:
             raise unknown_name("signal", name, self.names) from None
 
 
-def trajectory(time: Sequence[float] | Array, signals: dict[str, Any], units: dict[str, str] | None = None) -> Trajectory:
+def trajectory(
+    time: Sequence[float] | Array, signals: dict[str, Any], units: dict[str, str] | None = None
+) -> Trajectory:
     """A trajectory from a time axis and a dict of columns."""
     columns = [np.asarray(v, dtype=float) for v in signals.values()]
     values = np.column_stack(columns) if columns else np.empty((len(time), 0))
-    return Trajectory(np.asarray(time, dtype=float), values, tuple(signals), tuple((units or {}).get(n, "") for n in signals))
+    return Trajectory(
+        np.asarray(time, dtype=float), values, tuple(signals), tuple((units or {}).get(n, "") for n in signals)
+    )

@@ -19,7 +19,9 @@ __all__ = ["Additions", "Effect", "EffectParameter", "EffectUse", "apply_effects
 @cache
 def effects() -> FrozenMap[Effect]:
     """Every effect by name."""
-    modules = (importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__) if m.name != "base")
+    modules = (
+        importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__) if m.name != "base"
+    )
     found = [m.EFFECT for m in modules]
     return FrozenMap({e.name: e for e in sorted(found, key=lambda e: e.name)})
 

@@ -42,7 +42,9 @@ class Additions:
     def __init__(self, model: Model, prefix: str) -> None:
         self.model, self._prefix = model, prefix
 
-    def state(self, label: str, derivative: Callable[[sp.Symbol], sp.Expr], rest: sp.Expr | None = None, unit: str = "") -> sp.Symbol:
+    def state(
+        self, label: str, derivative: Callable[[sp.Symbol], sp.Expr], rest: sp.Expr | None = None, unit: str = ""
+    ) -> sp.Symbol:
         """The symbol of a new state; `derivative` gets it. rest: what the state equals at rest, where the derivative leaves it open."""
         name = fresh(self.model, f"{self._prefix}_{label}")
         x = symbol(name)
@@ -111,9 +113,18 @@ class EffectUse:
             if key not in known:
                 raise unknown_name("key", key, known, where="an effect")
         if "effect" not in given or "at" not in given:
-            raise ModelError("an effect needs its name and its place", expected="effect = NAME, at = SLOT or [SLOT, ...]", got=str(dict(given)))
+            raise ModelError(
+                "an effect needs its name and its place",
+                expected="effect = NAME, at = SLOT or [SLOT, ...]",
+                got=str(dict(given)),
+            )
         at = given["at"]
-        return cls(str(given["effect"]), (at,) if isinstance(at, str) else tuple(at), FrozenMap(given.get("parameters", {})), str(given.get("prefix", "")))
+        return cls(
+            str(given["effect"]),
+            (at,) if isinstance(at, str) else tuple(at),
+            FrozenMap(given.get("parameters", {})),
+            str(given.get("prefix", "")),
+        )
 
     @property
     def label(self) -> str:
@@ -139,13 +150,18 @@ def apply(model: Model, use: EffectUse, effect: Effect) -> Model:
     for place in use.at:
         kind = slot(model, place)[0]
         if kind not in effect.places:
-            raise ModelError(f"the effect cannot sit at the {kind} '{place}'", where=where, expected=" or ".join(effect.places))
+            raise ModelError(
+                f"the effect cannot sit at the {kind} '{place}'", where=where, expected=" or ".join(effect.places)
+            )
     values = {n: float(use.parameters.get(n, q.value)) for n, q in effect.parameters.items()}
     if effect.is_neutral(values):
         return model
     names = {n: fresh(model, use.parameter_name(n)) for n in effect.parameters}
     try:
-        added = {names[n]: Parameter(values[n], q.unit, q.min, q.max, description=q.description) for n, q in effect.parameters.items()}
+        added = {
+            names[n]: Parameter(values[n], q.unit, q.min, q.max, description=q.description)
+            for n, q in effect.parameters.items()
+        }
     except ModelError as e:
         raise e.at(where) from None
     model = replace(model, parameters=model.parameters | added)

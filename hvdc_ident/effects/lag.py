@@ -16,7 +16,13 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
 EFFECT = Effect(
     name="lag",
     summary="first-order lag, T y' = u - y",
-    parameters=FrozenMap({"T": EffectParameter(1e-3, neutral=0.0, unit="s", probes=(5e-4, 2e-3, 1e-2, 5e-2), description="time constant")}),
+    parameters=FrozenMap(
+        {
+            "T": EffectParameter(
+                1e-3, neutral=0.0, unit="s", probes=(5e-4, 2e-3, 1e-2, 5e-2), description="time constant"
+            )
+        }
+    ),
     rewrite=rewrite,
     sentence="{at} follows its order with a first-order lag of {T}",
     excited_by="a step or fast ramp through the slot, recorded at several samples per time constant",

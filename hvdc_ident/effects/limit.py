@@ -18,7 +18,9 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
 EFFECT = Effect(
     name="limit",
     summary="hard limit, clip(u, -level, level)",
-    parameters=FrozenMap({"level": EffectParameter(1.0, neutral=math.inf, probes=(0.2, 0.5, 0.8, 1.0), description="largest magnitude")}),
+    parameters=FrozenMap(
+        {"level": EffectParameter(1.0, neutral=math.inf, probes=(0.2, 0.5, 0.8, 1.0), description="largest magnitude")}
+    ),
     rewrite=rewrite,
     sentence="{at} cannot exceed {level} in magnitude",
     excited_by="a step large enough that the signal reaches the limit, held, then released",

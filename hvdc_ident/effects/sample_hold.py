@@ -18,7 +18,9 @@ EFFECT = Effect(
     summary="u held for Ts, then computed for `compute` more",
     parameters=FrozenMap(
         {
-            "Ts": EffectParameter(1e-4, neutral=0.0, unit="s", probes=(1e-4, 5e-4, 2e-3), description="sampling period"),
+            "Ts": EffectParameter(
+                1e-4, neutral=0.0, unit="s", probes=(1e-4, 5e-4, 2e-3), description="sampling period"
+            ),
             "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period"),
         }
     ),

@@ -17,7 +17,9 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
 EFFECT = Effect(
     name="window-mean",
     summary="mean of u over the last T (a one-cycle measurement)",
-    parameters=FrozenMap({"T": EffectParameter(0.02, neutral=0.0, unit="s", probes=(0.005, 0.01, 0.02), description="window")}),
+    parameters=FrozenMap(
+        {"T": EffectParameter(0.02, neutral=0.0, unit="s", probes=(0.005, 0.01, 0.02), description="window")}
+    ),
     rewrite=rewrite,
     sentence="{at} is the mean over the last {T}",
     excited_by="a step through the slot, recorded at several samples per window",

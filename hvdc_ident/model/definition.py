@@ -75,7 +75,7 @@ class Sampled:
 
     value: sp.Expr
     period: sp.Expr
-    compute: sp.Expr = sp.Integer(0)
+    compute: sp.Expr = sp.S.Zero
 
 
 @dataclass(frozen=True)
@@ -174,19 +174,48 @@ class Model:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Every name an expression may use."""
-        return (*self.parameters, *self.inputs, *self.states, *self.signals, *self.algebraic, *self.delays, *self.sampled)
+        return (
+            *self.parameters,
+            *self.inputs,
+            *self.states,
+            *self.signals,
+            *self.algebraic,
+            *self.delays,
+            *self.sampled,
+        )
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
         """What the machine code depends on: names and equations, without the values of parameters and inputs."""
-        return (tuple(self.parameters), tuple(self.inputs), self.states, self.signals, self.algebraic, self.outputs, self.delays, self.sampled)
+        return (
+            tuple(self.parameters),
+            tuple(self.inputs),
+            self.states,
+            self.signals,
+            self.algebraic,
+            self.outputs,
+            self.delays,
+            self.sampled,
+        )
 
     def __hash__(self) -> int:
         return self._hash
 
     @cached_property
     def _hash(self) -> int:
-        return hash((self.name, self.parameters, self.inputs, self.states, self.signals, self.algebraic, self.outputs, self.delays, self.sampled))
+        return hash(
+            (
+                self.name,
+                self.parameters,
+                self.inputs,
+                self.states,
+                self.signals,
+                self.algebraic,
+                self.outputs,
+                self.delays,
+                self.sampled,
+            )
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Only the definition travels to another process: symbols hash anew there."""

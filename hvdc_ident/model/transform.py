@@ -32,7 +32,9 @@ def substituted(model: Model, renaming: Renaming) -> dict[str, Any]:
         return e.xreplace(renaming) if isinstance(e, sp.Basic) else e
 
     return {
-        "states": FrozenMap({n: replace(s, derivative=new(s.derivative), rest=new(s.rest)) for n, s in model.states.items()}),
+        "states": FrozenMap(
+            {n: replace(s, derivative=new(s.derivative), rest=new(s.rest)) for n, s in model.states.items()}
+        ),
         "signals": FrozenMap({n: replace(s, value=new(s.value)) for n, s in model.signals.items()}),
         "algebraic": FrozenMap({n: replace(a, equation=new(a.equation)) for n, a in model.algebraic.items()}),
         "outputs": FrozenMap({n: replace(o, value=new(o.value)) for n, o in model.outputs.items()}),
@@ -47,7 +49,13 @@ def slot(model: Model, name: str) -> tuple[str, str]:
         if name[8:] in model.outputs:
             return "output", name[8:]
     else:
-        for kind, names in (("input", model.inputs), ("signal", model.signals), ("algebraic", model.algebraic), ("state", model.states), ("output", model.outputs)):
+        for kind, names in (
+            ("input", model.inputs),
+            ("signal", model.signals),
+            ("algebraic", model.algebraic),
+            ("state", model.states),
+            ("output", model.outputs),
+        ):
             if name in names:
                 return kind, name
     raise unknown_name("slot", name, model.slots, where=f"model '{model.name}'")
@@ -79,7 +87,11 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
         model, y = rewrite(model, symbol(before))
         return replace(model, signals=model.signals | {name: replace(old, value=y)})
     unknown = model.algebraic[name]
-    model = replace(model, signals=model.signals | {before: Signal(unknown.equation, unknown.unit)}, algebraic=model.algebraic | {name: replace(unknown, equation=symbol(before))})
+    model = replace(
+        model,
+        signals=model.signals | {before: Signal(unknown.equation, unknown.unit)},
+        algebraic=model.algebraic | {name: replace(unknown, equation=symbol(before))},
+    )
     model, y = rewrite(model, symbol(before))
     return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)})
 
@@ -101,16 +113,21 @@ def driven(model: Model, slots: tuple[str, ...]) -> Model:
     for given in slots:
         kind, name = slot(model, given)
         if kind == "output":
-            raise ModelError("an output cannot be driven", where=f"model '{model.name}', drive '{given}'", expected="a signal, unknown, state or input", hint="drive the signal that the output shows")
+            raise ModelError(
+                "an output cannot be driven",
+                where=f"model '{model.name}', drive '{given}'",
+                expected="a signal, unknown, state or input",
+                hint="drive the signal that the output shows",
+            )
         if kind == "input":
             continue
-        rest = {
-            "signal": lambda n: {"signals": model.signals.without(n)},
-            "algebraic": lambda n: {"algebraic": model.algebraic.without(n)},
-            "state": lambda n: {"states": model.states.without(n), "parameters": model.parameters.without(f"{n}_start") if model.states[n].start == "free" else model.parameters},
-        }[kind](name)
-        unit = (model.signals | model.algebraic | model.states)[name].unit  # type: ignore[operator]
-        model = replace(model, **rest, inputs=model.inputs | {name: Input(0.0, unit, "driven by a recording")})
+        section = {"signal": "signals", "algebraic": "algebraic", "state": "states"}[kind]
+        items = getattr(model, section)
+        column = Input(0.0, items[name].unit, "driven by a recording")
+        fields = {section: items.without(name), "inputs": model.inputs | {name: column}}
+        if kind == "state" and items[name].start == "free":
+            fields["parameters"] = model.parameters.without(f"{name}_start")
+        model = replace(model, **fields)
     return model
 
 
@@ -127,8 +144,15 @@ def parameterised(model: Model, name: str) -> Model:
             parameters |= {k: v for k, v in chosen.parameters.items() if k not in parameters}
         else:
             parameters[n] = p
-    signals = {n: Signal(e, model.parameters[n].unit, model.parameters[n].description) for n, e in chosen.replaces.items()}
-    others = FrozenMap({k: v for k, v in model.parameterisations.items() if k != name and not set(v.replaces) & set(chosen.replaces)})
-    return replace(model, parameters=FrozenMap(parameters), signals=FrozenMap({**signals, **model.signals}), parameterisations=others)
-
-
+    signals = {
+        n: Signal(e, model.parameters[n].unit, model.parameters[n].description) for n, e in chosen.replaces.items()
+    }
+    others = FrozenMap(
+        {k: v for k, v in model.parameterisations.items() if k != name and not set(v.replaces) & set(chosen.replaces)}
+    )
+    return replace(
+        model,
+        parameters=FrozenMap(parameters),
+        signals=FrozenMap({**signals, **model.signals}),
+        parameterisations=others,
+    )

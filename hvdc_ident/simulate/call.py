@@ -25,7 +25,10 @@ def call(typing_context: Any, address: Any, y: Any, yd: Any, w: Any, wd: Any, p:
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = ir.DoubleType().as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [pointer] * len(ARGUMENTS)).as_pointer()
-        data = [context.make_array(t)(context, builder, a).data for t, a in zip(signature.args[1:], arguments[1:], strict=True)]
+        data = [
+            context.make_array(t)(context, builder, a).data
+            for t, a in zip(signature.args[1:], arguments[1:], strict=True)
+        ]
         builder.call(builder.inttoptr(arguments[0], kind), data)
         return context.get_dummy_value()
 

@@ -139,11 +139,21 @@ def violation(values, m, slack):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def grown(array, count):  # type: ignore[no-untyped-def]
-    """The array with room for at least one more row than count."""
+def longer(array, count):  # type: ignore[no-untyped-def]
+    """The vector with room for at least one more element than count."""
+    if count < array.size:
+        return array
+    larger = np.empty(2 * array.size)
+    larger[:count] = array[:count]
+    return larger
+
+
+@njit(cache=True, error_model="numpy")
+def deeper(array, count):  # type: ignore[no-untyped-def]
+    """The table (rows, columns) with room for at least one more row than count."""
     if count < array.shape[0]:
         return array
-    larger = np.empty((2 * array.shape[0],) + array.shape[1:])
+    larger = np.empty((2 * array.shape[0], array.shape[1]))
     larger[:count] = array[:count]
     return larger
 
@@ -155,7 +165,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
     y: the flat start vector, consistent to solver tolerance, overwritten with the end vector. constants: delay times,
     sampling periods and compute times with their rows. Returns (status, time reached).
     """
-    nx, nz, nu, nd, nq, ns, no, np_, width = dims[0], dims[1], dims[2], dims[3], dims[4], dims[5], dims[6], dims[7], dims[8]
+    nx, nz, nu, nd, nq, ns, np_, width = dims[0], dims[1], dims[2], dims[3], dims[4], dims[5], dims[7], dims[8]
     n = nx + nz
     size = n * (1 + width)
     nw = 1 + nu + nd + nq
@@ -289,7 +299,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 source_before = before[i, 0] if first else src_left[i]
                 following = 0.0 if abs(src[i] - source_before) > 1e-12 * (1.0 + abs(src[i])) else order + 1.0
                 if following <= 4.0 and t + lag[i] < end:
-                    echo_t, echo_o, echo_p = grown(echo_t, echoes), grown(echo_o, echoes), grown(echo_p, echoes)
+                    echo_t, echo_o, echo_p = longer(echo_t, echoes), longer(echo_o, echoes), deeper(echo_p, echoes)
                     echo_t[echoes] = t + lag[i]
                     echo_o[echoes] = following
                     for c in range(width):
@@ -514,7 +524,11 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         node_values[j, i, 0] = src[i]
                         for c in range(width):
                             node_values[j, i, 1 + c] = src[nd + nq + i * width + c]
-                h_t, h_h, h_c = grown(h_t, count), grown(h_h, count), grown(h_c, count)
+                h_t, h_h = longer(h_t, count), longer(h_h, count)
+                if count >= h_c.shape[0]:
+                    h_more = np.empty((2 * h_c.shape[0], nd, NODES, 1 + width))
+                    h_more[:count] = h_c
+                    h_c = h_more
                 h_t[count] = t
                 h_h[count] = step_end - t
                 for i in range(nd):
@@ -578,7 +592,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             if nd:
                 for i in range(nd):
                     if t + lag[i] < end:
-                        echo_t, echo_o, echo_p = grown(echo_t, echoes), grown(echo_o, echoes), grown(echo_p, echoes)
+                        echo_t, echo_o, echo_p = longer(echo_t, echoes), longer(echo_o, echoes), deeper(echo_p, echoes)
                         echo_t[echoes] = t + lag[i]
                         echo_o[echoes] = 1.0
                         for c in range(width):

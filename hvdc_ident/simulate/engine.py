@@ -48,7 +48,23 @@ class Engine:
         self._code = self.structure.compile()
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
         factors = self.structure.elimination.count if self.structure.elimination else 0
-        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width, s.n_hess, self.structure.moves_by_itself, factors], dtype=np.int64)
+        self._dims = np.array(
+            [
+                s.nx,
+                s.nz,
+                s.nu,
+                s.nd,
+                s.nq,
+                s.ns,
+                s.no,
+                s.np,
+                s.width,
+                s.n_hess,
+                self.structure.moves_by_itself,
+                factors,
+            ],
+            dtype=np.int64,
+        )
         second = self.structure.second
         self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
         self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
@@ -74,7 +90,7 @@ class Engine:
             jac = np.zeros((n + extra, n + extra))
             if rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst) == FOUND:
                 return y, w
-        return fallback(self.structure, self._address, self._dims, p, u, self._guesses[0])
+        return fallback(self.structure, self._address, p, u, self._guesses[0])
 
     @cached_property
     def _guesses(self) -> list[Array]:
@@ -101,16 +117,35 @@ class Engine:
             for k, name in enumerate(names):
                 if not values[k] > 0.0:
                     kind = "delay" if k < s.nd else "sampling period"
-                    raise ModelError(f"the {kind} of '{name}' is not above 0", where=f"model '{m.name}'", got=f"{values[k]:g} s", hint="leave the effect out, or give it a positive time")
+                    raise ModelError(
+                        f"the {kind} of '{name}' is not above 0",
+                        where=f"model '{m.name}'",
+                        got=f"{values[k]:g} s",
+                        hint="leave the effect out, or give it a positive time",
+                    )
             for k, name in enumerate(m.sampled):
                 period, compute = values[s.nd + k], values[s.nd + s.nq + k]
                 if not 0.0 <= compute <= period:
-                    raise ModelError(f"the compute time of '{name}' does not fit its period", where=f"model '{m.name}'", expected=f"between 0 and {period:g} s", got=f"{compute:g} s")
+                    raise ModelError(
+                        f"the compute time of '{name}' does not fit its period",
+                        where=f"model '{m.name}'",
+                        expected=f"between 0 and {period:g} s",
+                        got=f"{compute:g} s",
+                    )
         return values
 
     # --- the run ---
 
-    def run(self, p: Array, inputs: Sequence[Any], time: Array, tolerance: Tolerance, method: Method = "auto", scale: Array | None = None, first: float | None = None) -> tuple[Array, Statistics]:
+    def run(
+        self,
+        p: Array,
+        inputs: Sequence[Any],
+        time: Array,
+        tolerance: Tolerance,
+        method: Method = "auto",
+        scale: Array | None = None,
+        first: float | None = None,
+    ) -> tuple[Array, Statistics]:
         """Outputs at the times, (n, outputs (1 + width)): values, then rows; and what it cost.
 
         inputs: one InputSignal an input. first: where the run starts, s (default: the first time).
@@ -120,7 +155,12 @@ class Engine:
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
         # "At the first row" is what stood before anything happened: the value from the left.
-        u = np.array([i.values[0] if i.times.size == 1 or i.times[0] >= begin else float(i(np.nextafter(begin, -np.inf))) for i in inputs])
+        u = np.array(
+            [
+                i.values[0] if i.times.size == 1 or i.times[0] >= begin else float(i(np.nextafter(begin, -np.inf)))
+                for i in inputs
+            ]
+        )
         y, w = self.start(p, u)
         constants = self.constants(p)
         pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
@@ -134,14 +174,16 @@ class Engine:
         while True:
             counts, modes = np.zeros(6, dtype=np.int64), np.zeros(max(s.ns, 1))
             status, reached = integrate(
-                self._address, self._dims, self._hess_row, self._hess_column, kind, p, y.copy(), w.copy(), np.zeros_like(w), constants, begin, end, breaks,
-                pointer, times, values, time, out, sizes, tol.rtol, tol.atol, tol.max_steps, counts, modes,
+                self._address, self._dims, self._hess_row, self._hess_column, kind, p, y.copy(), w.copy(), np.zeros_like(w), constants,
+                begin, end, breaks, pointer, times, values, time, out, sizes, tol.rtol, tol.atol, tol.max_steps, counts, modes,
             )  # fmt: skip
             if STATUS[status] == "stiff" and method == "auto":
                 self._explicit, kind = False, ROSENBROCK
                 continue
             break
-        statistics = Statistics(STATUS[status], "explicit" if kind == EXPLICIT else "rosenbrock", *(int(c) for c in counts))
+        statistics = Statistics(
+            STATUS[status], "explicit" if kind == EXPLICIT else "rosenbrock", *(int(c) for c in counts)
+        )
         if status:
             raise SimulationError(
                 f"the simulation of model '{self.structure.model.name}' stopped: {STATUS[status]}",
@@ -156,7 +198,11 @@ class Engine:
         s = self.structure.sizes
         if method != "auto":
             if method == "explicit" and s.nz:
-                raise ModelError("the explicit method cannot solve algebraic unknowns", where=f"model '{self.structure.model.name}'", hint="use method='rosenbrock' or 'auto'")
+                raise ModelError(
+                    "the explicit method cannot solve algebraic unknowns",
+                    where=f"model '{self.structure.model.name}'",
+                    hint="use method='rosenbrock' or 'auto'",
+                )
             return method == "explicit"
         if self._explicit is None:
             if s.nz:
@@ -198,7 +244,11 @@ def announce_compilation() -> None:
     cache = integrate._cache
     folder = Path(cache.cache_path)
     if not list(folder.glob("driver.integrate-*.nbi")):
-        print("hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...", file=sys.stderr, flush=True)
+        print(
+            "hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 @lru_cache(maxsize=32)
@@ -216,7 +266,11 @@ class _Key:
     model: Model
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and (self.structure, self.sensitivities, self.outputs) == (other.structure, other.sensitivities, other.outputs)
+        return isinstance(other, _Key) and (self.structure, self.sensitivities, self.outputs) == (
+            other.structure,
+            other.sensitivities,
+            other.outputs,
+        )
 
     def __hash__(self) -> int:
         return hash((self.structure, self.sensitivities, self.outputs))
@@ -224,7 +278,9 @@ class _Key:
 
 def engine(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
     """The engine of a model's structure, compiled at the first call and kept for later ones (the last 32)."""
-    return _engine(_Key(model.structure, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs), model))
+    return _engine(
+        _Key(model.structure, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs), model)
+    )
 
 
 @lru_cache(maxsize=256)
@@ -263,7 +319,11 @@ def simulate(
     p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
     if not np.isfinite(p).all():
         bad = [n for n, v in zip(plant.parameters, p, strict=True) if not np.isfinite(v)]
-        raise ModelError(f"the value of parameter '{bad[0]}' is not finite", where=f"model '{model.name}'", hint="an effect at an infinite neutral value is left out: do not set it")
+        raise ModelError(
+            f"the value of parameter '{bad[0]}' is not finite",
+            where=f"model '{model.name}'",
+            hint="an effect at an infinite neutral value is left out: do not set it",
+        )
     signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
     tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
     scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities] or [1.0])
@@ -278,5 +338,15 @@ def _simulation(model: Model, code: Engine, experiment: Experiment, out: Array, 
     s = code.structure.sizes
     names = code.structure.outputs
     units = tuple(model.outputs[n].unit if n in model.outputs else "" for n in names)
-    gradient = out[:, s.no :].reshape(experiment.time.size, s.no, s.width)[:, :, : s.np] if s.width else np.zeros((experiment.time.size, s.no, 0))
-    return Simulation(Trajectory(experiment.time, out[:, : s.no], names, units), code.structure.sensitivities, gradient, statistics, FrozenMap())
+    gradient = (
+        out[:, s.no :].reshape(experiment.time.size, s.no, s.width)[:, :, : s.np]
+        if s.width
+        else np.zeros((experiment.time.size, s.no, 0))
+    )
+    return Simulation(
+        Trajectory(experiment.time, out[:, : s.no], names, units),
+        code.structure.sensitivities,
+        gradient,
+        statistics,
+        FrozenMap(),
+    )

@@ -120,7 +120,13 @@ class Graph:
         if va == 0.0:
             return self.zero
         if vb is not None and vb != 0.0:
-            return self.constant(va / vb) if va is not None else self.mul(a, self.constant(1.0 / vb)) if math.frexp(vb)[0] in (0.5, -0.5) else self._node("div", a, b)
+            return (
+                self.constant(va / vb)
+                if va is not None
+                else self.mul(a, self.constant(1.0 / vb))
+                if math.frexp(vb)[0] in (0.5, -0.5)
+                else self._node("div", a, b)
+            )
         return self._node("div", a, b)
 
     def power(self, a: int, b: int) -> int:
@@ -231,19 +237,27 @@ class Graph:
             return self.select(self.negative(x), self.neg(x), x)
         if kind is sp.sign:
             x = sub(e.args[0])
-            return self.select(self.negative(x), self.constant(-1.0), self.select(self.negative(self.neg(x)), self.one, self.zero))
+            return self.select(
+                self.negative(x), self.constant(-1.0), self.select(self.negative(self.neg(x)), self.one, self.zero)
+            )
         if kind in (sp.Min, sp.Max):
             return self._extremum(kind is sp.Min, [sub(a) for a in e.args])
         if kind.__name__ == "clip":
             x, low, high = map(sub, e.args)
-            return self.select(self.negative(self.sub(x, low)), low, self.select(self.negative(self.sub(high, x)), high, x))
+            return self.select(
+                self.negative(self.sub(x, low)), low, self.select(self.negative(self.sub(high, x)), high, x)
+            )
         if kind is sp.Piecewise:
             pieces = [(sub(value), self._condition(c, sub)) for value, c in e.args]
             result = pieces[-1][0]
             for value, condition in reversed(pieces[:-1]):
                 result = self.select(condition, value, result)
             return result
-        raise ModelError(f"the function '{kind.__name__}' has no machine code", expected="a function of the expression grammar", hint="write it with the functions that `hvdc-ident` model cards know")
+        raise ModelError(
+            f"the function '{kind.__name__}' has no machine code",
+            expected="a function of the expression grammar",
+            hint="write it with the functions that `hvdc-ident` model cards know",
+        )
 
     def _sum(self, terms: Iterable[sp.Basic], sub: object) -> int:
         total = self.zero
@@ -333,7 +347,9 @@ class Graph:
         if op == "select":
             condition, yes, no = a
             both = {**g[yes], **g[no]}
-            return self._clean({v: self.select(condition, g[yes].get(v, self.zero), g[no].get(v, self.zero)) for v in both})
+            return self._clean(
+                {v: self.select(condition, g[yes].get(v, self.zero), g[no].get(v, self.zero)) for v in both}
+            )
         total: dict[int, int] = {}
         for argument, slope in self._slopes(n, op, a):
             for v, d in g[argument].items():
@@ -354,7 +370,9 @@ class Graph:
             return [(a[0], inverse), (a[1], self.neg(self.mul(n, inverse)))]
         if op == "pow":
             slope = self.mul(a[1], self.power(x, self.sub(a[1], self.one)))
-            return [(x, slope)] if self.value(a[1]) is not None else [(x, slope), (a[1], self.mul(n, self.call("log", x)))]
+            return (
+                [(x, slope)] if self.value(a[1]) is not None else [(x, slope), (a[1], self.mul(n, self.call("log", x)))]
+            )
         if op in ("sqrt", "sqrt0"):
             # sqrt(max(0, x)) is flat where its argument is cut at 0: the slope there must be 0, not 0 times infinity.
             return [(x, self.mul(self.constant(0.5), self.call("inverse", n)))]
@@ -407,6 +425,7 @@ def _evaluate(graph: Graph, n: int, values: dict[int, float], leaves: Mapping[in
         return _FOLD[op](x[0])
     return {
         "add": lambda: x[0] + x[1], "sub": lambda: x[0] - x[1], "mul": lambda: x[0] * x[1], "div": lambda: x[0] / x[1],
-        "neg": lambda: -x[0], "inverse": lambda: 1.0 / x[0] if x[0] else 0.0, "sqrt0": lambda: math.sqrt(max(x[0], 0.0)), "pow": lambda: x[0] ** x[1], "atan2": lambda: math.atan2(x[0], x[1]),
+        "neg": lambda: -x[0], "inverse": lambda: 1.0 / x[0] if x[0] else 0.0, "sqrt0": lambda: math.sqrt(max(x[0], 0.0)),
+        "pow": lambda: x[0] ** x[1], "atan2": lambda: math.atan2(x[0], x[1]),
         "and": lambda: x[0] and x[1], "or": lambda: x[0] or x[1], "not": lambda: not x[0],
     }[op]()  # fmt: skip

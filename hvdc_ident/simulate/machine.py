@@ -47,7 +47,13 @@ class Function:
 class Code:
     """Compiled functions of one module: `address[name]`. The code lives as long as this object."""
 
-    def __init__(self, graph: Graph, functions: Sequence[Function], width: int, written: Mapping[str, Callable[[str], str]] | None = None) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        functions: Sequence[Function],
+        width: int,
+        written: Mapping[str, Callable[[str], str]] | None = None,
+    ) -> None:
         """written: further hot functions as text, by name; each is called with the symbol it has to define."""
         serial = next(_serial)
         written = written or {}
@@ -56,7 +62,13 @@ class Code:
         self.address: dict[str, int] = {}
         for hot in (True, False):
             chosen = [f for f in functions if f.hot == hot]
-            text = "\n".join([*_declarations(), *(_Emitter(graph, f, names[f.name], width).text() for f in chosen), *(t(names[n]) for n, t in written.items() if hot)])
+            text = "\n".join(
+                [
+                    *_declarations(),
+                    *(_Emitter(graph, f, names[f.name], width).text() for f in chosen),
+                    *(t(names[n]) for n, t in written.items() if hot),
+                ]
+            )
             engine = _compiled(text, hot)
             self._engines.append(engine)
             kept = [f.name for f in chosen] + (list(written) if hot else [])
@@ -80,7 +92,9 @@ def _compiled(text: str, hot: bool) -> llvm.ExecutionEngine:
     module = llvm.parse_assembly(text, llvm.create_context())
     module.verify()
     target = llvm.Target.from_default_triple()
-    machine = target.create_target_machine(opt=2 if hot else 0, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten())
+    machine = target.create_target_machine(
+        opt=2 if hot else 0, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten()
+    )
     module.triple = llvm.get_default_triple()
     # The graph is free of common parts and its rows are vectors already: little is left for the optimiser. The ready-made
     # pipelines would also keep 60 KiB of every module for ever.

@@ -48,7 +48,7 @@ class Simulation:
 
     @property
     def status(self) -> str:
-        """"converged"; any other outcome is an exception."""
+        """ "converged"; any other outcome is an exception."""
         return self.statistics.status
 
     def __getitem__(self, output: str) -> Array:
@@ -83,8 +83,15 @@ class Simulation:
 
     def to_dict(self) -> dict[str, Any]:
         """The outputs, derivatives and statistics as plain lists and numbers."""
-        derivatives = {o: {p: self.gradient(o)[:, k].tolist() for k, p in enumerate(self.parameters)} for o in self.trajectory.names}
-        return {**self.trajectory.to_dict(), "sensitivities": derivatives if self.parameters else {}, "statistics": self.statistics.__dict__}
+        derivatives = {
+            o: {p: self.gradient(o)[:, k].tolist() for k, p in enumerate(self.parameters)}
+            for o in self.trajectory.names
+        }
+        return {
+            **self.trajectory.to_dict(),
+            "sensitivities": derivatives if self.parameters else {},
+            "statistics": self.statistics.__dict__,
+        }
 
 
 def rmse(a: Array, b: Array) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.simulate.structure import Structure
@@ -14,7 +15,7 @@ Equations = Callable[[Array], tuple[Array, Array]]
 ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
 
 
-def fallback(structure: Structure, address: Array, dims: Array, p: Array, u: Array, guess: Array) -> tuple[Array, Array]:
+def fallback(structure: Structure, address: NDArray[np.int64], p: Array, u: Array, guess: Array) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
     from hvdc_ident.simulate.engine import evaluate
     from hvdc_ident.simulate.steps import MODES, REST, REST_JAC, REST_P
@@ -74,7 +75,8 @@ def _pseudo_transient(equations: Equations, v: Array, nx: int) -> Array:
             h *= 0.3
             continue
         r_new, jac_new = equations(v + step)
-        before, after = np.linalg.norm(r / _weights(jac, v)), np.linalg.norm(r_new / _weights(jac_new, v + step))
+        before = float(np.linalg.norm(r / _weights(jac, v)))
+        after = float(np.linalg.norm(r_new / _weights(jac_new, v + step)))
         if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
             v, r, jac = v + step, r_new, jac_new
             h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
@@ -95,7 +97,7 @@ def _least_squares(equations: Equations, v: Array) -> Array:
             return v
         weight = _weights(jac, v)
         step = np.linalg.lstsq(jac / weight[:, None], -r / weight, rcond=1e-12)[0]
-        before, damping = np.linalg.norm(r / weight), 1.0
+        before, damping = float(np.linalg.norm(r / weight)), 1.0
         while damping > 1e-4:
             r_new = equations(v + damping * step)[0]
             if np.linalg.norm(r_new / weight) < before or before < 1e-14:

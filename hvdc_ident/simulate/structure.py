@@ -23,12 +23,36 @@ from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function, Row, function_text
 
 # The order in which the integrators take the addresses.
-NAMES = ("f", "fs", "jac", "hess", "ft", "sw", "sws", "swd", "modes", "out", "outs", "src", "srcs", "srcd", "rest", "rest_jac", "rest_p", "const", "lu", "solve", "solves")
+NAMES = (
+    "f",
+    "fs",
+    "jac",
+    "hess",
+    "ft",
+    "sw",
+    "sws",
+    "swd",
+    "modes",
+    "out",
+    "outs",
+    "src",
+    "srcs",
+    "srcd",
+    "rest",
+    "rest_jac",
+    "rest_p",
+    "const",
+    "lu",
+    "solve",
+    "solves",
+)
 
 
 def torn(model: Model) -> tuple[str, ...]:
     """The algebraic unknowns that are needed to break every circle; the others are plain signals."""
-    uses = {n: _names(s.value) for n, s in model.signals.items()} | {n: _names(a.equation) for n, a in model.algebraic.items()}
+    uses = {n: _names(s.value) for n, s in model.signals.items()} | {
+        n: _names(a.equation) for n, a in model.algebraic.items()
+    }
     keep = set(model.algebraic)
     for name in model.algebraic:
         if not _leads_back(name, uses, keep - {name}):
@@ -108,9 +132,16 @@ class Structure:
         self.residuals = [g.sub(node(m.algebraic[n].equation), nodes[n]) for n in self.unknowns]
         self.observed = [self._observed(n, node) for n in self.outputs]
         self.sources = [node(d.of) for d in m.delays.values()] + [node(s.value) for s in m.sampled.values()]
-        timing = [d.time for d in m.delays.values()] + [s.period for s in m.sampled.values()] + [s.compute for s in m.sampled.values()]
+        timing = (
+            [d.time for d in m.delays.values()]
+            + [s.period for s in m.sampled.values()]
+            + [s.compute for s in m.sampled.values()]
+        )
         self.timing = [node(e) for e in timing]
-        self.starts = [None if s.start is None else node(symbol(f"{n}_start") if s.start == "free" else s.start) for n, s in m.states.items()]
+        self.starts = [
+            None if s.start is None else node(symbol(f"{n}_start") if s.start == "free" else s.start)
+            for n, s in m.states.items()
+        ]
         self.rests = [None if s.rest is None else node(s.rest) for s in m.states.values()]
         self.rhs = [*self.derivatives, *self.residuals]
 
@@ -119,13 +150,26 @@ class Structure:
             return node(self.model.outputs[name].value)  # type: ignore[operator]
         if name in self.nodes:
             return self.nodes[name]
-        raise unknown_name("output or signal", name, [*self.model.outputs, *self.nodes], where=f"model '{self.model.name}'")
+        raise unknown_name(
+            "output or signal", name, [*self.model.outputs, *self.nodes], where=f"model '{self.model.name}'"
+        )
 
     @cached_property
     def sizes(self) -> Sizes:
         m, n = self.model, len(self.sensitivities)
         width = 0 if n == 0 else 2 if n <= 2 else -(-n // 4) * 4
-        return Sizes(len(self.states), len(self.unknowns), len(m.inputs), len(m.delays), len(m.sampled), len(self.graph.switches), len(self.outputs), n, width, len(self.second))
+        return Sizes(
+            len(self.states),
+            len(self.unknowns),
+            len(m.inputs),
+            len(m.delays),
+            len(m.sampled),
+            len(self.graph.switches),
+            len(self.outputs),
+            n,
+            width,
+            len(self.second),
+        )
 
     # --- derivatives ---
 
@@ -150,7 +194,11 @@ class Structure:
         products = [(d, "y", size + j * width) for j, d in sorted(self.partial(node, "y").items())]
         first, total = 1 + len(m.inputs), 1 + len(m.inputs) + len(m.delays) + len(m.sampled)
         for group in ("w", "wd"):
-            products += [(d, group, total + (j - first) * width) for j, d in sorted(self.partial(node, group).items()) if j >= first]
+            products += [
+                (d, group, total + (j - first) * width)
+                for j, d in sorted(self.partial(node, group).items())
+                if j >= first
+            ]
         return Row(scalars, products)
 
     def rate(self, node: int, states_too: bool) -> int:
@@ -202,9 +250,16 @@ class Structure:
             *self._rest(),
         ]
         if width:
-            result += [both("fs", self.rhs, hot=True), both("sws", list(g.switches)), both("outs", self.observed, hot=True), both("srcs", self.sources)]
-            result.append(Function("hess", (), [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)], hot=True))
-        if [v for v in g.switches] and len(g.switches) != s.ns:
+            result += [
+                both("fs", self.rhs, hot=True),
+                both("sws", list(g.switches)),
+                both("outs", self.observed, hot=True),
+                both("srcs", self.sources),
+            ]
+            result.append(
+                Function("hess", (), [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)], hot=True)
+            )
+        if len(g.switches) != s.ns:
             raise AssertionError("a derivative made a new condition")
         return result
 
@@ -214,7 +269,10 @@ class Structure:
         first = 1 + s.nu
         tail = [g.sub(v, g.leaf("w", first + k)) for k, v in enumerate(self.sources)]
         fixed = [rest if start is None else start for start, rest in zip(self.starts, self.rests, strict=True)]
-        head = [d if value is None else g.sub(g.leaf("y", k), value) for k, (d, value) in enumerate(zip(self.derivatives, fixed, strict=True))]
+        head = [
+            d if value is None else g.sub(g.leaf("y", k), value)
+            for k, (d, value) in enumerate(zip(self.derivatives, fixed, strict=True))
+        ]
         residual = [*head, *self.residuals, *tail]
         n, inner = len(residual), s.nx + s.nz
         entries = []
@@ -222,14 +280,21 @@ class Structure:
             entries += [(i * n + j, d) for j, d in self.partial(v, "y").items()]
             entries += [(i * n + inner + j - first, d) for j, d in self.partial(v, "w").items() if j >= first]
         position = {list(self.model.parameters).index(name): k for k, name in enumerate(self.sensitivities)}
-        by_p = [(i * s.width + position[k], d) for i, v in enumerate(residual) for k, d in self.partial(v, "p").items() if k in position]
+        by_p = [
+            (i * s.width + position[k], d)
+            for i, v in enumerate(residual)
+            for k, d in self.partial(v, "p").items()
+            if k in position
+        ]
         return [Function("rest", list(enumerate(residual))), Function("rest_jac", entries), Function("rest_p", by_p)]
 
     @cached_property
     def elimination(self) -> Elimination | None:
         """Straight-line code for the linear systems of the Rosenbrock method, where the pattern allows it."""
         n = len(self.rhs)
-        constant = {(i, j): self.graph.value(d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()}
+        constant = {
+            (i, j): self.graph.value(d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()
+        }
         return eliminate(constant, n, len(self.states)) if n else None
 
     def compile(self) -> Code:
@@ -262,7 +327,11 @@ def _ordered(definitions: dict[str, sp.Expr], model: str) -> list[str]:
                 order.append(name)
                 stack.pop()
             elif following in done:
-                raise ModelError(f"the signals run in a circle through '{following}'", where=f"model '{model}'", hint="declare one of them under `algebraic`")
+                raise ModelError(
+                    f"the signals run in a circle through '{following}'",
+                    where=f"model '{model}'",
+                    hint="declare one of them under `algebraic`",
+                )
             else:
                 done[following] = False
                 stack.append((following, iter(uses[following])))

@@ -41,7 +41,12 @@ def main() -> dict:
     lagged = fit(Problem(ModelSimulator(lagged_model), study.experiments, more), starts=4, seed=0)
     start = {n: f.start for n, f in study.candidates.items()}
     return {
-        "gains": {"true": TRUE, "start": start, "fitted": {n: plain.values[n] for n in TRUE}, "fitted with a lag": {n: lagged.values[n] for n in (*TRUE, "lag_Ir1_T")}},
+        "gains": {
+            "true": TRUE,
+            "start": start,
+            "fitted": {n: plain.values[n] for n in TRUE},
+            "fitted with a lag": {n: lagged.values[n] for n in (*TRUE, "lag_Ir1_T")},
+        },
         "rmse": {
             "start": errors(study, start),
             "true gains": errors(study, TRUE),

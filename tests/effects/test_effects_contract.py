@@ -16,7 +16,9 @@ from hvdc_ident.simulate import simulate
 LINK = load_model("vsc-hvdc-link")
 # No row and no step falls on a multiple of a sampling period: there a derivative has two sides.
 TIME = np.concatenate([[0.0], np.linspace(0.00037, 0.35, 331)])
-CASE = experiment("case", TIME, {"Pref2": InputSignal.step(0.10053, 0.4, 0.5), "Qref1": InputSignal.ramp(0.15, 0.0, 0.25, 0.1)})
+CASE = experiment(
+    "case", TIME, {"Pref2": InputSignal.step(0.10053, 0.4, 0.5), "Qref1": InputSignal.ramp(0.15, 0.0, 0.25, 0.1)}
+)
 # One slot of each kind, all within the P loop.
 SLOTS = ("Pref2", "P2_m", "Ir2", "xp", "outputs.P2")
 NAMES = tuple(effects())
@@ -49,7 +51,10 @@ def test_it_runs_with_exact_sensitivities_at_every_kind_of_slot(name, at):
         h = 1e-6 * (value or 1e-3)
         if value - h < 0:
             continue
-        low, high = (simulate(model, CASE, {parameter: v}, rtol=1e-12, outputs=("P2", "Irorder2")).trajectory.values for v in (value - h, value + h))
+        low, high = (
+            simulate(model, CASE, {parameter: v}, rtol=1e-12, outputs=("P2", "Irorder2")).trajectory.values
+            for v in (value - h, value + h)
+        )
         slope = (high - low) / (2 * h)
         found = run.gradients[:, :, k]
         size = max(np.abs(slope).max(), 1e-3 / model.parameters[parameter].size)
@@ -73,7 +78,7 @@ def test_it_changes_what_it_sits_on_and_survives_a_card(name):
 def test_it_describes_itself(name):
     effect = effects()[name]
     assert effect.name == name and effect.summary and effect.excited_by
-    text = effect.sentence.format(at="P2_m", **{n: "1" for n in effect.parameters})
+    text = effect.sentence.format(at="P2_m", **dict.fromkeys(effect.parameters, "1"))
     assert "P2_m" in text
     for q in effect.parameters.values():
         assert q.min <= q.value <= q.max and not math.isnan(q.value)

@@ -37,7 +37,9 @@ def test_the_design_rule_gives_table_1():
     assert "KIVDC" not in physical.parameters and {"J", "Ts"} <= set(physical.parameters)
     run = experiment("step", np.linspace(0.0, 0.5, 51), {"Vdcref1": InputSignal.step(0.1, 1.0, 1.019)})
     exact = {"KIVDC": (3 / (0.7 * 0.1)) ** 2 * 0.4}
-    np.testing.assert_allclose(simulate(physical, run).trajectory.values, simulate(link, run, exact).trajectory.values, atol=1e-7)
+    np.testing.assert_allclose(
+        simulate(physical, run).trajectory.values, simulate(link, run, exact).trajectory.values, atol=1e-7
+    )
     gains = simulate(physical, run, outputs=("KPVDC", "KIVDC", "KIP", "KIQ")).trajectory.values[0]
     np.testing.assert_allclose(gains, [24.0, 734.69, 30.0, 30.0], rtol=1e-5)
 

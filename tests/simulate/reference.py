@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import sympy as sp
 from scipy.integrate import solve_ivp
@@ -32,7 +34,10 @@ class Reference:
             for _ in range(60):
                 new = e.xreplace(definitions)
                 if new == e:
-                    return e.replace(lambda q: q.is_Pow and q.exp == sp.Rational(1, 2) and not q.base.is_number, lambda q: root_of(q.base))
+                    return e.replace(
+                        lambda q: q.is_Pow and q.exp == sp.Rational(1, 2) and not q.base.is_number,
+                        lambda q: root_of(q.base),
+                    )
                 e = new
             raise AssertionError("signals do not end")
 
@@ -76,8 +81,16 @@ class Reference:
             return [inputs[n](t, side) if n in inputs else i.value for n, i in m.inputs.items()]
 
         u = level(t0, -1)
-        guess = np.array([1.0 if s.guess is None else s.guess for s in m.states.values()] + [0.0] * nz) if start is None else np.asarray(start)
-        found = root(lambda y: self.F(y[:nx], y[nx:], p, u, t0).ravel() * np.where(np.arange(nx + nz) < nx, 1e-3, 1.0), guess, tol=1e-14)
+        guess = (
+            np.array([1.0 if s.guess is None else s.guess for s in m.states.values()] + [0.0] * nz)
+            if start is None
+            else np.asarray(start)
+        )
+        found = root(
+            lambda y: self.F(y[:nx], y[nx:], p, u, t0).ravel() * np.where(np.arange(nx + nz) < nx, 1e-3, 1.0),
+            guess,
+            tol=1e-14,
+        )
         y = found.x
         for _ in range(3):
             y = y - np.linalg.solve(self.FY(y[:nx], y[nx:], p, u, t0), self.F(y[:nx], y[nx:], p, u, t0).ravel())
@@ -86,7 +99,7 @@ class Reference:
         out, grad = np.zeros((len(time), len(m.outputs))), np.zeros((len(time), len(m.outputs), k))
         memory = {"z": z}
         stops = [t0, *[b for b in breaks if t0 < b < time[-1]], time[-1]]
-        for a, b in zip(stops[:-1], stops[1:], strict=True):
+        for a, b in pairwise(stops):
 
             def rhs(t, v, a=a, b=b):
                 x, S = v[:nx], v[nx:].reshape(nx, k)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tests.simulate.reference import Reference, sided
 
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
+from tests.simulate.reference import Reference, sided
 
 RTOL = 1e-8
 LINK = load_model("vsc-hvdc-link")
@@ -28,7 +28,13 @@ SATURATING = {
 CASES = {
     "index-1 DAE": (LINK, VDC_P_Q, {"KPP": 0.2, "KPQ": 0.3}, ("KPVDC", "KPP", "KPQ"), 0),
     "limits reached and released": (LINK, SATURATING, {"KPQ": 0.3}, ("KIQ", "KPQ"), 2),
-    "very stiff": (LINK, {"Vdcref1": InputSignal.step(0.02, 1.0, 1.019)}, {"C1": 1e-6, "C2": 0.4}, ("KPVDC", "KIVDC"), 0),
+    "very stiff": (
+        LINK,
+        {"Vdcref1": InputSignal.step(0.02, 1.0, 1.019)},
+        {"C1": 1e-6, "C2": 0.4},
+        ("KPVDC", "KIVDC"),
+        0,
+    ),
     "lag and limit": (LAGGED, {"Pref2": SATURATING["Pref2"]}, {}, ("KIP", "lag_Ir1_T", "limit_Ir2_level"), 2),
 }
 
@@ -40,7 +46,9 @@ def test_against_reference(case):
     mine = simulate(model, run, values, names, rtol=RTOL)
     breaks = sorted({b for s in inputs.values() for b in s.breaks})
     with np.errstate(all="ignore"):
-        theirs, gradients = Reference(model, names).run({n: sided(s) for n, s in inputs.items()}, run.time, breaks, values, rtol=1e-10)
+        theirs, gradients = Reference(model, names).run(
+            {n: sided(s) for n, s in inputs.items()}, run.time, breaks, values, rtol=1e-10
+        )
     assert mine.statistics.events >= switches
     for k, output in enumerate(model.outputs):
         # The dc current is the difference of two voltages times 4096: so is its error.
@@ -49,7 +57,10 @@ def test_against_reference(case):
         assert np.abs(mine[output] - theirs[:, k]).max() < 100 * RTOL * scale * gain, output
         for j, name in enumerate(names):
             size = max(np.abs(gradients[:, k, j]).max(), 0.1 / model.parameters[name].size)
-            assert np.abs(mine.gradient(output)[:, j] - gradients[:, k, j]).max() < 100 * RTOL * size * gain, (output, name)
+            assert np.abs(mine.gradient(output)[:, j] - gradients[:, k, j]).max() < 100 * RTOL * size * gain, (
+                output,
+                name,
+            )
 
 
 def test_the_published_start_and_peak_of_the_link():

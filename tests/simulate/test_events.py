@@ -17,13 +17,20 @@ METHODS = ("explicit", "rosenbrock")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_jump_of_the_right_hand_side_jumps_the_sensitivities(method):
     """x' = a below lim, b above: x = lim + b (t - lim/a), dx/dlim = 1 - b/a, dx/da = b lim / a^2."""
-    model = Model("jump", parameters={"a": 1.2, "b": 0.4, "lim": 0.7}, states={"x": State("where(x < lim, a, b)", start=0)}, outputs={"x": "x"})
+    model = Model(
+        "jump",
+        parameters={"a": 1.2, "b": 0.4, "lim": 0.7},
+        states={"x": State("where(x < lim, a, b)", start=0)},
+        outputs={"x": "x"},
+    )
     run = experiment("jump", np.linspace(0, 2, 41))
     result = simulate(model, run, sensitivities=("a", "b", "lim"), method=method, **TIGHT)
     t = run.time
     after = t > 0.7 / 1.2
     np.testing.assert_allclose(result["x"], np.where(after, 0.7 + 0.4 * (t - 0.7 / 1.2), 1.2 * t), atol=1e-9)
-    slopes = np.column_stack([np.where(after, 0.4 * 0.7 / 1.2**2, t), np.where(after, t - 0.7 / 1.2, 0), np.where(after, 1 - 0.4 / 1.2, 0)])
+    slopes = np.column_stack(
+        [np.where(after, 0.4 * 0.7 / 1.2**2, t), np.where(after, t - 0.7 / 1.2, 0), np.where(after, 1 - 0.4 / 1.2, 0)]
+    )
     np.testing.assert_allclose(result.gradient("x"), slopes, atol=1e-8)
     assert result.statistics.events == 1
 
@@ -31,7 +38,9 @@ def test_a_jump_of_the_right_hand_side_jumps_the_sensitivities(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_kink_is_located(method):
     """x' = clip(t, 0, 1/2)."""
-    model = Model("kink", parameters={"top": 0.5}, states={"x": State("clip(time, 0, top)", start=0)}, outputs={"x": "x"})
+    model = Model(
+        "kink", parameters={"top": 0.5}, states={"x": State("clip(time, 0, top)", start=0)}, outputs={"x": "x"}
+    )
     run = experiment("kink", np.linspace(0, 1, 21))
     result = simulate(model, run, sensitivities=("top",), method=method, **TIGHT)
     t = run.time
@@ -42,7 +51,14 @@ def test_a_kink_is_located(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_delay_follows_the_method_of_steps(method):
     """x' = u - x(t - T), a step of u from 0 to 1 at 0: 1 - t ... in pieces of length T."""
-    model = Model("dde", parameters={"T": 0.5}, inputs={"u": 0.0}, states={"x": "u - xd"}, delays={"xd": Delay(x, T)}, outputs={"x": "x"})
+    model = Model(
+        "dde",
+        parameters={"T": 0.5},
+        inputs={"u": 0.0},
+        states={"x": "u - xd"},
+        delays={"xd": Delay(x, T)},
+        outputs={"x": "x"},
+    )
     run = experiment("dde", np.linspace(0, 1.5, 31)[1:], {"u": InputSignal.step(0.0, 0.0, 1.0)})
     start = experiment("dde", np.concatenate([[-0.1], run.time]), run.inputs)
     result = simulate(model, start, sensitivities=("T",), method=method, **TIGHT)
@@ -58,7 +74,14 @@ def test_a_delay_follows_the_method_of_steps(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_delayed_step_moves_with_the_delay(method):
     """x' = u(t - T) - x after a unit step at 0.2: x = 1 - exp(-(t - 0.2 - T)), dx/dT = -exp(...)."""
-    model = Model("late", parameters={"T": 0.31}, inputs={"u": 0.0}, states={"x": "ud - x"}, delays={"ud": Delay(u, T)}, outputs={"x": "x"})
+    model = Model(
+        "late",
+        parameters={"T": 0.31},
+        inputs={"u": 0.0},
+        states={"x": "ud - x"},
+        delays={"ud": Delay(u, T)},
+        outputs={"x": "x"},
+    )
     run = experiment("late", np.linspace(0, 2, 21), {"u": InputSignal.step(0.2, 0.0, 1.0)})
     result = simulate(model, run, sensitivities=("T",), method=method, **TIGHT)
     s = run.time - 0.51
@@ -69,7 +92,14 @@ def test_a_delayed_step_moves_with_the_delay(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_sampled_ramp_is_a_staircase(method):
     """q holds u = t of the last sample, published c later: x' = q."""
-    model = Model("held", parameters={"Ts": 0.1, "c": 0.03}, inputs={"u": 0.0}, states={"x": State("q", start=0)}, sampled={"q": Sampled(u, Ts, c)}, outputs={"x": "x", "q": "q"})
+    model = Model(
+        "held",
+        parameters={"Ts": 0.1, "c": 0.03},
+        inputs={"u": 0.0},
+        states={"x": State("q", start=0)},
+        sampled={"q": Sampled(u, Ts, c)},
+        outputs={"x": "x", "q": "q"},
+    )
     run = experiment("held", np.linspace(0.005, 0.995, 100), {"u": InputSignal.ramp(0.0, 0.0, 2.0, 2.0)})
     start = experiment("held", np.concatenate([[0.0], run.time]), run.inputs)
     result = simulate(model, start, sensitivities=("Ts", "c"), method=method, **TIGHT)
@@ -87,7 +117,12 @@ def test_a_sampled_ramp_is_a_staircase(method):
 
 
 def test_both_methods_and_a_closed_form_agree_on_an_oscillator():
-    model = Model("osc", parameters={"w": 9.0, "z": 0.05}, states={"x": State("v", start=1), "v": State("-w**2*x - 2*z*w*v", start=0)}, outputs={"x": "x"})
+    model = Model(
+        "osc",
+        parameters={"w": 9.0, "z": 0.05},
+        states={"x": State("v", start=1), "v": State("-w**2*x - 2*z*w*v", start=0)},
+        outputs={"x": "x"},
+    )
     run = experiment("osc", np.linspace(0, 2, 201))
     w, z, t = sp.symbols("w z t", positive=True)
     wd = w * sp.sqrt(1 - z**2)
@@ -138,14 +173,29 @@ def test_a_current_limit_closed_by_the_other_axis_is_passed():
     """sqrt(1.1^2 - i^2) has an infinite slope where i meets its limit; the run goes on and says so."""
     from hvdc_ident.models import load_model
 
-    steps = {"Pref2": InputSignal.corners([(0.1, 0.4), (0.1, 1.3), (0.3, 1.3), (0.3, 0.4)]), "Qref1": InputSignal.step(0.15, 0.0, 0.7)}
-    result = simulate(load_model("vsc-hvdc-link"), experiment("deep", np.linspace(0, 0.6, 61), steps), {"KPP": 0.2, "KPQ": 0.3}, ("KIP",))
+    steps = {
+        "Pref2": InputSignal.corners([(0.1, 0.4), (0.1, 1.3), (0.3, 1.3), (0.3, 0.4)]),
+        "Qref1": InputSignal.step(0.15, 0.0, 0.7),
+    }
+    result = simulate(
+        load_model("vsc-hvdc-link"),
+        experiment("deep", np.linspace(0, 0.6, 61), steps),
+        {"KPP": 0.2, "KPQ": 0.3},
+        ("KIP",),
+    )
     assert result["Irorder2"].max() == pytest.approx(1.1) and result.statistics.forced < 50
     assert np.isfinite(result.gradients).all()
 
 
 def test_a_delay_of_nothing_is_refused():
-    model = Model("zero", parameters={"T": 0.0}, inputs={"u": 0.0}, states={"x": "ud - x"}, delays={"ud": Delay(u, T)}, outputs={"x": "x"})
+    model = Model(
+        "zero",
+        parameters={"T": 0.0},
+        inputs={"u": 0.0},
+        states={"x": "ud - x"},
+        delays={"ud": Delay(u, T)},
+        outputs={"x": "x"},
+    )
     with pytest.raises(ModelError, match="not above 0"):
         simulate(model, experiment("zero", [0.0, 1.0]))
 
