@@ -98,10 +98,10 @@ def model(
             unknowns[measured] = Algebraic(parse(measured[:-2]), start=starts[f"{measured}_g"], unit="pu")
         else:
             signals[measured] = measured[:-2]
-    states = {n: State(parse(e), guess=starts[n], unit=_unit(n)) for n, e in derivatives.items()}
+    states = {n: State(parse(e), guess=starts[n], unit=_unit(n), description=_part(n)) for n, e in derivatives.items()}
     for i in (1, 2):
         mean = parse(f"(vq{i} - vq{i}_before) / Tpll")
-        states[f"vqa{i}"] = State(mean, guess=0.0, rest=parse(f"vq{i}"), unit="pu", description="one-cycle mean of vq")
+        states[f"vqa{i}"] = State(mean, guess=0.0, rest=parse(f"vq{i}"), unit="pu", description=f"PLL {i}")
     return Model(
         name=name,
         description=f"Two-terminal VSC-HVDC link, average-value; pu of {rated.base:g} MVA and 640 kV",
@@ -140,6 +140,33 @@ _MEASUREMENTS = {
     "Vac1_m": "Vac",
     "Vac2_m": "Vac",
 }
+_PARTS = {
+    "Ir": "current control",
+    "Ii": "current control",
+    "xd": "current control",
+    "xqi": "current control",
+    "psi": "PLL",
+    "xpll": "PLL",
+    "fd": "voltage feed-forward",
+    "fq": "voltage feed-forward",
+    "Vf": "ac voltage filter",
+    "Vac": "ac voltage filter",
+    "Vc": "dc link",
+    "Idc": "dc link",
+    "Vdc": "dc voltage measurement",
+    "P": "active power measurement",
+    "Q": "reactive power measurement",
+    "xv": "dc voltage control",
+    "xp": "active power control",
+    "xq": "reactive power control",
+}
+
+
+def _part(state: str) -> str:
+    """The part of the plant that a state belongs to, with its station's number where it has one."""
+    prefix = max((p for p in _PARTS if state.startswith(p)), key=len)
+    station = next((c for c in state if c.isdigit()), "")
+    return _PARTS[prefix] if prefix in ("Vc", "Idc", "xv", "xp") else f"{_PARTS[prefix]} {station}"
 
 
 def _unit(name: str) -> str:

@@ -13,4 +13,4 @@ def write_demo(folder: Path, *, seed: int = 0, progress: Progress = silent) -> P
 
     Four experiments each of P, Q and Vdc, two steps and two ramps, the last of each held out.
     """
-    return write_waveforms(folder, Campaign(name="demo", count=4, holdout=1, seed=seed), progress=progress)
+    return write_waveforms(folder, Campaign(name="demo", count=4, holdout=1, sample=1e-3, seed=seed), progress=progress)
