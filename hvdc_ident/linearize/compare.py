@@ -45,7 +45,7 @@ class NuGap:
 def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     """The H-infinity norm by two-step bisection on the Hamiltonian (Bruinsma and Steinbuch 1990), to tolerance.
 
-    A model with delays is searched on its exact response. Raises LinearizationError with a pole on or right of the axis.
+    A model with delays is searched on its exact response. Raises LinearizationError for an unstable one.
     """
     if model.delay_free is not None:
         return _peak_on_grid(model)
@@ -117,7 +117,7 @@ def _peak_on_grid(model: LinearModel) -> Peak:
 
 
 def h2_norm(model: LinearModel) -> float:
-    """The H2 norm from the controllability Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0."""
+    """The H2 norm, by a Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0."""
     a, b, c, d = model.standard()
     if np.any(d):
         raise LinearizationError("the H2 norm is infinite: D is not 0", where=f"linear model '{model.name}'")
@@ -166,7 +166,7 @@ def _same_channels(first: LinearModel, second: LinearModel) -> None:
 def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     """The nu-gap metric with its winding condition (Vinnicombe 1993, doi 10.1109/9.231459); delays exact on the axis.
 
-    Scale inputs and outputs first so that 1 is of equal weight in each. Raises LinearizationError where channels differ.
+    Scale inputs and outputs first so that 1 has equal weight in each. Raises LinearizationError where channels differ.
     """
     _same_channels(first, second)
     grid = np.unique(np.concatenate([default_omega(first, 2000), default_omega(second, 2000)]))
@@ -187,7 +187,8 @@ def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     )
     value, omega = max((float(values[k]), float(grid[k])), (-float(found.fun), float(np.exp(found.x))))
     winding = winding_count(first, second)
-    return NuGap(1.0 if winding else min(value, 1.0), omega, winding, value)
+    value = min(value, 1.0)
+    return NuGap(1.0 if winding else value, omega, winding, value)
 
 
 def _chordal(p1: Array, p2: Array) -> Array:

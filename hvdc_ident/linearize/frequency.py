@@ -142,7 +142,7 @@ def sigma(model: LinearModel, omega: Array | Sequence[float] | None = None) -> t
 def sensitivity(
     model: LinearModel, omega: Array | Sequence[float], parameters: Sequence[str] | None = None
 ) -> dict[str, Array]:
-    """By parameter: (n, outputs, inputs) derivatives of the response, the operating point's shift and delays included."""
+    """By parameter: (n, outputs, inputs) derivatives of the response, with the operating point's shift and delays."""
     from hvdc_ident.linearize.modal import gradient_of
 
     w = _checked(omega)
@@ -168,7 +168,7 @@ def sensitivity(
 
 
 def bands(model: LinearModel, omega: Array | Sequence[float], covariance: Array, parameters: Sequence[str]) -> Response:
-    """The response with, as std, the first-order standard deviation of its modulus of error from a parameter covariance.
+    """The response with, as std, the first-order standard deviation of its error from a parameter covariance.
 
     covariance: (k, k) in the parameters' units, in the order of `parameters`, whose derivatives the model must have.
     """

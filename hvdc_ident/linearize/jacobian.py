@@ -175,7 +175,7 @@ class _Parts:
             total[..., total.shape[-2] - z.ne + i, :] += through * sources[..., i, :]
 
     def matrix_along(self, djac: Array, jac: Array, dtime: Array) -> Array:
-        """(directions, ...) the derivative of `matrix`; djac: of the Jacobian; dtime: (channels, directions) of times."""
+        """(directions, ...) the derivative of `matrix`; djac: of the Jacobian; dtime: (channels, directions)."""
         total = self.spread(djac)
         if self.channels:
             a, b, _, through = self.pade
@@ -290,7 +290,7 @@ def _model(
         notes["delays"] = f"Pade of order {parts.order} in A, B, C, D; exact in the frequency response"
         if "sampled" in kinds:
             notes["sampled blocks"] = (
-                "as a delay of half a period (the hold) plus the compute time: 1.5 periods in all when computing takes one"
+                "a delay of half a period (the hold) plus the compute time: 1.5 periods when computing takes one"
             )
     outputs = {n: o.unit for n, o in model.outputs.items()} | {
         n: x.unit for n, x in model.signals.items() if n not in model.outputs

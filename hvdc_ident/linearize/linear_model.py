@@ -105,7 +105,7 @@ class LinearModel:
         return not np.array_equal(self.E, np.eye(self.A.shape[0]))
 
     def standard(self) -> tuple[Array, Array, Array, Array]:
-        """A, B, C, D with E = 1; raises LinearizationError for a descriptor whose algebraic part cannot be eliminated."""
+        """A, B, C, D with E = 1. Raises LinearizationError for a descriptor whose algebraic part must stay."""
         if not self.is_descriptor:
             return self.A, self.B, self.C, self.D
         from hvdc_ident.linearize.descriptor import standard
@@ -162,8 +162,8 @@ class LinearModel:
         a, b, c, d = self.standard()
         names = self.state_names[: a.shape[0]]
         return control.StateSpace(
-            a, b, c, d, states=list(names), inputs=list(self.input_names), outputs=list(self.output_names), name=self.name,
-            remove_useless_states=False,
+            a, b, c, d, name=self.name, remove_useless_states=False,
+            states=list(names), inputs=list(self.input_names), outputs=list(self.output_names),
         )  # fmt: skip
 
     # --- analysis ---
@@ -207,7 +207,7 @@ class LinearModel:
         return transfer(self, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
 
     def bode(self, omega: Array | None = None) -> Response:
-        """The frequency response at omega in rad/s (default: around the poles and zeros), with units; it draws itself."""
+        """The frequency response at omega in rad/s (default: around the poles), with units; it draws itself."""
         from hvdc_ident.linearize.frequency import frequency_response
 
         return frequency_response(self, omega)

@@ -73,8 +73,8 @@ def root_locus(
 ) -> Locus:
     """The eigenvalues of the model along values of a parameter (or input), each at its own operating point.
 
-    Raises UnknownNameError, SteadyStateError with the value at which there is no operating point, and LinearizationError
-    on a kink.
+    Raises UnknownNameError, SteadyStateError with the value at which there is no operating point, and
+    LinearizationError on a kink.
     """
     if parameter not in model.parameters and parameter not in model.inputs:
         raise unknown_name(
@@ -131,7 +131,7 @@ class _Along:
 
 
 def match(before: Array, left: Array, after: Array, right: Array) -> Array:
-    """The order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding where they are alike."""
+    """The order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding between alike."""
     likeness = np.abs(left @ right)
     likeness = likeness / np.maximum(likeness.max(axis=1, keepdims=True), 1e-300)
     distance = np.abs(before[:, None] - after[None, :])

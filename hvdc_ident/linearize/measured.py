@@ -24,8 +24,8 @@ def from_record(
 ) -> Response:
     """The response from recorded input to recorded output by Welch's averages, with coherence and standard deviation.
 
-    time: (n,) s; uneven rows are put on an even grid by straight lines. segments: how many, half overlapped; more give a
-    surer and coarser estimate. The standard deviation is sqrt((1 - g2)/(2 k g2)) |H| (Bendat and Piersol, 9.2) with k
+    time: (n,) s; uneven rows are put on an even grid by straight lines. segments: how many, half overlapped; more give
+    a surer and coarser estimate. The standard deviation is sqrt((1 - g2)/(2 k g2)) |H| (Bendat and Piersol, 9.2) with k
     the effective number of averages. Raises WaveformError for data that are too short, constant or not finite.
     """
     import scipy.signal
@@ -57,7 +57,8 @@ def from_record(
     std = np.abs(h) * np.sqrt((1.0 - coherence) / (2.0 * averages * np.maximum(coherence, 1e-12)))
     shape = (-1, 1, 1)
     return Response(
-        2 * np.pi * f[keep], h.reshape(shape), (output,), (input,), (("", ""),), std.reshape(shape), coherence.reshape(shape), "recording"
+        2 * np.pi * f[keep], h.reshape(shape), (output,), (input,), (("", ""),),
+        std.reshape(shape), coherence.reshape(shape), "recording",
     )  # fmt: skip
 
 

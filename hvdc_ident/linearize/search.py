@@ -175,7 +175,7 @@ class Search:
         return np.concatenate(parts, axis=1)
 
     def by_parameters(self, v: Array, which: list[int]) -> Array:
-        """(unknowns, parameters) derivatives of the solution by parameters that stay fixed, by implicit differentiation.
+        """(unknowns, parameters) derivatives of the solution by fixed parameters, by implicit differentiation.
 
         Where the Jacobian is singular (a state that rests anywhere) the change of least norm.
         """

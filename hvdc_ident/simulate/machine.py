@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import itertools
 import struct
+import weakref
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -73,10 +75,13 @@ class Code:
             self._engines.append(engine)
             kept = [f.name for f in chosen] + (list(written) if hot else [])
             self.address |= {n: engine.get_function_address(names[n]) for n in kept}
+        # Freed with this object, but not at the end of the process, when LLVM may be gone before it.
+        weakref.finalize(self, _close, self._engines).atexit = False
 
-    def __del__(self) -> None:
-        for engine in getattr(self, "_engines", ()):
-            engine.close()
+
+def _close(engines: list[llvm.ExecutionEngine]) -> None:
+    for engine in engines:
+        engine.close()
 
 
 def _declarations() -> list[str]:

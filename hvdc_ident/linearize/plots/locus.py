@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def locus(found: Locus, left: float | None = None) -> Figure:
-    """The figure: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the real axis."""
+    """The figure: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
     fig = figure(6.5, 5.0)
     axes = fig.subplots()
     for k in range(found.eigenvalues.shape[1]):

@@ -1,0 +1,311 @@
+"""Frequency responses, zeros, loops and margins, against python-control and closed forms."""
+
+import control
+import numpy as np
+import pytest
+from helpers import linear, stable
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvdc_ident.errors import LinearizationError, UnknownNameError, WaveformError
+from hvdc_ident.linearize import find_operating_point, linearize
+from hvdc_ident.linearize.frequency import (
+    admittance,
+    bands,
+    frequency_response,
+    impedance,
+    sensitivity,
+    sigma,
+    values_at,
+)
+from hvdc_ident.linearize.loop import loop
+from hvdc_ident.linearize.margins import margins
+from hvdc_ident.linearize.measured import by_simulation, from_record
+from hvdc_ident.linearize.pade import pade, response
+from hvdc_ident.linearize.symbolic import symbolic_transfer
+from hvdc_ident.linearize.zeros import zeros
+from hvdc_ident.models import load_model
+
+DELAY = [{"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}}]
+W = np.logspace(-1, 3, 15)
+
+
+@pytest.fixture(scope="module")
+def link():
+    return load_model("vsc-hvdc-link")
+
+
+@pytest.fixture(scope="module")
+def model(link):
+    return linearize(link)
+
+
+def test_response_equals_python_control(model):
+    want = model.to_control()(1j * W)
+    np.testing.assert_allclose(np.moveaxis(model.bode(W).values, 0, -1), want, rtol=1e-9, atol=1e-12)
+    assert model.to_control().state_labels == list(model.state_names)
+    assert model.to_control().input_labels == list(model.input_names)
+
+
+def test_singular_values(model):
+    w, s = sigma(model, W)
+    np.testing.assert_allclose(s[3], np.linalg.svd(model.response([w[3]])[0], compute_uv=False))
+
+
+def test_bad_frequencies_are_refused(model):
+    for bad in ([-1.0], [np.nan], []):
+        with pytest.raises(LinearizationError):
+            model.bode(bad)
+    with pytest.raises(LinearizationError, match="on a pole"):
+        linear([[0.0]], [[1.0]], [[1.0]]).bode([0.0])
+
+
+# --- transfer functions and zeros ---
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("through", [False, True])
+def test_zeros_make_the_system_matrix_singular(seed, through):
+    m = stable(seed, n=6, m=2, o=2, through=through)
+    found = zeros(*m.standard())
+    assert found.size == (6 if through else 4)
+    for z in found:
+        pencil = np.block([[m.A - z * np.eye(6), m.B], [m.C, m.D]])
+        values = np.linalg.svd(pencil, compute_uv=False)
+        assert values[-1] < 1e-12 * values[0]
+
+
+def test_every_transfer_function_of_the_link_is_its_response(model):
+    s = 1j * np.array([0.3, 7.0, 150.0])
+    for i in model.input_names:
+        for o in model.output_names:
+            f = model.transfer_function(i, o)
+            want = model.channel(i, o).response(s.imag)[:, 0, 0]
+            np.testing.assert_allclose(f(s), want, rtol=1e-6, atol=1e-9 * max(1.0, np.abs(want).max()))
+            assert np.isfinite([f.gain]).all()
+
+
+def test_a_channel_without_a_path_is_zero():
+    f = linear([[-1.0]], [[1.0]], [[0.0]]).transfer_function()
+    assert (f.gain, f.zeros.size, f.poles.size) == (0.0, 0, 0)
+
+
+def test_stable_pairs_cancel_and_unstable_ones_stay():
+    stable_pair = linear([[-1, 0], [0, -2]], [[1], [0]], [[1, 1]]).transfer_function()
+    assert stable_pair.poles == pytest.approx([-1.0]) and len(stable_pair.cancelled) == 1
+    unstable = linear([[-1, 0], [0, 2]], [[1], [0]], [[1, 1]]).transfer_function()
+    assert sorted(unstable.poles.real) == pytest.approx([-1.0, 2.0])
+    assert unstable.zeros == pytest.approx([2.0])
+
+
+# --- delays ---
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+def test_pade_is_all_pass_and_right_at_low_frequency(order):
+    a, b, c, d = pade(order)
+    w = np.array([0.01, 0.2, 1.0])
+    got = np.array([c @ np.linalg.solve(1j * x * np.eye(order) - a, b) + d for x in w])
+    np.testing.assert_allclose(np.abs(got), 1.0, rtol=1e-9)
+    top, bottom = control.pade(1.0, order)
+    want = np.polyval(top, 1j * w) / np.polyval(bottom, 1j * w)
+    np.testing.assert_allclose(got, want, rtol=1e-8)
+
+
+def test_pade_order_is_checked():
+    with pytest.raises(LinearizationError):
+        pade(0)
+
+
+def test_delays_are_exact_in_frequency_and_pade_in_the_state_space(link):
+    found = linearize(link.with_effects(DELAY), inputs=["Vdcref1"], outputs=["Vdc1"])
+    plain = linearize(link, inputs=["Vdcref1"], outputs=["Vdc1"])
+    assert len(found.state_names) == 6 + 5
+    # Close the loop around the delay by hand: open the plain link at Ir1 and put exp(-sT) in.
+    opened = loop(link, "Ir1").open
+    s = 1j * W
+    e = np.exp(-0.002 * s)
+    l0 = opened.response(W)[:, 0, 0]
+    direct = plain.response(W)[:, 0, 0]
+    # Vdc1 follows the delayed order: G = e (1 + L) / (1 + e L) times the plain closed loop.
+    np.testing.assert_allclose(found.response(W)[:, 0, 0], direct * e * (1 + l0) / (1 + e * l0), rtol=1e-8)
+    rational = found.to_control()(1j * W[:8])
+    np.testing.assert_allclose(found.response(W[:8])[:, 0, 0], np.ravel(rational), rtol=1e-6)
+
+
+def test_a_sampled_block_is_a_hold_and_its_compute_time():
+    s = 1j * np.array([1e-9, 1.0, 100.0])
+    want = (1 - np.exp(-0.01 * s[1:])) / (0.01 * s[1:]) * np.exp(-0.004 * s[1:])
+    got = response("sampled", 0.01, 0.004, s)
+    np.testing.assert_allclose(got[1:], want, rtol=1e-12)
+    assert got[0] == pytest.approx(1.0)
+
+
+# --- sensitivity and bands ---
+
+
+@pytest.mark.parametrize("effects", [[], DELAY], ids=["plain", "delayed"])
+def test_sensitivity_of_the_response_against_differences(link, effects):
+    plant = link.with_effects(effects)
+    names = ["KPVDC", "KIVDC", "C1", *([n for n in plant.parameters if n.endswith("_T")])]
+    found = linearize(plant, inputs=["Vdcref1"], outputs=["Irorder1"], sensitivities=names)
+    slopes = sensitivity(found, W)
+    for name in names:
+        value = plant.parameters[name].value
+        up, down = (
+            linearize(plant.with_values({name: value * (1 + s)}), inputs=["Vdcref1"], outputs=["Irorder1"]).response(W)
+            for s in (1e-5, -1e-5)
+        )
+        want = (up - down) / (2e-5 * value)
+        assert np.abs(slopes[name] - want).max() < 1e-6 * np.abs(want).max()
+
+
+def test_bands_against_monte_carlo(link):
+    names = ["KPVDC", "KIVDC"]
+    found = linearize(link, inputs=["Vdcref1"], outputs=["Vdc1"], sensitivities=names)
+    covariance = np.array([[0.04, 0.3], [0.3, 9.0]])
+    w = np.array([5.0, 30.0, 80.0])
+    band = bands(found, w, covariance, names)
+    rng = np.random.default_rng(5)
+    draws = rng.multivariate_normal([0, 0], covariance, size=4000)
+    errors = np.array([values_at(found, dict(zip(names, d, strict=True)), w) - band.values for d in draws])
+    np.testing.assert_allclose(band.std, np.sqrt((np.abs(errors) ** 2).mean(axis=0)), rtol=0.05)
+    with pytest.raises(LinearizationError, match="covariance"):
+        bands(found, w, np.eye(3), names)
+
+
+def test_dc_impedance_and_admittance(link):
+    """At 0 rad/s the voltage control holds Vdc1; far above, the capacitors alone: 1/(s C)."""
+    found = linearize(link)
+    z = impedance(found, ["Vdc1"], ["Iload1"], [1e-4, 3e6], into=False)
+    assert abs(z.values[0, 0, 0]) < 1e-5
+    assert z.values[1, 0, 0] == pytest.approx(1 / (3e6j * 0.2), rel=0.02)
+    y = admittance(found, ["Vdc1"], ["Iload1"], [3e6], into=False)
+    assert y.values[0, 0, 0] == pytest.approx(1 / z.values[1, 0, 0])
+
+
+# --- loops and margins ---
+
+
+@pytest.mark.parametrize("signal", ["Irorder1", "Ir1", "P2_m", "ev", "Vdc1", "xp"])
+def test_closing_an_opened_loop_gives_the_closed_model_s_poles(link, model, signal):
+    opened = loop(link, signal)
+    np.testing.assert_allclose(
+        np.sort_complex(opened.closed_poles()), np.sort_complex(model.poles()), rtol=1e-6, atol=1e-4
+    )
+    s, t = opened.sensitivity(W), opened.complementary(W)
+    np.testing.assert_allclose(s.values + t.values, 1.0)
+
+
+def test_no_loop_through_an_input(link):
+    with pytest.raises(LinearizationError, match="no loop"):
+        loop(link, "Pref2")
+    with pytest.raises(UnknownNameError):
+        loop(link, "nothing")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.05, 5.0))
+def test_margins_equal_python_control(seed, gain):
+    rng = np.random.default_rng(seed)
+    poles = -(10 ** rng.uniform(-1, 1, 4))
+    top = gain * np.prod(-poles)
+    a = np.diag(poles[:1])
+    g = control.zpk([], poles, top)
+    ss = control.ss(control.tf(g))
+    found = margins(linear(ss.A, ss.B, ss.C, ss.D))
+    gm, pm, sm, wpc, wgc, wms = control.stability_margins(g)
+    if np.isfinite(gm) and gm > 1:
+        assert found.gain_margin.value == pytest.approx(gm, rel=1e-6)
+        assert found.gain_margin.omega == pytest.approx(wpc, rel=1e-6)
+    if np.isfinite(pm) and gain > 1.01:
+        assert found.phase_margin.value == pytest.approx((pm + 180) % 360 - 180, rel=1e-5, abs=1e-5)
+        assert found.phase_margin.omega == pytest.approx(wgc, rel=1e-6)
+    assert found.modulus.value == pytest.approx(sm, rel=1e-5)
+    assert found.modulus.omega == pytest.approx(wms, rel=1e-2)
+    assert found.stable == bool(np.isfinite(gm) and gm > 1)
+    assert a.shape == (1, 1)
+
+
+def test_disk_margin_equals_python_control():
+    g = control.tf([1], [1, 2, 3, 4])
+    alpha, gain_db, phase = control.disk_margins(g, np.logspace(0, 0.5, 200_001))
+    ss = control.ss(g)
+    found = margins(linear(ss.A, ss.B, ss.C, ss.D))
+    assert found.disk.value == pytest.approx(float(alpha), rel=1e-6)
+    assert 20 * np.log10(found.disk_gain) == pytest.approx(float(gain_db), rel=1e-5)
+    assert found.disk_phase == pytest.approx(float(phase), rel=1e-5)
+
+
+def test_delay_margin_of_an_integrator_with_a_delay():
+    """L = 1/s: phase margin 90 degrees at 1 rad/s, so a delay of pi/2 s."""
+    found = margins(linear([[-1e-9]], [[1.0]], [[1.0]]), np.logspace(-3, 3, 2001))
+    assert found.phase_margin.value == pytest.approx(90.0, abs=1e-6)
+    assert found.delay.value == pytest.approx(np.pi / 2, rel=1e-6)
+    with pytest.raises(LinearizationError, match="one loop"):
+        margins(stable(0))
+
+
+def test_an_ill_posed_loop_is_refused():
+    with pytest.raises(LinearizationError, match="ill-posed"):
+        margins(linear([[-1.0]], [[0.0]], [[1.0]], [[-1.0]]))
+
+
+# --- measured ---
+
+
+def test_multisine_through_the_nonlinear_model(link):
+    found = by_simulation(link, "Vdcref1", ["Vdc1", "Irorder1"], [5.0, 20.0, 60.0], 1e-5, rtol=1e-10)
+    want = linearize(link, find_operating_point(link), inputs=["Vdcref1"], outputs=["Vdc1", "Irorder1"]).response(
+        found.omega
+    )
+    np.testing.assert_allclose(found.values, want, rtol=2e-4)
+
+
+def test_multisine_through_a_delay(link):
+    plant = link.with_effects(DELAY)
+    found = by_simulation(plant, "Vdcref1", ["Vdc1"], [20.0, 60.0], 1e-5, rtol=1e-9)
+    want = linearize(plant, inputs=["Vdcref1"], outputs=["Vdc1"]).response(found.omega)
+    np.testing.assert_allclose(found.values, want, rtol=2e-3)
+
+
+def test_response_from_a_recording_with_its_band():
+    import scipy.signal
+
+    rng = np.random.default_rng(0)
+    t = np.arange(20000) * 1e-3
+    u = rng.normal(size=t.size)
+    y = scipy.signal.lfilter([0.1], [1, -0.9], u) + 0.02 * rng.normal(size=t.size)
+    found = from_record(t, u, y, segments=20)
+    want = 0.1 / (1 - 0.9 * np.exp(-1j * found.omega * 1e-3))
+    z = np.abs(found.values[:, 0, 0] - want) / found.std[:, 0, 0]
+    assert 0.5 < np.mean(z**2) / 2 < 2.0
+    assert 0 <= found.coherence.min() <= found.coherence.max() <= 1
+    with pytest.raises(WaveformError, match="never changes"):
+        from_record(t, np.ones_like(t), y)
+    with pytest.raises(WaveformError, match="too few"):
+        from_record(t[:20], u[:20], y[:20])
+
+
+# --- formulas ---
+
+
+def test_the_voltage_loop_as_a_formula(link):
+    found = symbolic_transfer(link, "Vdcref1", "Vdc1", ["KPVDC", "KIVDC"], together={"C1": "C", "C2": "C"})
+    assert {s.name for s in found.expression.free_symbols} == {"s", "KPVDC", "KIVDC", "C"}
+    for values in ({"KPVDC": 24.0, "KIVDC": 734.7, "C": 0.2}, {"KPVDC": 10.0, "KIVDC": 300.0, "C": 0.3}):
+        other = link.with_values(
+            {"KPVDC": values["KPVDC"], "KIVDC": values["KIVDC"], "C1": values["C"], "C2": values["C"]}
+        )
+        want = linearize(other, inputs=["Vdcref1"], outputs=["Vdc1"]).response([3.0])[0, 0, 0]
+        assert found(3j, values) == pytest.approx(want, rel=1e-9)
+    latex = found.latex()
+    assert "s^{3}" in latex and "KIVDC" in latex and latex.startswith(r"\frac")
+    with pytest.raises(LinearizationError, match="delays"):
+        symbolic_transfer(link.with_effects(DELAY), "Vdcref1", "Vdc1", ["KPVDC"])
+
+
+def test_default_frequencies_cover_the_poles(model):
+    found = frequency_response(model)
+    assert found.omega[0] < 30 / 10 and found.omega[-1] > 4.1e5
+    assert found.array.dims == ("omega", "output", "input")
