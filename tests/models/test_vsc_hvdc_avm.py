@@ -13,7 +13,7 @@ from hvdc_ident.simulate import Tolerance, simulate
 from hvdc_ident.simulate.engine import engine
 
 NAMES = ("vsc-hvdc-avm", *VARIANTS)
-FINE = Tolerance(1e-10, 1e-13)
+FINE = Tolerance(1e-12, 1e-15)
 
 
 def at_rest(link, outputs, **values):
@@ -108,7 +108,7 @@ def test_its_sensitivities_are_derivatives(name):
     names, outputs = ("KIP", "KIVDC", "Ls", "Zg", "Tpll"), ("Irorder1", "P2", "Q2", "Vdc1")
     exact = simulate(link, step, None, names, outputs=outputs, tolerance=FINE)
     for k, n in enumerate(names):
-        h = 1e-4 * link.values[n]
+        h = 1e-3 * link.values[n]
         high, low = (
             simulate(link, step, {n: link.values[n] + s * h}, outputs=outputs, tolerance=FINE).trajectory.values
             for s in (1, -1)
