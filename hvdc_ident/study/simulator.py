@@ -1,33 +1,5 @@
-"""A sympy model as the thing a fit can run."""
+"""The simulator of a study's model, under the name studies use."""
 
-from __future__ import annotations
+from hvdc_ident.simulate.model_simulator import ModelSimulator
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-
-from hvdc_ident.errors import SimulationError, SteadyStateError
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.model.definition import Model
-from hvdc_ident.parameters import Parameter
-from hvdc_ident.simulate import Simulation, simulate
-
-
-@dataclass(frozen=True, eq=False)
-class ModelSimulator:
-    """The model with its engine: parameters, and runs with sensitivities. It travels to other processes."""
-
-    model: Model
-
-    @property
-    def parameters(self) -> Mapping[str, Parameter]:
-        """The model's parameters by name."""
-        return self.model.parameters
-
-    def simulate(
-        self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
-    ) -> Simulation:
-        """A run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
-        try:
-            return simulate(self.model, experiment, values, sensitivities, outputs=experiment.outputs or None)
-        except SteadyStateError as e:
-            raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
+__all__ = ["ModelSimulator"]
