@@ -1,0 +1,297 @@
+"""Rows of the observability-identifiability matrix at random points: over a prime field, or with 120 decimals.
+
+The unknowns are the start of the states and the parameters. Rows: the derivatives of the outputs' Taylor coefficients in
+every stretch of the experiment, and of the equations the start obeys, so that a steady start needs no solution formula.
+After A. Sedoglavic, "A probabilistic algorithm to test local algebraic observability in polynomial time", J. Symbolic
+Computation 33 (2002) 735-755.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from random import Random
+from typing import Any, Literal
+
+import numpy as np
+
+from hvdc_ident.sensitivity.equations import Equations, Source
+from hvdc_ident.sensitivity.field_point import Sparse, Step, Values, plan
+from hvdc_ident.sensitivity.high_precision import HighPrecision
+from hvdc_ident.sensitivity.prime_field import Array, NoSuchNumber, NotRational, PrimeField
+from hvdc_ident.sensitivity.taylor import Ring, Taylor, inverse
+
+InputClass = Literal["constant", "step", "ramp", "free"]
+TRIES = 300
+JUMPS = 8  # step sizes tried from one start before another start is drawn
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked: the equations at rest and after the event, which parameters, which inputs move and how.
+
+    moved: {position in w: class}. parameters: positions in p. rested: whether every state starts at rest.
+    """
+
+    source: Source
+    rest: Equations
+    move: Equations
+    parameters: tuple[int, ...]
+    moved: tuple[tuple[int, InputClass], ...]
+    rested: bool
+
+    @property
+    def order(self) -> int:
+        """The Taylor order: enough for a linear model's outputs and their derivatives, and for a nonlinear one's in general."""
+        n = len(self.rest.derivatives)
+        return max(n + len(self.parameters) + 2, 2 * n + 3)
+
+    @property
+    def start(self) -> list[int]:
+        """The nodes that are 0 at the start."""
+        zero = self.rest.graph.zero
+        return [n for n in (*(s for s in self.rest.starts if s is not None), *self.rest.residuals) if n != zero]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What is seen at one point: the reduced rows over the parameters alone, and the parameters' values there."""
+
+    ring: Ring
+    matrix: Array
+    pivots: tuple[int, ...]
+    theta: tuple[Any, ...]
+
+    @property
+    def seen(self) -> tuple[int, ...]:
+        """Positions of the parameters that are seen: their unit row is among the rows."""
+        return tuple(c for r, c in zip(self.matrix, self.pivots, strict=True) if np.count_nonzero(r) == 1)
+
+
+@dataclass(frozen=True)
+class Base:
+    """A point: parameters, start [states, unknowns], inputs with time first, and the values of roots already chosen."""
+
+    p: list[Any]
+    y: list[Any]
+    w: list[Any]
+    known: dict[tuple[str, Any], Any]
+    nonzero: frozenset[int] = frozenset()  # nodes that are not 0 at the start
+
+
+Jump = Callable[[Base, list[Any], "set[int]", Random], list[Any]]
+
+
+def rows(question: Question, ring: Ring, base: Base, jump: Jump, random: Random, deadline: float) -> Rows:
+    """The rows at one base point. jump: the unknowns right after the inputs have jumped to the given values."""
+    q, nx = question, len(question.rest.derivatives)
+    found: list[Array] = []
+    theta = [base.p[k] for k in q.parameters]
+
+    def series(e: Equations, y: list[Any], w: Sequence[Sequence[Any]], order: int, roots: Sequence[int]) -> Mapping[int, Array]:
+        t = Taylor(e, ring, base.p, q.parameters, random.randrange(2**31), deadline)
+        t.known = base.known
+        return t.run(y, w, order, roots)
+
+    def watch(e: Equations, y: list[Any], w: Sequence[Sequence[Any]], order: int) -> None:
+        result = series(e, y, w, order, e.outputs)
+        found.extend(result[n][:, 1:] for n in e.outputs)
+
+    still = [[v] for v in base.w]
+    uses_time = [[base.w[0], 1], *still[1:]]
+    watch(q.rest, base.y, still if q.rested else uses_time, 0 if q.rested else q.order)
+    constraint = series(q.rest, base.y, still, 0, q.start)
+    for n in q.start:
+        if ring.p and int(constraint[n][0, 0]) % ring.p:
+            raise NoSuchNumber("the start does not hold")
+        found.append(constraint[n][:, 1:])
+    for w in stretches(q, ring, base, random):
+        jumped = {k for k in range(len(w)) if w[k][0] != base.w[k]}
+        y = base.y
+        if q.move.residuals and (jumped or q.move is not q.rest):
+            y = [*base.y[:nx], *jump(base, [v[0] for v in w], jumped, random)]
+        watch(q.move, y, w, q.order)
+    reduced, pivots = ring.rref(np.concatenate(found))
+    first = sum(c < nx for c in pivots)
+    return Rows(ring, reduced[first:, nx:], tuple(c - nx for c in pivots[first:]), tuple(theta))
+
+
+def stretches(q: Question, ring: Ring, base: Base, random: Random) -> Iterator[list[list[Any]]]:
+    """The inputs' series: each moved input on its own, then all together."""
+    moves = {k: _move(kind, ring, base.w[k], random, q.order) for k, kind in q.moved}
+    groups = [[k] for k in moves] + ([list(moves)] if len(moves) > 1 else [])
+    for group in groups:
+        w = [moves[k] if k in group else [v] for k, v in enumerate(base.w)]
+        w[0] = [base.w[0], 1]
+        yield w
+    if not groups and q.move is not q.rest:
+        yield [[base.w[0], 1], *([v] for v in base.w[1:])]
+
+
+def _move(kind: InputClass, ring: Ring, level: Any, random: Random, order: int) -> list[Any]:
+    def size() -> Any:
+        return ring.number(Fraction(random.randrange(2, 10**6) if ring.p else random.randrange(5000, 20000), 10**6))
+
+    if kind == "step":
+        return [ring.reduce(level + size())]
+    return [level, *(size() for _ in range(1 if kind == "ramp" else order))]
+
+
+# --- over a prime field ---
+
+
+class FieldPoints:
+    """Random points over one prime field; NotRational where they cannot be found."""
+
+    def __init__(self, question: Question, ring: PrimeField, random: Random, deadline: float) -> None:
+        self.q, self.ring, self.random, self.deadline = question, ring, random, deadline
+        self._plans: dict[frozenset[int], tuple[Sparse, list[Step]]] = {}
+        self._prepare()
+
+    def _prepare(self) -> None:
+        q, g, m = self.q, self.q.rest.graph, self.q.source.model
+        held = {k: v.value for k, v in enumerate(m.parameters.values()) if k not in q.parameters}
+        null = [g.leaf("p", k) for k, v in held.items() if v == 0.0]
+        null += [g.leaf("w", 1 + k) for k, v in enumerate(m.inputs.values()) if v.value == 0.0]
+        self.leaves = {
+            "p": [g.leaf("p", k) for k in range(len(m.parameters))],
+            "y": [g.leaf("y", k) for k in range(len(q.rest.derivatives) + len(q.rest.residuals))],
+            "w": [g.leaf("w", k) for k in range(1 + len(m.inputs))],
+        }
+        self.null = set(null)
+        self.sparse = Sparse(q.rest, q.start, (), self.null)
+        p = {self.sparse.leaf_of[n] for n in self.leaves["p"] if n in self.sparse.leaf_of}
+        free = {self.sparse.leaf_of[n] for n in (*self.leaves["w"], *self.leaves["y"]) if n in self.sparse.leaf_of}
+        self.steps = plan(self.sparse, free, p)
+
+    def __call__(self) -> Rows:
+        """The rows at one more point."""
+        for _ in range(TRIES):
+            try:
+                return rows(self.q, self.ring, self._base(), self._jump, self.random, self.deadline)
+            except NoSuchNumber:
+                continue
+        raise NotRational("no point of the prime field was found")
+
+    def _base(self) -> Base:
+        values = Values(self.sparse, self.ring, {}, {}, self.random)
+        values.take(self.steps)
+        of, known = values.of, self.sparse.leaf_of
+
+        def value(n: int) -> int:
+            if n in self.null:
+                return 0
+            return of[known[n]] if n in known and known[n] in of else self.ring.random(self.random)
+
+        p, y, w = ([value(n) for n in self.leaves[group]] for group in ("p", "y", "w"))
+        self._same_branch(y)
+        return Base(p, y, w, self._roots(self.sparse, of), frozenset(n for n, v in known.items() if of.get(v)))
+
+    def _same_branch(self, y: list[Any]) -> None:
+        """Refuses a start at which something is 0 that is not 0 at the operating point: it solves other equations."""
+        q = self.q
+        if not (q.rested and (q.rest.residuals or q.source.graph.switches)):
+            return
+        if any(v == 0 and abs(x) > 1e-6 for v, x in zip(y, q.source.point, strict=True)):
+            raise NoSuchNumber("another branch")
+
+    def _roots(self, s: Sparse, of: Mapping[int, int]) -> dict[tuple[str, Any], Any]:
+        chosen = [of[v] for n, v in s.leaf_of.items() if s.source.nodes[n][0] == "sqrt" and v in of]
+        return {("sqrt", v * v % self.ring.p): v for v in chosen}
+
+    def _jump(self, base: Base, w: list[Any], jumped: set[int], random: Random) -> list[Any]:
+        q, nx = self.q, len(self.q.rest.derivatives)
+        unknown = affected(q, jumped)
+        if not unknown:
+            return base.y[nx:]
+        key = frozenset(unknown)
+        given = dict(zip(self.leaves["p"], base.p, strict=True)) | dict(zip(self.leaves["w"], w, strict=True))
+        given |= {n: v for k, (n, v) in enumerate(zip(self.leaves["y"], base.y, strict=True)) if k - nx not in unknown}
+        if key not in self._plans:
+            zeros = [q.move.residuals[i] for i in sorted(unknown)]
+            s = Sparse(q.move, zeros, list(given), ())
+            self._plans[key] = (s, plan(s, set(), set()))
+        s, steps = self._plans[key]
+        values = Values(s, self.ring, {v: given[n] for n, v in s.leaf_of.items() if n in given}, base.known, random)
+        values.take(steps)
+        if any(values.of.get(v) == 0 and n in base.nonzero for n, v in s.leaf_of.items()):
+            raise NoSuchNumber("a branch that does not join the start")
+        base.known.update(self._roots(s, values.of))
+        unknowns = enumerate(self.leaves["y"][nx:])
+        return [values.of[s.leaf_of[n]] if k in unknown else base.y[nx + k] for k, n in unknowns]
+
+
+def affected(q: Question, jumped: set[int]) -> set[int]:
+    """Positions of the unknowns that jump when inputs do, or when a limiter's branch changes."""
+    g, nx = q.move.graph, len(q.move.derivatives)
+    leaves = [{g.nodes[n][1:] for n in g.reachable([r]) if g.nodes[n][0] == "leaf"} for r in q.move.residuals]
+    found = {i for i, (a, b) in enumerate(zip(q.rest.residuals, q.move.residuals, strict=True)) if a != b}
+    found |= {i for i, used in enumerate(leaves) if any(("w", k) in used for k in jumped)}
+    while True:
+        more = {i for i, used in enumerate(leaves) if any(("y", nx + j) in used for j in found)} - found
+        if not more:
+            return found
+        found |= more
+
+
+# --- with real numbers ---
+
+
+class RealPoints:
+    """Random points near the operating point, in real numbers of 120 decimals; use inside `context()`."""
+
+    def __init__(self, question: Question, random: Random, deadline: float) -> None:
+        self.q, self.ring, self.random, self.deadline = question, HighPrecision(), random, deadline
+
+    def __call__(self) -> Rows:
+        """The rows at one more point."""
+        for spread in (0.2, 0.1, 0.05, 0.02, 0.01):
+            try:
+                return rows(self.q, self.ring, self._base(spread), self._jump, self.random, self.deadline)
+            except ArithmeticError:
+                continue
+        raise NotRational("no start was found near the operating point")
+
+    def _near(self, value: float, spread: float) -> Decimal:
+        share = Decimal(self.random.randrange(-(10**6), 10**6)) / 10**6
+        return Decimal(repr(float(value))) * (1 + Decimal(str(spread)) * share)
+
+    def _base(self, spread: float) -> Base:
+        m, q = self.q.source.model, self.q
+        p = [
+            self._near(x.value or 0.05 * x.size, spread) if k in q.parameters else Decimal(repr(x.value))
+            for k, x in enumerate(m.parameters.values())
+        ]
+        w = [Decimal(0), *(Decimal(repr(float(v))) for v in q.source.u)]
+        y = [Decimal(repr(float(v))) for v in q.source.point]
+        free = [k for k, s in enumerate(q.rest.starts) if s is None]
+        for k in free:
+            y[k] = self._near(float(y[k]) or 0.1, spread)
+        zeros = [s for s in q.rest.starts if s is not None] + list(q.rest.residuals)
+        unknown = [k for k in range(len(y)) if k not in free]
+        return Base(p, self._newton(zeros, unknown, p, y, w), w, {})
+
+    def _newton(self, zeros: list[int], unknown: list[int], p: list[Any], y: list[Any], w: list[Any]) -> list[Any]:
+        if not zeros:
+            return y
+        q = self.q
+        flat = Equations(q.rest.graph, (q.rest.graph.zero,) * len(y), (), (), (), ())
+        for _ in range(60):
+            t = Taylor(flat, self.ring, p, (), 0, self.deadline)
+            result = t.run(y, [[v] for v in w], 0, zeros)
+            block = np.array([result[n][0] for n in zeros])
+            step = self.ring.product(inverse(self.ring, block[:, [1 + k for k in unknown]]), block[:, :1])[:, 0]
+            y = list(y)
+            for k, d in zip(unknown, step, strict=True):
+                y[k] = y[k] - d
+            if all(abs(d) < Decimal("1e-100") * (1 + abs(y[k])) for k, d in zip(unknown, step, strict=True)):
+                return y
+        raise NoSuchNumber("no start was found")
+
+    def _jump(self, base: Base, w: list[Any], jumped: set[int], random: Random) -> list[Any]:
+        nx = len(self.q.rest.derivatives)
+        unknown = [nx + k for k in sorted(affected(self.q, jumped))]
+        zeros = [self.q.move.residuals[k - nx] for k in unknown]
+        return self._newton(zeros, unknown, base.p, base.y, w)[nx:] if unknown else base.y[nx:]
