@@ -1,7 +1,7 @@
 """The shipped models, one file each, and the one way to load any model.
 
 A file gives `model()` and one line, SUMMARY, under its own name with hyphens; where it has structure options it may
-ship more of them: VARIANTS, {name: (one line, function that gives the model)}.
+ship more of them: VARIANTS, {name: (one line, function that gives the model)}. Files that begin with _ are no models.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["load_model", "shipped_models", "summaries"]
 @cache
 def _shipped_by_name() -> FrozenMap[tuple[str, Callable[[], Model]]]:
     found: dict[str, tuple[str, Callable[[], Model]]] = {}
-    for name in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+    for name in sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")):
         module: Any = importlib.import_module(f"{__name__}.{name}")
         found |= {name.replace("_", "-"): (str(module.SUMMARY), module.model)} | getattr(module, "VARIANTS", {})
     return FrozenMap(found)
