@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from hvdc_ident.experiment import Experiment, InputSignal
     from hvdc_ident.fit import fit
     from hvdc_ident.formats import read_waveforms
+    from hvdc_ident.linearize import LinearModel, OperatingPoint, find_operating_point, linearize
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.simulate import simulate
+    from hvdc_ident.study.export import export
     from hvdc_ident.study.study import load_study
     from hvdc_ident.trajectory import Trajectory
 
@@ -29,11 +31,16 @@ __all__ = [
     "Experiment",
     "Input",
     "InputSignal",
+    "LinearModel",
     "Model",
+    "OperatingPoint",
     "Parameter",
     "Trajectory",
     "__version__",
+    "export",
+    "find_operating_point",
     "fit",
+    "linearize",
     "load_model",
     "load_study",
     "read_waveforms",
@@ -44,10 +51,15 @@ _HOME = {
     "Experiment": "experiment",
     "Input": "parameters",
     "InputSignal": "experiment",
+    "LinearModel": "linearize",
     "Model": "model.definition",
+    "OperatingPoint": "linearize",
     "Parameter": "parameters",
     "Trajectory": "trajectory",
+    "export": "study.export",
+    "find_operating_point": "linearize",
     "fit": "fit",
+    "linearize": "linearize",
     "load_model": "models",
     "load_study": "study.study",
     "read_waveforms": "formats",
@@ -55,7 +67,7 @@ _HOME = {
 }
 
 
-_VERBS = ("fit", "simulate")
+_VERBS = ("fit", "linearize", "simulate")
 """Names of a function and of the folder it lives in."""
 
 

@@ -30,7 +30,7 @@ def test_public_names_have_a_docstring(name: str) -> None:
     assert (getattr(hvdc_ident, name).__doc__ or "").strip()
 
 
-@pytest.mark.parametrize("verb", ["fit", "simulate"])
+@pytest.mark.parametrize("verb", ["fit", "linearize", "simulate"])
 def test_a_verb_can_be_called_whatever_was_imported_first(verb: str) -> None:
     folder = importlib.import_module(f"hvdc_ident.{verb}")
     assert callable(getattr(hvdc_ident, verb))
