@@ -42,6 +42,10 @@ Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, max=2**31 - 1, 
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
 Trust = Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")]
+Force = Annotated[
+    list[str] | None,
+    typer.Option("--force", metavar="NAME", help="Fit this candidate whatever the verdict on it; may be repeated."),
+]
 
 
 class _Failed(Exception):
@@ -215,6 +219,27 @@ def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet:
         raise _Failed("; ".join(failures))
 
 
+def _run_one(
+    stage: Stage, study: Path, out: Path | None, options: Options, *, json: bool, quiet: bool, trust: bool
+) -> None:
+    """Runs one stage of a study, and those it builds on, and tells how it went."""
+    from dataclasses import replace
+
+    from hvdc_ident.study.pipeline import run_stage
+    from hvdc_ident.study.progress import progress
+    from hvdc_ident.study.study import load_study
+
+    loaded = load_study(study, trust)
+    folder = out or loaded.folder
+    with progress(quiet or json) as told:
+        done = run_stage(loaded, stage.name, folder, replace(options, progress=told))
+    if json:
+        _print_json(done.data)
+    _say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}", json=json, quiet=quiet)
+    if done.failed:
+        raise _Failed(f"{stage.name}: {done.failed}")
+
+
 def _add_stage(stage: Stage) -> None:
     """Registers one stage as a command of its name."""
 
@@ -227,22 +252,24 @@ def _add_stage(stage: Stage) -> None:
         quiet: Quiet = False,
         trust: Trust = False,
     ) -> None:
-        from hvdc_ident.study.pipeline import run_stage
-        from hvdc_ident.study.progress import progress
-        from hvdc_ident.study.study import load_study
+        _run_one(stage, study, out, Options(workers, seed), json=json, quiet=quiet, trust=trust)
 
-        loaded = load_study(study, trust)
-        folder = out or loaded.folder
-        with progress(quiet or json) as told:
-            done = run_stage(loaded, stage.name, folder, Options(workers, seed, told))
-        if json:
-            _print_json(done.data)
-        _say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}", json=json, quiet=quiet)
-        if done.failed:
-            raise _Failed(f"{stage.name}: {done.failed}")
+    def forcing(
+        study: StudyFile,
+        force: Force = None,
+        out: Out = None,
+        workers: Workers = 1,
+        seed: Seed = 0,
+        json: Json = False,
+        quiet: Quiet = False,
+        trust: Trust = False,
+    ) -> None:
+        options = Options(workers, seed, force=tuple(dict.fromkeys(force or ())))
+        _run_one(stage, study, out, options, json=json, quiet=quiet, trust=trust)
 
-    command.__doc__ = stage.summary
-    app.command(stage.name)(guarded(command))
+    made = forcing if "force" in stage.takes else command
+    made.__doc__ = stage.summary
+    app.command(stage.name)(guarded(made))
 
 
 for _stage in stages():

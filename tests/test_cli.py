@@ -87,7 +87,14 @@ def test_fit_finds_the_gain_and_writes_every_file(study: Path) -> None:
     found = json.loads((folder / "fit.json").read_text())
     assert abs(found["estimates"]["k"]["value"] - 5.0) < 0.05
     assert {"schema", "study", "model", "software", "seed"} <= set(found)
-    names = {"fit.json", "fitted-values.toml", "fitted-values.csv", "fitted-values.ssv", "fit.step.csv"}
+    names = {
+        "identifiability.json",
+        "fit.json",
+        "fitted-values.toml",
+        "fitted-values.csv",
+        "fitted-values.ssv",
+        "fit.step.csv",
+    }
     assert {p.name for p in folder.iterdir()} == names
 
 

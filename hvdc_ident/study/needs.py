@@ -26,3 +26,15 @@ def need_candidates(study: Study, stage: str) -> None:
         raise StudyError(
             f"{stage} needs parameters to estimate and the study names none", where=study.path.name, hint=hint
         )
+
+
+def need_start(study: Study) -> None:
+    """Raises SteadyStateError where an experiment has no steady state at the start values: the study is then wrong."""
+    from contextlib import suppress
+
+    from hvdc_ident.errors import SimulationError
+    from hvdc_ident.simulate import simulate
+
+    for experiment in study.experiments:
+        with suppress(SimulationError):
+            simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)

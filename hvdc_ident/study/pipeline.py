@@ -124,6 +124,7 @@ def _kept(study: Study, wanted: Stage, folder: Path, options: Options) -> dict[s
 def _mark(study: Study, wanted: Stage, options: Options) -> str:
     """A hash of all that decides a stage's result: the study, its files, the seed, this software."""
     parts = [wanted.name, *(f"{n}={h}" for n, h in study.sources.items()), str(options.seed), version(), _code()]
+    parts += [f"{name}={getattr(options, name)}" for name in wanted.takes if getattr(options, name)]
     return digest("\n".join(parts).encode())
 
 

@@ -28,11 +28,15 @@ def silent(done: int, total: int, text: str) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """How stages run. workers: processes; seed: of every random number; progress: who is told."""
+    """How stages run. workers: processes; seed: of every random number; progress: who is told.
+
+    force: candidates to fit whatever the verdict on them.
+    """
 
     workers: int = 1
     seed: int = 0
     progress: Progress = silent
+    force: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class Stage:
     name: its command. file: its JSON in DIR. run: the work, given the study, the options and the data of the stages it
     builds on, by name; what the study lacks for it is a StudyError. wanted: whether `run STUDY` includes it.
     after: the stages it builds on; they run first. order: place among the stages of a run.
+    takes: names of `Options` that only some stages have and that decide its result.
     """
 
     name: str
@@ -63,6 +68,7 @@ class Stage:
     wanted: Callable[[Study], bool]
     order: int
     after: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
 
 
 @cache

@@ -1,9 +1,9 @@
-"""The stage `fit`: estimates of the candidates from the recordings."""
+"""The stage `fit`: estimates from the recordings, of what the stage `identify` found identifiable."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stage import Options, Outcome, Stage
@@ -18,19 +18,25 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     from hvdc_ident.errors import SimulationError
     from hvdc_ident.fit import Problem
     from hvdc_ident.frozen import FrozenMap
+    from hvdc_ident.identifiability import gated_fit
     from hvdc_ident.simulate import simulate
-    from hvdc_ident.study.needs import need_candidates, need_experiments
+    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
     from hvdc_ident.study.simulator import ModelSimulator
     from hvdc_ident.study.tables import comparison_csv, ssv, values_csv
 
     need_experiments(study, "fit", role="fit")
     need_candidates(study, "fit")
     problem = Problem(ModelSimulator(study.model), study.experiments, tuple(study.candidates.values()))
-    _check_start(study)
-    result = _fitted(study, options, problem)
+    need_start(study)
+    report = earlier["identify"]
+    if "parameters" not in report:
+        why = f"nothing can be fitted before the stage identify has run: {report.get('message', 'it failed')}"
+        return Outcome({"status": "failed", "message": why}, failed=why)
+    result = gated_fit(problem, report, lambda p: _fitted(study, options, p), force=options.force)
     found = result.to_dict()
     data = {
         **found,
+        "forced": [n for n in options.force if n in result.fitted and n not in report["identifiable"]],
         "candidates": {
             n: {"start": f.start, "min": f.min, "max": f.max, "unit": study.model.parameters[n].unit}
             for n, f in study.candidates.items()
@@ -59,25 +65,15 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     return Outcome(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
-def _check_start(study: Study) -> None:
-    """Raises SteadyStateError where an experiment has no steady state at the start values: the study is then wrong."""
-    from contextlib import suppress
-
-    from hvdc_ident.errors import SimulationError
-    from hvdc_ident.simulate import simulate
-
-    for experiment in study.experiments:
-        with suppress(SimulationError):
-            simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
-
-
 def _fitted(study: Study, options: Options, problem: Problem) -> FitResult:
     from hvdc_ident.fit import Group, fit, fit_individually
     from hvdc_ident.fit.optimisers import optimiser
     from hvdc_ident.study.schema import Fit
 
     asked = study.settings.fit or Fit()
-    with _executor(options.workers) as executor:
+    from hvdc_ident.study.executor import processes
+
+    with processes(options.workers) as executor:
         common: dict[str, Any] = {
             "starts": asked.starts,
             "seed": options.seed,
@@ -89,28 +85,19 @@ def _fitted(study: Study, options: Options, problem: Problem) -> FitResult:
             groups = [
                 Group(tuple(g.parameters), tuple(g.outputs or ()), tuple(g.experiments or ())) for g in asked.groups
             ]
-            return fit_individually(problem, groups, **common)
+            free = [f.name for f in problem.free]
+            groups = [replace(g, parameters=tuple(n for n in g.parameters if n in free)) for g in groups]
+            return fit_individually(problem, [g for g in groups if g.parameters], **common)
         return fit(problem, **common)
-
-
-@contextmanager
-def _executor(workers: int) -> Iterator[Any]:
-    """Processes for the starts, or None for this process alone."""
-    if workers <= 1:
-        yield None
-        return
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield pool
 
 
 STAGE = Stage(
     name="fit",
     file="fit.json",
-    summary="Estimates of the candidates, with their intervals.",
+    summary="Estimates of the identifiable candidates, with their intervals.",
     run=run,
     wanted=lambda study: study.settings.fit is not None,
     order=40,
+    after=("identify",),
+    takes=("force",),
 )

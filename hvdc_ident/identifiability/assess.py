@@ -1,0 +1,383 @@
+"""The verb `identifiability`: structure, pilot fit, information and profiles, put together into verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.errors import SimulationError, StudyError
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit import FitResult, Free, Problem, Simulator
+from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
+from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.objective import LeastSquares, descend
+from hvdc_ident.fit.profile import TWO_SIDED, Profile, Walk, profiles
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.identifiability import verdicts
+from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
+from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogeneity, misspecification
+from hvdc_ident.identifiability.pilot import Optimum, pilot
+from hvdc_ident.identifiability.recommend import Recommendation, recommend
+from hvdc_ident.identifiability.report import IdentifiabilityReport
+from hvdc_ident.identifiability.structure import Structure, numerical_structure
+from hvdc_ident.identifiability.verdicts import Verdict
+from hvdc_ident.model.definition import Model
+from hvdc_ident.sensitivity.fisher import (
+    collinear_subsets,
+    independent,
+    inflation_index,
+    null_directions,
+    pivoted_order,
+    rise_over_range,
+)
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+
+
+def identifiability(
+    subject: Model | Simulator,
+    experiments: Iterable[Experiment],
+    candidates: Iterable[Free],
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    held: Mapping[str, float] | None = None,
+    walk: Walk | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> IdentifiabilityReport:
+    """What the experiments tell about the candidates: a verdict on each, the set to fit, and what to measure next.
+
+    subject: a model, or anything that can be simulated (then the structure is judged by numbers, at random points).
+    candidates: the parameters to judge, with start and bounds. held: values of other parameters.
+    Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
+    """
+    simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
+    problem = Problem(simulator, tuple(experiments), tuple(candidates), held=FrozenMap(held or {}))
+    return _Assessment(problem, subject if isinstance(subject, Model) else None, seed, walk or Walk(), progress).report(
+        starts, executor
+    )
+
+
+class _Assessment:
+    """One assessment; what was found so far."""
+
+    def __init__(self, problem: Problem, model: Model | None, seed: int, walk: Walk, progress: Progress | None) -> None:
+        self.problem, self.model, self.seed, self.walk, self.progress = problem, model, seed, walk, progress
+        self.free = {f.name: f for f in problem.free}
+        self.units = {n: problem.simulator.parameters[n].unit for n in self.free}
+        self.found: dict[str, Verdict] = {}
+        self.held: dict[str, str] = {}
+        self.combinations: list[Combination] = []
+        self.thresholds: dict[str, float] = {}
+        self.norms: dict[str, float] = {}
+        self.notes: list[str] = []
+
+    def report(self, starts: int, executor: Executor | None) -> IdentifiabilityReport:
+        """The report."""
+        self._check()
+        self._tell("structure")
+        structure = numerical_structure(self.problem, self.seed)
+        self._structural(structure)
+        first = replace(
+            self.problem,
+            free=tuple(f for f in self.problem.free if f.name not in self.held),
+            held=self.problem.held | {n: self.free[n].start for n in self.held},
+        )
+        optimum, result = pilot(first, starts=starts, seed=self.seed, executor=executor, progress=self.progress)
+        self._data_notes(optimum, result)
+        self.norms.update(optimum.information.norms)
+        rest: Optimum | None = self._insensitive(optimum)
+        rest = self._lost(rest) if rest else None
+        last = self._profiled(rest) if rest else None
+        return self._assembled(structure, optimum, last, result)
+
+    def _tell(self, text: str) -> None:
+        if self.progress:
+            self.progress(0, 1, text)
+
+    def _check(self) -> None:
+        for e in self.problem.fitted_experiments:
+            assert e.measured is not None
+            if not any(np.isfinite(e.measured[o][e.compared]).any() for o in e.outputs):
+                raise StudyError(
+                    "nothing was measured", where=f"experiment '{e.name}'", expected="finite values in its window"
+                )
+        self.quiet = all(s.is_constant for e in self.problem.fitted_experiments for s in e.inputs.values())
+        if self.quiet and any(e.inputs for e in self.problem.fitted_experiments):
+            self.notes.append("No input moves in any of the experiments: they show a steady state and nothing else.")
+
+    def _data_notes(self, optimum: Optimum, result: FitResult) -> None:
+        rows = sum(b.residual.size for b in optimum.blocks)
+        if rows <= optimum.theta.size:
+            self.notes.append(f"{rows} measured values cannot determine {optimum.theta.size} unknowns.")
+        if optimum.deterministic:
+            names = ", ".join(optimum.deterministic)
+            self.notes.append(f"The records of {names} have no noise: standard deviations are those of the misfit.")
+        if result.status in ("two-optima", "not-converged"):
+            self.notes.append(f"Pilot fit: {result.status}, {result.message}.")
+
+    # --- the stages, each taking parameters out ---
+
+    def _structural(self, structure: Structure) -> None:
+        stuck = [n for n in self.free if n not in structure.admissible]
+        self.combinations += [
+            replace(c, held=tuple(n for n in c.members if n in stuck)) for c in structure.combinations
+        ]
+        for c in structure.combinations:
+            for n in c.members:
+                at = self.free[n].start if n in stuck else None
+                others = [m for m in c.members if m in stuck]
+                self.found.setdefault(n, verdicts.structural(n, c.words, at, self.units[n], others))
+        for n in stuck:
+            self.held[n] = self.found[n].reason if n in self.found else "not seen"
+        if structure.note:
+            self.notes.append(f"Structure {structure.status}: {structure.note}.")
+
+    def _insensitive(self, optimum: Optimum) -> Optimum | None:
+        """The optimum without the parameters whose whole range changes nothing, confirmed by refits at both ends."""
+        self.thresholds = thresholds(optimum)
+        matrix, names = optimum.information.matrix, optimum.names
+        out: dict[str, str] = {}
+        for i, n in enumerate(names):
+            limit = self.thresholds[n]
+            if rise_over_range(matrix[i, i] / optimum.slope[i] ** 2, self.free[n].span) >= limit:
+                continue
+            rise = _rise_at_ends(optimum, i, self.free[n])
+            if rise is None or rise >= limit:
+                continue
+            self._judge(verdicts.insensitive(self.free[n], rise, limit, self.units[n], self.quiet))
+            out[n] = self.found[n].reason
+        return self._without(optimum, out)
+
+    def _lost(self, optimum: Optimum) -> Optimum | None:
+        """The optimum with the fewest parameters held so that no direction is invisible in these data."""
+        k = len(optimum.names)
+        null = null_directions(optimum.columns)[:, :k]
+        null = null[(np.abs(null) > 0).any(axis=1)]
+        if not null.size:
+            return optimum
+        logs = [u.min > 0 for u in optimum.problem.free]
+        combos = combinations_of(null, optimum.names, logs, optimum.theta[:k].tolist(), "practical")
+        kept = {optimum.names[i] for i in independent(optimum.information.matrix)}
+        members = [n for n in optimum.names if any(n in c.members for c in combos)]
+        out = {n: "" for n in members if n not in kept}
+        self.combinations += [replace(c, held=tuple(n for n in c.members if n in out)) for c in combos]
+        for n in members:
+            words = next(c.words for c in combos if n in c.members)
+            self._judge(verdicts.lost(n, words, self.free[n].start if n in out else optimum.value(n), self.units[n]))
+        return self._without(optimum, {n: self.found[n].reason for n in out})
+
+    def _profiled(self, optimum: Optimum | None) -> Optimum | None:
+        """The optimum of the set all of whose profiles are closed, with a verdict on every member."""
+        while optimum is not None:
+            limits = thresholds(optimum)
+            self.thresholds |= limits
+            physical = _physical(optimum.problem)
+            around = profiles(
+                LeastSquares.of(optimum.problem),
+                optimum.theta,
+                optimum.names,
+                threshold=limits,
+                physical=physical,
+                walk=self.walk,
+                progress=self.progress,
+            )
+            self.notes += [f"A better optimum was found: {r}." for r in around.restarts]
+            optimum = Optimum(optimum.problem, around.theta)
+            opened = [n for n, p in around.by_name.items() if not _bounded(p)]
+            if not opened:
+                self._closed(optimum, around.by_name, physical)
+                return optimum
+            combo = self._open_combination(optimum, opened)
+            for n in opened:
+                words = combo.words if combo and n in combo.members else ""
+                self._judge(verdicts.practical(around.by_name[n], words, self.units[n]))
+            order = [optimum.names[i] for i in pivoted_order(optimum.information.matrix)]
+            victim = max(opened, key=order.index)
+            if combo:
+                self.combinations.append(replace(combo, held=(victim,)))
+            optimum = self._without(optimum, {victim: self.found[victim].reason})
+        return None
+
+    def _open_combination(self, optimum: Optimum, opened: Sequence[str]) -> Combination | None:
+        """What of the open ones is seen together, where they are open because they make each other good."""
+        if len(opened) < 2:
+            return None
+        matrix = optimum.information.select(opened).matrix
+        d = np.sqrt(np.diag(matrix))
+        if not (d > 0).all():
+            return None
+        values, vectors = np.linalg.eigh(matrix / np.outer(d, d))
+        if values[0] > (2.0 / verdicts.COLLINEAR) ** 2:
+            return None
+        logs = [self.free[n].min > 0 for n in opened]
+        null = vectors[:, :1].T / d
+        found = combinations_of(null, opened, logs, [optimum.value(n) for n in opened], "practical")
+        return found[0] if len(found[0].members) > 1 else None
+
+    def _closed(
+        self, optimum: Optimum, found: Mapping[str, Profile], physical: Mapping[str, tuple[bool, bool]]
+    ) -> None:
+        """Verdicts on the set whose profiles are closed."""
+        index = inflation_index(optimum.information.matrix)
+        shares = optimum.information.shares()
+        conditional = partners(self.combinations, self.held)
+        for i, n in enumerate(optimum.names):
+            p, free, unit = found[n], self.free[n], self.units[n]
+            if p.one_sided:
+                own = physical[n][int(p.value >= free.max)]
+                self._judge(verdicts.at_bound(p, free, own, unit))
+                continue
+            best = max(shares, key=lambda e: shares[e][n])
+            std = optimum.uncertainty.std(n)
+            std = None if std is None else std * float(np.sqrt(optimum.excess))
+            judged = verdicts.closed(p, free, std, float(index[i]), _partner(optimum, i), f"'{best}'", unit)
+            given = conditional.get(n, ())
+            judged = replace(judged, conditional_on=given)
+            if n in self.found:  # a member of a combination: its verdict stands, its interval is that of the set fitted
+                self.found[n] = replace(judged, verdict=self.found[n].verdict, reason=self.found[n].reason).noted(
+                    f"With {', '.join(given)} held it is {_lower(judged.reason)}" if given else ""
+                )
+            else:
+                self._judge(judged)
+
+    def _judge(self, verdict: Verdict) -> None:
+        self.found.setdefault(verdict.name, verdict)
+
+    def _without(self, optimum: Optimum, out: Mapping[str, str]) -> Optimum | None:
+        """The optimum with those held at their start values; None where nothing is left."""
+        if not out:
+            return optimum
+        self.held |= out
+        if len(out) == len(optimum.names):
+            return None
+        return optimum.held(out, {n: self.free[n].start for n in out})
+
+    # --- the end ---
+
+    def _assembled(
+        self, structure: Structure, first: Optimum, last: Optimum | None, result: FitResult
+    ) -> IdentifiabilityReport:
+        bound = {n for n, v in self.found.items() if v.verdict == "at-bound"}
+        fitted = tuple(n for n in self.free if last is not None and n in last.names and n not in bound)
+        held = {
+            n: (self.found[n].value, self.found[n].reason) if n in bound else (self.free[n].start, self.held[n])
+            for n in self.free
+            if n not in fitted
+        }
+        for n in self.free:
+            self.found[n] = replace(self.found[n], sensitivity_norm=self.norms.get(n))
+            if n in held:
+                self.found[n] = replace(self.found[n], value=held[n][0])
+            elif last is not None and not np.isfinite(self.found[n].value):
+                self.found[n] = replace(self.found[n], value=last.value(n))
+        different = (
+            heterogeneity(last) if last is not None and len(last.problem.fitted_experiments) > 1 else FrozenMap()
+        )
+        judged = misspecification(last, different, self.units) if last is not None else Misspecification(False, ())
+        matrix = first.information.matrix
+        collinear = collinear_subsets(matrix, first.names)[:200] if len(first.names) > 1 else ()
+        return IdentifiabilityReport(
+            FrozenMap({n: self.found[n] for n in self.free}),
+            fitted,
+            FrozenMap(held),
+            structure,
+            tuple(self.combinations),
+            collinear,
+            last.uncertainty.correlation() if last is not None else {},
+            first.information.shares(),
+            different,
+            judged,
+            self._recommended(last or first),
+            FrozenMap(self.thresholds),
+            {
+                "status": result.status,
+                "message": result.message,
+                "starts": len(result.starts),
+                "cost": first.cost,
+                "chi2_per_dof": first.misfit,
+                "effective_samples": dict(first.uncertainty.effective),
+                "noise_source": dict(result.noise_source),
+            },
+            tuple(self.notes),
+        )
+
+    def _recommended(self, at: Optimum) -> Recommendation | None:
+        """What to measure next, where the model's inputs are known."""
+        if self.model is None:
+            return None
+        self._tell("what to measure next")
+        values = {**{n: f.start for n, f in self.free.items()}, **at.problem.values(at.theta)}
+        theta = [values[n] for n in self.free] + [
+            u_value for u, u_value in zip(at.problem.names, at.theta, strict=True) if u not in self.free
+        ]
+        whole = Optimum(replace(self.problem, weights=at.problem.weights), np.array(theta, dtype=float))
+        inputs = {n: i.value for n, i in self.model.inputs.items()}
+        units = {**self.units, **{n: i.unit for n, i in self.model.inputs.items()}}
+        try:
+            return recommend(whole, inputs, units, thresholds=self.thresholds)
+        except SimulationError as error:
+            self.notes.append(f"What to measure next cannot be told: {error.what}.")
+            return None
+
+
+def thresholds(optimum: Optimum) -> dict[str, float]:
+    """The rise of the cost at the ends of each parameter's 95 % interval.
+
+    1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error add to the
+    variance in its direction (vertical scaling of an independence likelihood: Chandler and Bate 2007,
+    doi 10.1093/biomet/asm015): the larger of the AR(1) sandwich times the excess misfit and, where the misfit shows
+    model error, the sandwich over experiments with t(n - 1).
+    """
+    from scipy.stats import t
+
+    u = optimum.uncertainty
+    quantile = 0.5 * float(t.ppf(0.975, u.dof)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
+    raw, corrected = np.diag(u.raw), np.diag(u.corrected)
+    factor = np.where(raw > 0, corrected / np.where(raw > 0, raw, 1.0), 1.0) * optimum.excess
+    limits = quantile * np.maximum(factor, 1.0)
+    if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
+        covariance, dof = cluster_sandwich(optimum.blocks)
+        ratio = np.where(raw > 0, np.diag(covariance) / np.where(raw > 0, raw, 1.0), 0.0)
+        limits = np.maximum(limits, 0.5 * float(t.ppf(0.975, dof)) ** 2 * ratio)
+    return {n: float(v) for n, v in zip(optimum.names, limits, strict=False)}
+
+
+def _rise_at_ends(optimum: Optimum, i: int, free: Free) -> float | None:
+    """How much the cost rises at the worse end of the range, the others re-fitted; None where an end cannot be run."""
+    fixed = np.arange(optimum.theta.size) == i
+    rises = []
+    for end in free.drawn:
+        theta = optimum.theta.copy()
+        theta[i] = end
+        try:
+            rises.append(descend(LeastSquares.of(optimum.problem), theta, fixed, enough=1e-3).at.cost - optimum.cost)
+        except SimulationError:
+            return None
+    return max(*rises, 0.0)
+
+
+def _physical(problem: Problem) -> dict[str, tuple[bool, bool]]:
+    """By parameter whether its bounds are the model's own."""
+    own = problem.simulator.parameters
+    return {f.name: (f.min == own[f.name].min, f.max == own[f.name].max) for f in problem.free}
+
+
+def _bounded(p: Profile) -> bool:
+    """Whether the interval is known: both ends, or the one that a parameter on its bound has."""
+    return p.closed or (p.one_sided and "closed" in (p.lower.status, p.upper.status))
+
+
+def _partner(optimum: Optimum, i: int) -> str:
+    """The parameter whose column is most like the i-th."""
+    matrix = optimum.information.matrix
+    d = np.sqrt(np.diag(matrix))
+    cosines = np.abs(matrix[i] / np.where(d > 0, d * d[i], 1.0))
+    cosines[i] = -1.0
+    return optimum.names[int(np.argmax(cosines))] if len(optimum.names) > 1 else ""
+
+
+def _lower(text: str) -> str:
+    return text[3:] if text.startswith("It is ") is False else text[6:]

@@ -1,0 +1,135 @@
+"""The gated fit: only what the report calls identifiable is fitted, the rest is held, each with value and reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hvdc_ident.errors import unknown_name
+from hvdc_ident.fit import Estimate, FitResult, Problem
+from hvdc_ident.frozen import FrozenMap
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a report lets a fit do.
+
+    fitted: the parameters to fit, in the order of the candidates. held: value and reason of the others.
+    conditional_on: of a fitted one, those held without which it could not be told. forced: fitted against the report.
+    """
+
+    fitted: tuple[str, ...]
+    held: FrozenMap[tuple[float, str]]
+    conditional_on: FrozenMap[tuple[str, ...]]
+    forced: tuple[str, ...] = ()
+
+
+def gate(report: Mapping[str, Any], force: Sequence[str] = ()) -> Gate:
+    """The gate that a report, as its `to_dict` or its JSON, sets up; `force` names parameters to fit all the same.
+
+    Raises UnknownNameError for a forced name that is no candidate.
+    """
+    parameters = report["parameters"]
+    for name in force:
+        if name not in parameters:
+            raise unknown_name("candidate", name, parameters, where="--force")
+    open_set = set(report["identifiable"])
+    forced = tuple(n for n in parameters if n in force and n not in open_set)
+    fitted = tuple(n for n in parameters if n in open_set or n in forced)
+    held = {n: (float(h["value"]), _why(n, report)) for n, h in report["held"].items() if n not in fitted}
+    given = {n: tuple(c for c in parameters[n]["conditional_on"] if c in held) for n in fitted}
+    return Gate(fitted, FrozenMap(held), FrozenMap({n: c for n, c in given.items() if c}), forced)
+
+
+def _why(name: str, report: Mapping[str, Any]) -> str:
+    line, held = report["parameters"][name], report["held"][name]
+    unit = f" {line['unit']}" if line.get("unit") else ""
+    return f"{line['verdict']}, held at {held['value']:.6g}{unit}: {held['reason']}"
+
+
+def gated(problem: Problem, through: Gate) -> Problem:
+    """The problem with only the fitted parameters free. Raises StudyError where none is left."""
+    return replace(
+        problem,
+        free=tuple(f for f in problem.free if f.name in through.fitted),
+        held=problem.held | {n: v for n, (v, _) in through.held.items()},
+        why=problem.why | {n: why for n, (_, why) in through.held.items()},
+        conditional_on=problem.conditional_on | through.conditional_on,
+    )
+
+
+def gated_fit(
+    problem: Problem,
+    report: Mapping[str, Any],
+    fit: Callable[[Problem], FitResult],
+    *,
+    force: Sequence[str] = (),
+) -> FitResult:
+    """The fit of the identifiable set, its estimates as the report allows them to be stated.
+
+    report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak parameters get the profile's interval
+    and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
+    Where nothing is left to fit the status is "failed" and the message says so.
+    """
+    through = gate(report, force)
+    if not through.fitted:
+        reasons = FrozenMap({n: why for n, (_, why) in through.held.items()})
+        values = FrozenMap({n: v for n, (v, _) in through.held.items()})
+        return FitResult(
+            "failed",
+            "no candidate can be estimated from these data; every one is held, with its reason",
+            (),
+            reasons,
+            values,
+            estimates=_at_bound(report, through),
+        )
+    result = fit(gated(problem, through))
+    if result.status == "failed":
+        return result
+    estimates = {n: _stated(n, e, report, through) for n, e in result.estimates.items()}
+    ordered = {n: {**estimates, **_at_bound(report, through)}.get(n) for n in report["parameters"]}
+    return replace(result, estimates=FrozenMap({n: e for n, e in ordered.items() if e is not None}))
+
+
+def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate) -> Estimate:
+    """An estimate in the form its verdict allows."""
+    line = report["parameters"][name]
+    if name in through.forced:
+        return replace(e, reason=f"forced, against the report: {line['verdict']}. {line['reason']}")
+    interval = _interval(line)
+    weak = line["verdict"] == "weak" or (line.get("std") is None)
+    other_set = bool(through.forced)
+    if interval is None or (other_set and not weak):
+        return replace(e, std=None, std_raw=None) if weak else e
+    if not interval[0] <= e.value <= interval[1]:
+        return (
+            replace(e, std=None, std_raw=None, ci95=None, method="none", reason="the fit and the pilot fit disagree")
+            if weak
+            else e
+        )
+    if not weak:
+        return replace(e, std=line["std"], ci95=interval, method="profile")
+    note = "; its interval is of the set without the forced ones" if other_set else ""
+    return replace(e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"weak: {line['reason']}{note}")
+
+
+def _interval(line: Mapping[str, Any]) -> tuple[float, float] | None:
+    ci = line.get("ci95")
+    return (float(ci[0]), float(ci[1])) if ci and ci[0] is not None and ci[1] is not None else None
+
+
+def _at_bound(report: Mapping[str, Any], through: Gate) -> FrozenMap[Estimate]:
+    """The held ones that stand on a bound, with their one-sided limit."""
+    found = {}
+    for n, line in report["parameters"].items():
+        if line["verdict"] == "at-bound" and n in through.held:
+            found[n] = Estimate(
+                float(line["value"]),
+                None,
+                _interval(line),
+                "one-sided",
+                unit=line.get("unit", ""),
+                reason=line["reason"],
+            )
+    return FrozenMap(found)

@@ -1,0 +1,159 @@
+"""The pilot fit: the optimum at which the verdicts stand, and what is known there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hvdc_ident.errors import FitError, SimulationError
+from hvdc_ident.fit import Problem, fit
+from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.noise import GIVEN, MISFIT, source_of
+from hvdc_ident.fit.nuisance import unknown_of
+from hvdc_ident.fit.objective import LeastSquares, descend
+from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.sensitivity.fisher import Information
+from hvdc_ident.trajectory import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """A problem at its optimum theta, (p,), each unknown in its unit."""
+
+    problem: Problem
+    theta: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The free parameters, without the nuisances."""
+        return tuple(f.name for f in self.problem.free)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Residuals and derivatives there."""
+        return self.problem.blocks(self.theta)
+
+    @cached_property
+    def cost(self) -> float:
+        """Half the sum of squared residuals."""
+        return sum(0.5 * float(b.residual @ b.residual) for b in self.blocks)
+
+    @cached_property
+    def slope(self) -> Array:
+        """(p,): length of a scaled coordinate's unit: the value where a parameter is positive, else the range."""
+        rows = [v if u.min > 0 else u.span for u, v in zip(self.problem.unknowns, self.theta, strict=True)]
+        return np.array(rows, dtype=float)
+
+    @cached_property
+    def columns(self) -> Array:
+        """(n, p): whitened sensitivities in scaled coordinates, nuisances last."""
+        return np.vstack([b.jacobian for b in self.blocks]) * self.slope
+
+    @cached_property
+    def information(self) -> Information:
+        """On the parameters, the nuisances of each experiment marginalised."""
+        from hvdc_ident.sensitivity.fisher import marginal
+
+        k = len(self.problem.free)
+        matrices: dict[str, Array] = {}
+        for b in self.blocks:
+            scaled = b.jacobian * self.slope
+            matrices[b.experiment] = matrices.get(b.experiment, 0.0) + scaled.T @ scaled
+        kept = {e: marginal(f, range(k)) if f.shape[0] > k else f for e, f in matrices.items()}
+        return Information(self.names, FrozenMap(kept))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """What the curvature says, corrected for correlated samples."""
+        source = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
+        spans = np.array([u.span for u in self.problem.unknowns])
+        return uncertainty(self.blocks, self.problem.names, spans, source)
+
+    @property
+    def deterministic(self) -> tuple[str, ...]:
+        """Outputs whose standard deviation is the misfit's, for their records have no noise."""
+        experiments = self.problem.fitted_experiments
+        return tuple(o for o in self.problem.outputs if source_of(experiments, o) == MISFIT)
+
+    @cached_property
+    def misfit(self) -> float:
+        """Mean squared residual per degree of freedom: 1 where the model explains the data down to given noise."""
+        n = sum(b.residual.size for b in self.blocks)
+        return 2.0 * self.cost / max(n - self.theta.size, 1)
+
+    @property
+    def excess(self) -> float:
+        """The same where it is more than chance allows with so many independent samples, else 1; 1 without noise."""
+        effective = max(sum(self.uncertainty.effective.values()), 1.0)
+        given = all(source_of(self.problem.fitted_experiments, o) == GIVEN for o in self.problem.outputs)
+        return self.misfit if given and self.misfit > 1.0 + 4.0 * np.sqrt(2.0 / effective) else 1.0
+
+    def value(self, name: str) -> float:
+        """The value of an unknown, in its unit."""
+        return float(self.theta[self.problem.names.index(name)])
+
+    def held(self, why: Mapping[str, str], values: Mapping[str, float]) -> Optimum:
+        """The optimum with some parameters held at given values, found from this one.
+
+        Raises FitError where the rest cannot be simulated there, or nothing is left to fit.
+        """
+        left = tuple(f for f in self.problem.free if f.name not in why)
+        fewer = replace(self.problem, free=left, held=self.problem.held | values, why=self.problem.why | why)
+        theta = np.array([v for n, v in zip(self.problem.names, self.theta, strict=True) if n not in why])
+        try:
+            end = descend(LeastSquares.of(fewer), theta, np.zeros(theta.size, dtype=bool), enough=1e-6)
+        except SimulationError as error:
+            text = ", ".join(f"{n} = {values[n]:g}" for n in why)
+            raise FitError(f"the model cannot be run with {text}: {error}", hint="another start for them") from None
+        return Optimum(fewer, end.theta)
+
+
+def pilot(
+    problem: Problem,
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> tuple[Optimum, FitResult]:
+    """The best optimum of a multistart over the whole set of unknowns, with the weights of the misfit where needed.
+
+    Raises SimulationError, with the experiment's name, where no start could be simulated.
+    """
+    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress)
+    if result.status == "failed":
+        raise SimulationError(
+            f"identifiability cannot be told: {result.message}",
+            where=", ".join(failing(problem)) or "pilot fit",
+            hint="other starts or bounds, or leave that experiment out",
+        )
+    weights = {
+        o: next(s[o] for s in result.sigma.values() if o in s)
+        for o, source in result.noise_source.items()
+        if source != GIVEN
+    }
+    weighted = problem.with_(weights={**problem.weights, **weights})
+    theta = [result.values[f.name] for f in problem.free]
+    theta += [result.nuisance[e.name][n].value for e in problem.fitted_experiments for n in e.nuisance]
+    assert len(theta) == len(weighted.names)
+    return Optimum(weighted, np.array(theta, dtype=float)), result
+
+
+def failing(problem: Problem) -> Sequence[str]:
+    """The experiments that cannot be simulated at the start values."""
+    found = []
+    for e in problem.fitted_experiments:
+        try:
+            problem.with_(experiments=[e]).cost(problem.with_(experiments=[e]).start)
+        except SimulationError:
+            found.append(f"experiment '{e.name}'")
+    return found
+
+
+__all__ = ["Optimum", "failing", "pilot", "unknown_of"]

@@ -1,0 +1,126 @@
+"""The report on identifiability, frozen; `to_dict` is its JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.fit.profile import Profile
+from hvdc_ident.fit.result import plain
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.identifiability.combinations import Combination
+from hvdc_ident.identifiability.heterogeneity import Heterogeneity, Misspecification
+from hvdc_ident.identifiability.recommend import Recommendation
+from hvdc_ident.identifiability.structure import Structure
+from hvdc_ident.identifiability.verdicts import Verdict
+from hvdc_ident.sensitivity.fisher import Collinear
+
+CONDITIONS = (
+    "Every verdict holds for these outputs, experiments, noise and bounds, at the optimum of the pilot fit; with other "
+    "data it may be another."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiabilityReport:
+    """What the experiments tell about the candidates.
+
+    parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
+    reason of each other one. combinations: what is seen of those that cannot be told apart. collinear: subsets with
+    their index, worst first within each size. shares: of each parameter's information, by experiment.
+    notes: remarks on the data and on what the search met.
+    """
+
+    parameters: FrozenMap[Verdict]
+    identifiable: tuple[str, ...]
+    held: FrozenMap[tuple[float, str]]
+    structure: Structure
+    combinations: tuple[Combination, ...] = ()
+    collinear: tuple[Collinear, ...] = ()
+    correlation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    shares: FrozenMap[FrozenMap[float]] = field(default_factory=FrozenMap)
+    heterogeneity: FrozenMap[Heterogeneity] = field(default_factory=FrozenMap)
+    misspecification: Misspecification = field(default_factory=lambda: Misspecification(False, ()))
+    recommended: Recommendation | None = None
+    thresholds: FrozenMap[float] = field(default_factory=FrozenMap)
+    pilot: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def conditional_on(self) -> dict[str, tuple[str, ...]]:
+        """For each fitted one the held ones without which it could not be told."""
+        return {n: v.conditional_on for n, v in self.parameters.items() if v.conditional_on and n in self.identifiable}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON takes it: full precision, None for what is not finite."""
+        s = self.structure
+        found = {
+            "parameters": {n: _verdict(v) for n, v in self.parameters.items()},
+            "identifiable": list(self.identifiable),
+            "held": {n: {"value": v, "reason": why} for n, (v, why) in self.held.items()},
+            "combinations": [
+                {
+                    "members": list(c.members),
+                    "seen": list(c.seen),
+                    "words": c.words,
+                    "kind": c.kind,
+                    "direction": dict(c.direction),
+                    "held": list(c.held),
+                }
+                for c in self.combinations
+            ],
+            "collinearity": [{"parameters": list(c.names), "index": c.index} for c in self.collinear],
+            "correlation": self.correlation,
+            "structural": {
+                "status": s.status,
+                "method": s.method,
+                "unidentifiable": list(s.unidentifiable),
+                "admissible": list(s.admissible),
+                "note": s.note,
+            },
+            "misspecified": self.misspecification.flag,
+            "misspecification": {
+                "signs": list(self.misspecification.signs),
+                "next": self.misspecification.pointer,
+                "heterogeneity": {n: plain(h) for n, h in self.heterogeneity.items()},
+            },
+            "experiments": {e: {"information": dict(t)} for e, t in self.shares.items()},
+            "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
+            "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
+            "pilot": self.pilot,
+            "notes": [*self.notes, CONDITIONS],
+        }
+        return {k: plain(v) for k, v in found.items()}
+
+
+def _verdict(v: Verdict) -> dict[str, Any]:
+    return {
+        "verdict": v.verdict,
+        "reason": v.reason,
+        "value": v.value,
+        "unit": v.unit,
+        "ci95": v.ci95,
+        "std": v.std,
+        "relative_std": v.relative_std,
+        "sensitivity_norm": v.sensitivity_norm,
+        "collinearity": v.collinearity,
+        "partner": v.partner,
+        "conditional_on": v.conditional_on,
+    }
+
+
+def _profile(p: Profile) -> dict[str, Any]:
+    sides = {
+        n: {"status": s.status, "limit": s.limit, "reason": s.reason}
+        for n, s in (("lower", p.lower), ("upper", p.upper))
+    }
+    return {
+        "values": np.asarray(p.values),
+        "rises": np.asarray(p.rises),
+        "threshold": p.threshold,
+        "one_sided": p.one_sided,
+        **sides,
+    }

@@ -1,0 +1,134 @@
+"""The verdict on each parameter, with one sentence of reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from hvdc_ident.fit.profile import Profile
+from hvdc_ident.fit.unknown import Free
+
+VerdictName = Literal[
+    "structurally-unidentifiable", "insensitive", "practically-unidentifiable", "weak", "at-bound", "identifiable"
+]
+WIDE = 0.5
+"""A half-width of more than this share of the value (of the range where 0 is admissible) makes a parameter weak."""
+COLLINEAR = 20.0
+"""A standard deviation that the other parameters make so many times larger makes it weak; half of that is worded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What can be said about one parameter, numbers in `unit`.
+
+    value: at the optimum; of a held one, what it is held at. ci95: from the profile; an end that is None is not known.
+    std, relative_std: only of identifiable ones. sensitivity_norm: of its whitened, scaled column. collinearity: by how
+    much the others widen its standard deviation. partner: the one most collinear with it. conditional_on: parameters
+    held without which it could not be told. profile: the evidence.
+    """
+
+    name: str
+    verdict: VerdictName
+    reason: str
+    value: float
+    unit: str = ""
+    ci95: tuple[float | None, float | None] | None = None
+    std: float | None = None
+    relative_std: float | None = None
+    sensitivity_norm: float | None = None
+    collinearity: float | None = None
+    partner: str = ""
+    conditional_on: tuple[str, ...] = ()
+    profile: Profile | None = None
+
+    def noted(self, *notes: str) -> Verdict:
+        """The verdict with remarks added to its reason."""
+        return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
+
+
+def structural(name: str, words: str, held_at: float | None, unit: str, conditional_on: Sequence[str] = ()) -> Verdict:
+    """Only a combination shows, whatever the data. held_at: its start value where it is one of those held."""
+    text = f"Whatever the data, {words}"
+    if held_at is not None:
+        text += f": it is held at {_with_unit(held_at, unit)}."
+        return Verdict(name, "structurally-unidentifiable", text, held_at, unit)
+    text += f": what is found holds for {', '.join(conditional_on)} as held." if conditional_on else "."
+    return Verdict(name, "structurally-unidentifiable", text, float("nan"), unit, conditional_on=tuple(conditional_on))
+
+
+def insensitive(free: Free, rise: float, threshold: float, unit: str, quiet: bool) -> Verdict:
+    """Its whole range moves the outputs by less than noise may. rise: of the cost at the worse end. quiet: no input moves."""
+    span = f"Anywhere between {free.min:.4g} and {_with_unit(free.max, unit)}"
+    told = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
+    why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
+    also = " No input moves in any of these experiments." if quiet else ""
+    return Verdict(free.name, "insensitive", f"{span} {told}{why}.{also}", free.start, unit)
+
+
+def practical(profile: Profile, words: str, unit: str) -> Verdict:
+    """Its profile is open inside the bounds. words: the combination it belongs to, if any."""
+    parts = []
+    if profile.lower.status != "closed":
+        parts.append(f"from below ({profile.lower.reason})")
+    if profile.upper.status != "closed":
+        parts.append(f"from above ({profile.upper.reason})")
+    text = f"These data do not bound it {' nor '.join(parts)}." + (f" Of these data {words}." if words else "")
+    return Verdict(profile.name, "practically-unidentifiable", text, profile.value, unit, profile.ci95, profile=profile)
+
+
+def lost(name: str, words: str, value: float, unit: str) -> Verdict:
+    """Its sensitivity is that of the others together: in these data only a combination shows."""
+    return Verdict(name, "practically-unidentifiable", f"In these experiments {words}.", value, unit)
+
+
+def at_bound(profile: Profile, free: Free, physical: bool, unit: str) -> Verdict:
+    """Its optimum lies on a bound; the other end is its one-sided limit."""
+    low = profile.value <= free.min
+    limit = profile.upper.limit if low else profile.lower.limit
+    ci = (profile.value, limit) if low else (limit, profile.value)
+    assert limit is not None
+    side = "lower" if low else "upper"
+    kind = "physical" if physical else "search"
+    beyond = "" if physical else "; the optimum may lie beyond it, so widen the bounds"
+    text = (
+        f"The best value is its {side} {kind} bound {_with_unit(profile.value, unit)}{beyond}; with 95 % confidence it is "
+        f"{'below' if low else 'above'} {_with_unit(limit, unit)}."
+    )
+    return Verdict(profile.name, "at-bound", text, profile.value, unit, ci, profile=profile)
+
+
+def closed(
+    profile: Profile, free: Free, std: float | None, collinearity: float, partner: str, best: str, unit: str
+) -> Verdict:
+    """Weak or identifiable: its interval is known. std: in its unit. best: the experiment that tells most about it."""
+    low, high = profile.ci95
+    assert low is not None and high is not None
+    half = 0.5 * (high - low)
+    share, of = (half / abs(profile.value), "of its value") if free.min > 0 else (half / free.span, "of its range")
+    common = {"collinearity": collinearity, "partner": partner, "profile": profile}
+    span = f"{low:.4g} … {_with_unit(high, unit)}"
+    if share > WIDE or collinearity > COLLINEAR:
+        told = f"It is known only to lie in {span}, ±{100 * share:.3g} % {of}"
+        if collinearity > COLLINEAR:
+            told += f", and {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
+        return Verdict(profile.name, "weak", f"{told}.", profile.value, unit, (low, high), **common)  # type: ignore[arg-type]
+    text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
+    if collinearity > 0.5 * COLLINEAR:
+        text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
+    relative = std / abs(profile.value) if std is not None and profile.value else None
+    return Verdict(
+        profile.name,
+        "identifiable",
+        f"{text}.",
+        profile.value,
+        unit,
+        (low, high),
+        std,
+        relative,
+        **common,  # type: ignore[arg-type]
+    )
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{value:.4g} {unit}".rstrip()

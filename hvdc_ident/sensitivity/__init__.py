@@ -1,0 +1,1 @@
+"""Derivatives and ranks: sweeps, structural identifiability, information; no optimiser."""
