@@ -11,7 +11,7 @@ from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.delays import Channel, DelayFree, channels
-from hvdc_ident.linearize.limits import in_use, structure_roots
+from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
 from hvdc_ident.linearize.pade import pade
@@ -56,6 +56,7 @@ def linearize(
     jac = s.jacobian(y, w, p, modes)[: s.layout.main]
     if not np.isfinite(jac).all():
         raise _not_finite(s, jac, model.name)
+    _refuse_flat_roots(s, y, w, p, modes, model.name)
     parts = _Parts(s, channels(model, s, p), pade_order)
     reduced = eliminate(parts.matrix(jac), parts.rows, parts.columns)
     keep = descriptor or reduced.condition > WELL_POSED
@@ -68,6 +69,24 @@ def linearize(
         )
     gradient = _gradient(s, at, parts, jac, modes, reduced, sensitivities, chosen) if sensitivities and not keep else {}
     return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side)
+
+
+def _refuse_flat_roots(s: System, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
+    """Raises where a square root in use stands at 0 and moves: its slope is infinite there."""
+    flat = s.flat_roots(y, w, p, modes)
+    if not flat:
+        return
+    g = s.structure.graph
+    used = nodes_in_use(s.structure, structure_roots(s.structure), modes > 0.5)
+    for n in set(flat) & used:
+        inner = nodes_in_use(s.structure, [g.nodes[n][1]], modes > 0.5)
+        if any(g.nodes[k][0] == "leaf" and g.nodes[k][1] != "p" for k in inner):
+            names = [name for name, k in s.structure.nodes.items() if k == n]
+            raise LinearizationError(
+                f"the square root{f' of {names[0]!r}' if names else ''} stands at 0, where its slope is infinite",
+                where=f"model '{model}'",
+                hint="move an input a little",
+            )
 
 
 def one_sided(model: Model, point: OperatingPoint, **options: object) -> tuple[LinearModel, LinearModel]:

@@ -180,6 +180,16 @@ def structure_roots(structure: Structure) -> list[int]:
 
 def in_use(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
     """The switches that decide a branch which the roots' values come from; negative: the switches' modes."""
+    return _walk(structure, roots, negative)[1]
+
+
+def nodes_in_use(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
+    """The nodes which the roots' values come from, branches that are switched off left out."""
+    return _walk(structure, roots, negative)[0]
+
+
+def _walk(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) -> tuple[frozenset[int], frozenset[int]]:
+    """(nodes, switches) in use."""
     nodes = structure.graph.nodes
     used: set[int] = set()
 
@@ -205,4 +215,4 @@ def in_use(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) 
             stack.append(key[2] if holds(key[1]) else key[3])
         elif key[0] not in ("const", "leaf", "bool", "switch"):
             stack.extend(key[1:])
-    return frozenset(used)
+    return frozenset(seen), frozenset(used)

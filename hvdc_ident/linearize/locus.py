@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -104,11 +104,22 @@ class _Along:
     """The state matrix at a value of the parameter, each search starting from the one before."""
 
     def __init__(self, model: Model, parameter: str, fixed: dict[str, float]) -> None:
-        self.model, self.parameter, self.fixed = model, parameter, fixed
+        self.model, self.parameter = model, parameter
         self.guess: Array | None = None
+        start = {parameter: (model.parameters | model.inputs)[parameter].value}  # type: ignore[operator]
+        self._search = Search.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
+        self._place = names.index(parameter)
+
+    def _at(self, value: float) -> Search:
+        """The search at a value: nothing else in it changes but the guesses that stand on parameters."""
+        key = "p" if self.parameter in self.model.parameters else "u"
+        values = getattr(self._search, key).copy()
+        values[self._place] = value
+        return replace(self._search, **{key: values})
 
     def matrix(self, value: float) -> Array:
-        search = Search.of(self.model, {**self.fixed, self.parameter: value}, (), {}, at="steady", moving=(), time=0.0)
+        search = self._at(value)
         point = None
         if self.guess is not None:
             with np.errstate(all="ignore"):
@@ -124,10 +135,6 @@ class _Along:
             self.guess = np.concatenate([point.y, [*point.extras.values()]])
         found = linearize(self.model, point, inputs=(), outputs=tuple(self.model.outputs))
         return found.standard()[0] if found.is_descriptor else found.A
-
-    def rightmost(self, value: float) -> complex:
-        values = np.linalg.eigvals(self.matrix(value))
-        return complex(values[np.argmax(values.real)])
 
 
 def match(before: Array, left: Array, after: Array, right: Array) -> Array:

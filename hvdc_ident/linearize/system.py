@@ -94,6 +94,8 @@ class System:
         self._by_yw = self._entries()
         by_p = [(i * size.np + j, d) for i, v in enumerate(self.nodes) for j, d in s.partial(v, "p").items()]
         switches = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
+        reached = g.reachable(self.nodes)
+        self.roots = [(n, g.nodes[n][1]) for n in reached if g.nodes[n][0] in ("sqrt", "sqrt0")]
         timing = [(i * size.np + j, d) for i, v in enumerate(s.timing) for j, d in s.partial(v, "p").items()]
         functions = [
             Function("timing_p", timing),
@@ -103,6 +105,7 @@ class System:
             Function("modes", list(enumerate(switches)), live=True),
             Function("switches", list(enumerate(g.switches)), live=True),
             Function("timing", list(enumerate(s.timing))),
+            Function("roots", [(k, a) for k, (_, a) in enumerate(self.roots)]),
         ]
         self._code = Code(g, functions, 1)
         self._call = {f.name: _SIGNATURE(self._code.address[f.name]) for f in functions}
@@ -116,6 +119,11 @@ class System:
         return out[:length]
 
     # --- values and derivatives ---
+
+    def flat_roots(self, y: Array, w: Array, p: Array, m: Array) -> list[int]:
+        """The square roots whose argument is 0 at the point, where they have no slope."""
+        at = self._run("roots", len(self.roots), y, w, p, m)
+        return [n for (n, _), value in zip(self.roots, at, strict=True) if value == 0.0]
 
     def modes(self, y: Array, w: Array, p: Array) -> Array:
         """One number a switch: 1 where the switch is negative at the point, else 0."""

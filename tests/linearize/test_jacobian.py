@@ -191,11 +191,25 @@ def test_outputs_may_be_signals():
     np.testing.assert_allclose(found.response([0.0])[0, 0, 0].real, 0.0, atol=1e-9)
 
 
-def test_a_root_without_slope_is_refused():
+@pytest.mark.parametrize(
+    ("text", "why"), [("x**0.3 - x", "not finite"), ("sqrt(x**2 + u**2) - x", "slope is infinite")]
+)
+def test_a_root_without_slope_is_refused(text, why):
     model = Model(
         name="root",
-        states=FrozenMap({"x": State(parse("x**0.3 - x"))}),
+        inputs=FrozenMap({"u": Input(0.0)}),
+        states=FrozenMap({"x": State(parse(text))}),
         outputs=FrozenMap({"x": Output(parse("x"))}),
     )
-    with pytest.raises(LinearizationError, match="not finite"):
+    with pytest.raises(LinearizationError, match=why):
         linearize(model, point_at(model, {"x": 0.0}))
+
+
+def test_a_root_that_is_cut_at_zero_has_the_slope_zero():
+    model = Model(
+        name="cut",
+        inputs=FrozenMap({"u": Input(2.0)}),
+        states=FrozenMap({"x": State(parse("sqrt(max(0, 1 - u)) - x"), guess=0.0)}),
+        outputs=FrozenMap({"x": Output(parse("x"))}),
+    )
+    np.testing.assert_array_equal(linearize(model).B, [[0.0]])
