@@ -62,11 +62,23 @@ class Sparse:
         self._products: dict[int, int] = {}
         self.equations: list[int] = []
         self.fixed = {self._variable(n) for n in known if self.source.nodes[n][0] == "leaf"}
-        for z in zeros:
-            self.equations.append(self._fraction(z)[0])
+        same = [self._same(z) for z in zeros]  # all before any expression is read
+        for z, alike in zip(zeros, same, strict=True):
+            if alike:
+                self._fraction(self.source.nodes[z][1])
+            else:
+                self.equations.append(self._fraction(z)[0])
         self.equations = [self._with_products(e) for e in self.equations]
         self.fixed |= set(self.constants)
         self._slopes: dict[int, dict[int, int]] = {e: self.graph.gradient(e) for e in self.equations}
+
+    def _same(self, zero: int) -> bool:
+        """Whether an equation only says that an unknown is a signal: then both are one variable from here on."""
+        op, *a = self.source.nodes[zero]
+        if op != "sub" or a[0] not in self.signals or a[1] in self.leaf_of or self.source.nodes[a[1]][:2] != ("leaf", "y"):
+            return False
+        self.leaf_of[a[1]] = self._variable(a[0])
+        return True
 
     def _variable(self, node: int) -> int:
         if node not in self.leaf_of:
@@ -146,10 +158,11 @@ class Sparse:
         return 2 if variable not in self.graph.reachable([second]) else 3
 
 
-def plan(s: Sparse, drawable: set[int], first: set[int]) -> list[Step]:
+def plan(s: Sparse, drawable: set[int], first: set[int], random: Random | None = None) -> list[Step]:
     """Steps that give every variable a value; NotRational where this simple way does not lead through.
 
     drawable: variables that may be random. first: those that are drawn before anything is solved.
+    random: makes another plan where there are several, for one may lead to a branch that another avoids.
     """
     steps: list[Step] = [Draw(v) for v in sorted(first)]
     last: list[Step] = []
@@ -158,7 +171,7 @@ def plan(s: Sparse, drawable: set[int], first: set[int]) -> list[Step]:
         done = _forward(s, left, known, steps)
         if not left or done or _peel(s, left, known, last):
             continue
-        _tear(s, left, known, steps, drawable)
+        _tear(s, left, known, steps, drawable, random)
     unknown = {v for e in s.equations for v in s.variables(e)} - known - {x.variable for x in last}
     return [*steps, *(Draw(v) for v in sorted(unknown)), *reversed(last)]
 
@@ -192,7 +205,7 @@ def _peel(s: Sparse, left: list[int], known: set[int], last: list[Step]) -> bool
     return False
 
 
-def _tear(s: Sparse, left: list[int], known: set[int], steps: list[Step], drawable: set[int]) -> None:
+def _tear(s: Sparse, left: list[int], known: set[int], steps: list[Step], drawable: set[int], random: Random | None) -> None:
     counts: dict[int, int] = {}
     for e in left:
         for v in s.variables(e) - known:
@@ -201,6 +214,8 @@ def _tear(s: Sparse, left: list[int], known: set[int], steps: list[Step], drawab
         raise NotRational("the start is overdetermined")
     surplus = len(counts) > len(left)
     order = sorted(counts, key=lambda v: (-counts[v], v))
+    if random is not None:
+        random.shuffle(order)
     for v in order:
         inner: list[Step] = []
         tried, remaining = known | {v}, list(left)

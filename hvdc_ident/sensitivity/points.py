@@ -8,7 +8,7 @@ Computation 33 (2002) 735-755.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -107,27 +107,35 @@ def rows(question: Question, ring: Ring, base: Base, jump: Jump, random: Random,
         if ring.p and int(constraint[n][0, 0]) % ring.p:
             raise NoSuchNumber("the start does not hold")
         found.append(constraint[n][:, 1:])
-    for w in stretches(q, ring, base, random):
-        jumped = {k for k in range(len(w)) if w[k][0] != base.w[k]}
-        y = base.y
-        if q.move.residuals and (jumped or q.move is not q.rest):
-            y = [*base.y[:nx], *jump(base, [v[0] for v in w], jumped, random)]
+    for group in stretches(q):
+        y, w = _after(q, ring, base, jump, group, random)
         watch(q.move, y, w, q.order)
     reduced, pivots = ring.rref(np.concatenate(found))
     first = sum(c < nx for c in pivots)
     return Rows(ring, reduced[first:, nx:], tuple(c - nx for c in pivots[first:]), tuple(theta))
 
 
-def stretches(q: Question, ring: Ring, base: Base, random: Random) -> Iterator[list[list[Any]]]:
-    """The inputs' series: each moved input on its own, then all together."""
-    moves = {k: _move(kind, ring, base.w[k], random, q.order) for k, kind in q.moved}
-    groups = [[k] for k in moves] + ([list(moves)] if len(moves) > 1 else [])
-    for group in groups:
-        w = [moves[k] if k in group else [v] for k, v in enumerate(base.w)]
+def stretches(q: Question) -> list[dict[int, InputClass]]:
+    """The moves that are watched: each moved input on its own, then all together."""
+    groups: list[dict[int, InputClass]] = [{k: kind} for k, kind in q.moved]
+    return groups + ([dict(q.moved)] if len(groups) > 1 else [] if groups or q.move is q.rest else [{}])
+
+
+def _after(
+    q: Question, ring: Ring, base: Base, jump: Jump, group: Mapping[int, InputClass], random: Random
+) -> tuple[list[Any], list[list[Any]]]:
+    """The start and the inputs' series right after the inputs of a group have begun to move."""
+    for _ in range(JUMPS):
+        w = [_move(group[k], ring, v, random, q.order) if k in group else [v] for k, v in enumerate(base.w)]
         w[0] = [base.w[0], 1]
-        yield w
-    if not groups and q.move is not q.rest:
-        yield [[base.w[0], 1], *([v] for v in base.w[1:])]
+        jumped = {k for k in range(len(w)) if w[k][0] != base.w[k]}
+        if not (q.move.residuals and (jumped or q.move is not q.rest)):
+            return base.y, w
+        try:
+            return [*base.y[: len(q.rest.derivatives)], *jump(base, [v[0] for v in w], jumped, random)], w
+        except NoSuchNumber:
+            continue
+    raise NoSuchNumber("no jump was found")
 
 
 def _move(kind: InputClass, ring: Ring, level: Any, random: Random, order: int) -> list[Any]:
@@ -215,9 +223,13 @@ class FieldPoints:
             self._plans[key] = (s, plan(s, set(), set()))
         s, steps = self._plans[key]
         values = Values(s, self.ring, {v: given[n] for n, v in s.leaf_of.items() if n in given}, base.known, random)
-        values.take(steps)
-        if any(values.of.get(v) == 0 and n in base.nonzero for n, v in s.leaf_of.items()):
-            raise NoSuchNumber("a branch that does not join the start")
+        try:
+            values.take(steps)
+            if any(values.of.get(v) == 0 and n in base.nonzero for n, v in s.leaf_of.items()):
+                raise NoSuchNumber("a branch that does not join the start")
+        except NoSuchNumber:
+            self._plans[key] = (s, plan(s, set(), set(), random))
+            raise
         base.known.update(self._roots(s, values.of))
         unknowns = enumerate(self.leaves["y"][nx:])
         return [values.of[s.leaf_of[n]] if k in unknown else base.y[nx + k] for k, n in unknowns]
