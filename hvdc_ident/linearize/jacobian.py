@@ -71,6 +71,25 @@ def linearize(
     return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side)
 
 
+def state_matrix(model: Model, s: System, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
+    """A alone at a point given by its vectors: what `linearize` gives, without the rest. Raises as it does."""
+    modes = modes_at(s, y, w, p, "refuse")
+    jac = s.jacobian(y, w, p, modes)[: s.layout.main]
+    if not np.isfinite(jac).all():
+        raise _not_finite(s, jac, model.name)
+    _refuse_flat_roots(s, y, w, p, modes, model.name)
+    parts = _Parts(s, channels(model, s, p), pade_order)
+    reduced = eliminate(parts.matrix(jac), parts.rows, parts.columns)
+    if reduced.condition > WELL_POSED:
+        raise LinearizationError(
+            "the algebraic part is ill-conditioned",
+            where=f"model '{model.name}'",
+            got=f"condition number {reduced.condition:.2g}",
+            hint="use linearize(), which keeps it as a descriptor",
+        )
+    return np.asarray(reduced.result[: parts.n, : parts.n])
+
+
 def _refuse_flat_roots(s: System, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
     """Raises where a square root in use stands at 0 and moves: its slope is infinite there."""
     flat = s.flat_roots(y, w, p, modes)

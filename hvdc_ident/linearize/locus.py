@@ -11,10 +11,10 @@ from scipy.optimize import linear_sum_assignment
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.linearize.arrays import Array
-from hvdc_ident.linearize.jacobian import linearize
+from hvdc_ident.linearize.jacobian import state_matrix
 from hvdc_ident.linearize.modal import eigen
 from hvdc_ident.linearize.newton import newton
-from hvdc_ident.linearize.operating_point import point_of, solve
+from hvdc_ident.linearize.operating_point import solve
 from hvdc_ident.linearize.search import Search
 from hvdc_ident.model.definition import Model
 
@@ -119,22 +119,20 @@ class _Along:
         return replace(self._search, **{key: values})
 
     def matrix(self, value: float) -> Array:
+        """A at the value's own operating point, searched from the last one found."""
         search = self._at(value)
-        point = None
         if self.guess is not None:
             with np.errstate(all="ignore"):
                 root = newton(search.equations, self.guess, search.low, search.high)
             if root.found:
-                point = point_of(self.model, search, root, with_limits=False)
                 self.guess = root.v
-        if point is None:
-            try:
-                point = solve(self.model, search)
-            except SteadyStateError as e:
-                raise e.at(f"{self.parameter} = {value:g}") from None
-            self.guess = np.concatenate([point.y, [*point.extras.values()]])
-        found = linearize(self.model, point, inputs=(), outputs=tuple(self.model.outputs))
-        return found.standard()[0] if found.is_descriptor else found.A
+                return state_matrix(self.model, search.system, *search.vectors(root.v))
+        try:
+            point = solve(self.model, search)
+        except SteadyStateError as e:
+            raise e.at(f"{self.parameter} = {value:g}") from None
+        self.guess = np.concatenate([point.y, [*point.extras.values()]])
+        return state_matrix(self.model, search.system, point.y, point.w, point.p)
 
 
 def match(before: Array, left: Array, after: Array, right: Array) -> Array:

@@ -145,8 +145,8 @@ def _not_found(model: Model, search: Search, root: Root) -> SteadyStateError:
     )
 
 
-def point_of(model: Model, search: Search, root: Root, with_limits: bool = True) -> OperatingPoint:
-    """The point of a solved search; without its limits where only the values matter, which is faster."""
+def point_of(model: Model, search: Search, root: Root) -> OperatingPoint:
+    """The point of a solved search."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
     values = s.values(y, w, p, s.modes(y, w, p))
@@ -163,7 +163,7 @@ def point_of(model: Model, search: Search, root: Root, with_limits: bool = True)
         FrozenMap(wanted),
         _named(s.parameters, p),
         float(root.shares.max(initial=0.0)),
-        limits(s.structure, s.conditions, s.switches(y, w, p)) if with_limits else (),
+        limits(s.structure, s.conditions, s.switches(y, w, p)),
         root.iterations,
         method,
         search.at,

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
     from hvdc_ident.study.study import Study
 
+MOST_DRAWN = 12
+"""Channels up to which the frequency response is written too, for the report to draw."""
+
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for."""
@@ -30,6 +33,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         "jacobian_error": jacobian_error(point.model, point, model.output_names),
         "jacobian_check": "complex step of 1e-30 through the equations, relative to each row's largest entry",
     }
+    if len(functions) <= MOST_DRAWN:
+        data["frequency_response"] = model.bode().to_dict()
     for key in ("schema", "kind", "model"):
         data.pop(key, None)
     return Outcome(data)
