@@ -144,7 +144,8 @@ def longer(array, count):  # type: ignore[no-untyped-def]
     if count < array.size:
         return array
     larger = np.empty(2 * array.size)
-    larger[:count] = array[:count]
+    for i in range(count):  # a slice would make the compiler carry its error texts
+        larger[i] = array[i]
     return larger
 
 
@@ -154,7 +155,9 @@ def deeper(array, count):  # type: ignore[no-untyped-def]
     if count < array.shape[0]:
         return array
     larger = np.empty((2 * array.shape[0], array.shape[1]))
-    larger[:count] = array[:count]
+    for i in range(count):
+        for j in range(array.shape[1]):
+            larger[i, j] = array[i, j]
     return larger
 
 
@@ -206,10 +209,10 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
     h_t, h_h, h_c = np.empty(64 if nd else 1), np.empty(64 if nd else 1), np.empty((64 if nd else 1, nd, NODES, 1 + width))
     node_values = np.zeros((NODES, nd, 1 + width))
     src, src_rate, src_left = np.zeros((nd + nq) * (1 + width) + 1), np.zeros(nd + nq + 1), np.zeros(nd + nq + 1)
-    tick, publish = np.full(nq, np.inf), np.full(nq, np.inf)
+    tick, publish = np.zeros(nq), np.zeros(nq)
     ticks, pending, pending_p, publish_p = np.zeros(nq), np.zeros(nq), np.zeros((nq, width)), np.zeros((nq, width))
     for i in range(nq):
-        tick[i] = start
+        tick[i], publish[i] = start, np.inf
     # Jumps and corners that reach the equations again through a delay: instant, order, rows of its derivative.
     echo_t, echo_o, echo_p, echoes = np.empty(16), np.empty(16), np.empty((16, width)), 0
 
@@ -321,7 +324,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         quiet = still and nd == 0  # only time itself changes within the segment
         forced = dims[10] > 0 or nd > 0 or not still
         if not forced:
-            ft[:] = 0.0
+            for q in range(size):
+                ft[q] = 0.0
         if ns:
             call(address[SW], y, yd, w, wd, p, m, sv)
             for i in range(ns):
@@ -527,7 +531,11 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 h_t, h_h = longer(h_t, count), longer(h_h, count)
                 if count >= h_c.shape[0]:
                     h_more = np.empty((2 * h_c.shape[0], nd, NODES, 1 + width))
-                    h_more[:count] = h_c
+                    for i in range(count):
+                        for j in range(nd):
+                            for r in range(NODES):
+                                for q in range(1 + width):
+                                    h_more[i, j, r, q] = h_c[i, j, r, q]
                     h_c = h_more
                 h_t[count] = t
                 h_h[count] = step_end - t
@@ -622,7 +630,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     jump_p[c] = echo_p[i, c]
             elif echo_t[i] > t:
                 echo_t[kept], echo_o[kept] = echo_t[i], echo_o[i]
-                echo_p[kept] = echo_p[i]
+                for c in range(width):
+                    echo_p[kept, c] = echo_p[i, c]
                 kept += 1
         echoes = kept
         if echo_now and width:
@@ -630,5 +639,6 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         while i_break < breaks.size and breaks[i_break] <= t:
             i_break += 1
         first = False
-    modes_out[:ns] = m[:ns]
+    for i in range(ns):
+        modes_out[i] = m[i]
     return CONVERGED, t

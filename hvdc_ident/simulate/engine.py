@@ -15,6 +15,7 @@ from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unk
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.machine import Code
 from hvdc_ident.simulate.result import Simulation, Statistics
 from hvdc_ident.simulate.structure import NAMES, Structure
 from hvdc_ident.trajectory import Array, Trajectory
@@ -46,6 +47,7 @@ class Engine:
         self.structure = Structure(model, sensitivities, outputs)
         s = self.structure.sizes
         self._code = self.structure.compile()
+        self._late: Code | None = None
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
         factors = self.structure.elimination.count if self.structure.elimination else 0
         self._dims = np.array(
@@ -172,6 +174,8 @@ class Engine:
         tol = tolerance
         kind = EXPLICIT if self._is_explicit(method, p, y, w, end - begin) else ROSENBROCK
         while True:
+            if kind == ROSENBROCK:
+                self._compile_late()
             counts, modes = np.zeros(6, dtype=np.int64), np.zeros(max(s.ns, 1))
             status, reached = integrate(
                 self._address, self._dims, self._hess_row, self._hess_column, kind, p, y.copy(), w.copy(), np.zeros_like(w), constants,
@@ -192,6 +196,13 @@ class Engine:
                 hint=HINTS[STATUS[status]],
             )
         return out, statistics
+
+    def _compile_late(self) -> None:
+        """Nothing; the code that only the Rosenbrock method needs is there."""
+        if self._late is None:
+            self._late = self.structure.compile_late()
+            for name, address in self._late.address.items():
+                self._address[NAMES.index(name)] = address
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """Whether the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""

@@ -46,6 +46,7 @@ NAMES = (
     "solve",
     "solves",
 )
+LATE = ("hess",)  # beside the elimination: what only the Rosenbrock method needs
 
 
 def torn(model: Model) -> tuple[str, ...]:
@@ -219,6 +220,7 @@ class Structure:
 
     # --- functions ---
 
+    @cached_property
     def functions(self) -> list[Function]:
         """All functions of `NAMES`, those without content left out."""
         s, g = self.sizes, self.graph
@@ -298,7 +300,11 @@ class Structure:
         return eliminate(constant, n, len(self.states)) if n else None
 
     def compile(self) -> Code:
-        """The machine code; keep it as long as its addresses are used."""
+        """The machine code that every run needs; keep it as long as its addresses are used."""
+        return Code(self.graph, [f for f in self.functions if f.name not in LATE], max(self.sizes.width, 1))
+
+    def compile_late(self) -> Code:
+        """What only the Rosenbrock method needs: second derivatives and elimination, most of the code of a large model."""
         e, width = self.elimination, self.sizes.width
         written: dict[str, Callable[[str], str]] = {}
         if e is not None:
@@ -306,7 +312,7 @@ class Structure:
             written["solve"] = lambda symbol: solve_text(e, symbol, 0)
             if width:
                 written["solves"] = lambda symbol: solve_text(e, symbol, width)
-        return Code(self.graph, self.functions(), max(width, 1), written)
+        return Code(self.graph, [f for f in self.functions if f.name in LATE], max(width, 1), written)
 
 
 def _ordered(definitions: dict[str, sp.Expr], model: str) -> list[str]:
