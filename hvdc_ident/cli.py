@@ -97,9 +97,10 @@ def _say(text: str, *, json: bool, quiet: bool) -> None:
 
 
 def _print_json(value: Any) -> None:
-    from hvdc_ident.files import json_text
+    from hvdc_ident.files import json_pieces
 
-    typer.echo(json_text(value), nl=False)
+    for piece in json_pieces(value):
+        typer.echo(piece, nl=False)
 
 
 @app.callback(invoke_without_command=True)

@@ -8,20 +8,40 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hvdc_ident.errors import InputError
 
 
-def write_text(path: Path, text: str) -> Path:
-    """The path, once the text is on the disk: a reader sees the old file or the new one, never a part."""
-    return write_bytes(path, text.encode("utf-8"))
+@dataclass(frozen=True)
+class Rows:
+    """A long list of a result that is made row by row whenever it is written, never held as a whole."""
+
+    make: Callable[[], Iterable[Any]]
+    count: int
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.make())
+
+    def __len__(self) -> int:
+        return self.count
+
+
+def write_text(path: Path, text: str | Iterable[str]) -> Path:
+    """The path, once the text, or its pieces, is on the disk: a reader sees the old file or the new one, no part."""
+    pieces = [text] if isinstance(text, str) else text
+    return _write(path, (piece.encode("utf-8") for piece in pieces))
 
 
 def write_bytes(path: Path, content: bytes) -> Path:
     """The path, once the bytes are on the disk: temporary file, fsync, rename."""
+    return _write(path, [content])
+
+
+def _write(path: Path, pieces: Iterable[bytes]) -> Path:
     make_folder(path.parent)
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
@@ -30,7 +50,8 @@ def write_bytes(path: Path, content: bytes) -> Path:
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+            for piece in pieces:
+                stream.write(piece)
             stream.flush()
             os.fsync(stream.fileno())
         temporary.chmod(0o666 & ~_umask())
@@ -59,7 +80,7 @@ def digest(content: bytes) -> str:
 
 def plain(value: Any) -> Any:
     """The value as JSON can hold it: mappings, lists, text, numbers; a number that is not finite becomes None."""
-    if value is None or isinstance(value, str | bool):
+    if value is None or isinstance(value, str | bool | Rows):
         return value
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
@@ -80,7 +101,37 @@ def plain(value: Any) -> Any:
 
 def json_text(value: Any) -> str:
     """JSON text with every digit of every number; what is not finite is written as null."""
-    return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return "".join(json_pieces(value))
+
+
+def json_pieces(value: Any) -> Iterator[str]:
+    """The same text in pieces, so that long `Rows` under a name of the outermost mapping are never held as a whole."""
+    value = plain(value)
+    if not (isinstance(value, dict) and any(isinstance(v, Rows) for v in value.values())):
+        yield _dumped(value, 1) + "\n"
+        return
+    opening = "{\n"
+    for name, item in value.items():
+        yield f"{opening} {_dumped(name)}: "
+        opening = ",\n"
+        if isinstance(item, Rows):
+            yield from _rows(item)
+        else:
+            yield _dumped(item, 1).replace("\n", "\n ")
+    yield "\n}\n"
+
+
+def _rows(rows: Rows) -> Iterator[str]:
+    """A JSON list, one row a line."""
+    opening = "[\n  "
+    for row in rows:
+        yield opening + _dumped(plain(row))
+        opening = ",\n  "
+    yield "[]" if opening.startswith("[") else "\n ]"
+
+
+def _dumped(value: Any, indent: int | None = None) -> str:
+    return json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 def _cannot_write(path: Path, error: OSError) -> InputError:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.files import digest, json_text, plain, write_text
+from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
+from hvdc_ident.study.store import exclusive, source_hash
 from hvdc_ident.study.study import Study
 
 SCHEMA = 1
@@ -38,10 +38,11 @@ def run_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
     Raises InputError, with nothing written, or ComputationError.
     """
     wanted = stage(name)
-    earlier: dict[str, Any] = {}
-    for before in wanted.after:
-        earlier[before] = _kept_or_run(study, stage(before), folder, options).data
-    return _run(study, wanted, folder, options, earlier)
+    with exclusive(folder):
+        earlier: dict[str, Any] = {}
+        for before in wanted.after:
+            earlier[before] = _kept_or_run(study, stage(before), folder, options).data
+        return _run(study, wanted, folder, options, earlier)
 
 
 def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
@@ -50,10 +51,11 @@ def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
     A stage that fails ends the run of those that build on it; the others run.
     """
     done: dict[str, Done] = {}
-    for wanted in (s for s in stages() if s.wanted(study)):
-        if any(done[b].failed for b in wanted.after if b in done):
-            continue
-        done[wanted.name] = _kept_or_run(study, wanted, folder, options)
+    with exclusive(folder):
+        for wanted in (s for s in stages() if s.wanted(study)):
+            if any(done[b].failed for b in wanted.after if b in done):
+                continue
+            done[wanted.name] = _kept_or_run(study, wanted, folder, options)
     return list(done.values())
 
 
@@ -73,7 +75,7 @@ def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options) ->
 
 def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any]) -> Done:
     try:
-        outcome = wanted.run(study, options, earlier)
+        outcome = wanted.run(study, replace(options, folder=folder), earlier)
     except ComputationError as e:
         outcome = Outcome({"status": "failed", "message": str(e)}, failed=str(e))
     heading = heading_of(study, options.seed)
@@ -81,7 +83,7 @@ def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: M
     data = plain({**heading, "stage": wanted.name, "fingerprint": mark, "files": list(outcome.files), **outcome.data})
     for name, text in outcome.files.items():
         write_text(folder / name, text)
-    write_text(folder / wanted.file, json_text(data))
+    write_text(folder / wanted.file, json_pieces(data))
     return Done(wanted, data, outcome.failed, fresh=True)
 
 
@@ -123,14 +125,6 @@ def _kept(study: Study, wanted: Stage, folder: Path, options: Options) -> dict[s
 
 def _mark(study: Study, wanted: Stage, options: Options) -> str:
     """A hash of all that decides a stage's result: the study, its files, the seed, this software."""
-    parts = [wanted.name, *(f"{n}={h}" for n, h in study.sources.items()), str(options.seed), version(), _code()]
+    parts = [wanted.name, *(f"{n}={h}" for n, h in study.sources.items()), str(options.seed), version(), source_hash()]
     parts += [f"{name}={getattr(options, name)}" for name in wanted.takes if getattr(options, name)]
     return digest("\n".join(parts).encode())
-
-
-@cache
-def _code() -> str:
-    """A hash of the package's own source: another state of it may find other numbers."""
-    root = Path(__file__).resolve().parents[1]
-    files = sorted(p for p in root.rglob("*.py"))
-    return digest("\n".join(f"{p.relative_to(root).as_posix()} {digest(p.read_bytes())}" for p in files).encode())

@@ -138,6 +138,9 @@ class Sweep(Table):
     max: FiniteFloat | None = None
     points: Annotated[int, Field(ge=2, le=1_000_000)] | None = None
     scale: Literal["linear", "log"] = "linear"
+    sampling: Literal["grid", "latin-hypercube"] = "grid"
+    against: Literal["data", "base"] | None = None
+    want: Annotated[list[Literal["rmse", "poles", "bode"]], Field(min_length=1)] = ["rmse"]
     values: Annotated[list[FiniteFloat], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
@@ -145,6 +148,8 @@ class Sweep(Table):
         spread = (self.min, self.max, self.points)
         if self.values is not None and any(v is not None for v in spread):
             raise ValueError("give either values or min, max and points")
+        if self.values is not None and self.sampling == "latin-hypercube":
+            raise ValueError("a Latin hypercube needs min, max and points, not values")
         if self.values is None:
             if self.min is None or self.max is None or self.points is None:
                 raise ValueError("min, max and points are needed, or values")

@@ -11,6 +11,7 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import unknown_name
@@ -30,13 +31,15 @@ def silent(done: int, total: int, text: str) -> None:
 class Options:
     """How stages run. workers: processes; seed: of every random number; progress: who is told.
 
-    force: candidates to fit whatever the verdict on them.
+    force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
+    None: nothing is kept.
     """
 
     workers: int = 1
     seed: int = 0
     progress: Progress = silent
     force: tuple[str, ...] = ()
+    folder: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -164,6 +164,11 @@ def _check_questions(study: Study, where: str) -> None:
     for line in s.sweep:
         _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
+    if s.sweep:
+        from hvdc_ident.study.sweeps import against_of, axes_of
+
+        axes_of(s.sweep, 0, f"{where}, sweep")
+        against_of(s.sweep, f"{where}, sweep")
     for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
         place = f"{where}, fit.groups number {number}"
         _all_known("candidate", group.parameters, study.candidates, f"{place}.parameters")

@@ -1,0 +1,346 @@
+"""The verb `sweep`: a model run at many points of its parameters, compared with data, another model or itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import ComputationError, InputError, StudyError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.sensitivity.axes import AxesLike, Points, points_of
+from hvdc_ident.sensitivity.point import PointTask, Reference, simulated
+from hvdc_ident.sensitivity.sweep_result import SweepResult
+from hvdc_ident.simulate.engine import Method, simulate
+from hvdc_ident.trajectory import Array
+
+Want = Literal["rmse", "poles", "bode"]
+Progress = Callable[[int, int, str], None]
+"""Called with points done, points in all, and a line of text."""
+CHUNK = 2048  # points looked up, queued or written at a time
+PROBE, WORTH = 0.3, 2.0  # s: points run here first; work left that is worth starting other processes for
+TOLD = 0.1  # s between two reports of progress
+
+
+class Ended(Protocol):
+    """What became of one item: its place among the items, and its value, or why it has none."""
+
+    @property
+    def index(self) -> int: ...
+    @property
+    def value(self) -> Any: ...
+    @property
+    def failure(self) -> str: ...
+
+
+class Runner(Protocol):
+    """Anything that runs a function over items and tells what became of each, in any order."""
+
+    def run(self, function: Callable[[Any], Any], items: Iterator[Any], /) -> Iterator[Ended]: ...
+
+
+class Kept(Protocol):
+    """Where finished points are kept: bytes by key."""
+
+    def get(self, keys: Sequence[bytes], /) -> Mapping[bytes, bytes]: ...
+    def put(self, key: bytes, value: bytes, /) -> None: ...
+
+
+@dataclass
+class _Table:
+    """The numbers as they come in; rows stand where their points stand."""
+
+    task: PointTask
+    points: Points
+    failed: dict[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, t = len(self.points), self.task
+        self.rmse = np.full((n, len(t.references)), np.nan)
+        self.poles = np.full((n, t.poles), np.nan, dtype=complex)
+        size = (t.omega.size, len(t.outputs), len(t.inputs)) if t.omega.size else (0, 0, 0)
+        self.response = np.full((n, *size), np.nan, dtype=complex)
+
+    def fill(self, index: int, packed: bytes) -> None:
+        found = self.task.unpacked(packed)
+        if isinstance(found, str):
+            self.failed[index] = found
+            return
+        self.rmse[index], self.poles[index] = found[0], found[1]
+        if self.task.omega.size:
+            self.response[index] = found[2]
+
+
+def sweep(
+    model: Model,
+    experiments: Sequence[Experiment],
+    axes: AxesLike,
+    *,
+    against: Literal["data", "base"] | Model = "data",
+    outputs: Sequence[str] | None = None,
+    values: Mapping[str, float] | None = None,
+    want: Sequence[Want] = ("rmse",),
+    linear: tuple[Sequence[str], Sequence[str]] | None = None,
+    omega: Array | None = None,
+    executor: Runner | None = None,
+    kept: Callable[[str], Kept] | None = None,
+    progress: Progress | None = None,
+) -> SweepResult:
+    """A row for each point: the RMSE of each output in each experiment, and poles or frequency response where wanted.
+
+    axes: `grid`, `log_grid`, `listed`, `latin_hypercube`, several of them (their product, the last moves fastest), or
+    {name: values}; parameters, or inputs that no experiment moves, in their units. against: the recordings, the run at
+    the base values, or another model's run. outputs: default, the recorded ones (against data), else all the model's.
+    values: what the base is where it is not the model's. linear: (inputs, outputs) of the frequency response.
+    omega: its frequencies, rad/s (default: 200 around the base's poles). executor: where points run if there is work
+    for more than a few seconds; rows and digits do not depend on it. kept: given the task's fingerprint, where points
+    are looked up and kept. A point that fails is a row with a reason and no number.
+
+    Raises InputError for names, values, bounds or data that do not fit, ComputationError where the reference fails.
+    """
+    points = points_of(axes)
+    base = FrozenMap(values or {})
+    _check(model, experiments, points, base, want)
+    task = _task(model, tuple(experiments), points.names, base, against, outputs, want, linear, omega)
+    shelf = kept(task.fingerprint) if kept else None
+    table = _Table(task, points)
+    told = _Told(progress, len(points))
+    missing = _known(table, shelf, told)
+    _run(table, missing, shelf, executor, told)
+    told.close()
+    return SweepResult(
+        model=model.name,
+        axes=points.axes,
+        units=FrozenMap({n: _unit(model, n) for n in points.names}),
+        series=tuple((r.output, r.experiment) for r in task.references),
+        series_units=tuple(model.outputs[r.output].unit if r.output in model.outputs else "" for r in task.references),
+        against=against if isinstance(against, str) else against.name,
+        base=FrozenMap({n: _base_value(model, base, n) for n in points.names}),
+        rmse=table.rmse,
+        poles=table.poles,
+        omega=task.omega,
+        response=table.response,
+        channels=(task.inputs, task.outputs) if task.omega.size else ((), ()),
+        failed=dict(sorted(table.failed.items())),
+        wanted=tuple(want),
+    )
+
+
+def _known(table: _Table, shelf: Kept | None, told: _Told) -> NDArray[np.intp]:
+    """The places of points that are not kept yet; those that are, are filled in."""
+    n = len(table.points)
+    if shelf is None:
+        return np.arange(n)
+    open_ = []
+    for start in range(0, n, CHUNK):
+        keys = [row.tobytes() for row in table.points.rows(start, start + CHUNK)]
+        found = shelf.get(keys)
+        for offset, key in enumerate(keys):
+            packed = found.get(key)
+            if packed is None:
+                open_.append(start + offset)
+            else:
+                table.fill(start + offset, packed)
+    told.done = n - len(open_)
+    return np.array(open_, dtype=np.intp)
+
+
+def _run(table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor: Runner | None, told: _Told) -> None:
+    """Every missing point run: here while that is quick, in the executor where there is much left."""
+    begin, count = time.perf_counter(), 0
+    for count, (index, row) in enumerate(_rows(table.points, missing), start=1):
+        _finish(table, index, row, table.task(row), shelf, told)
+        spent = time.perf_counter() - begin
+        if executor is not None and spent > PROBE and spent / count * (missing.size - count) > WORTH:
+            break
+    left = missing[count:]
+    if not left.size or executor is None:
+        return
+    for end in executor.run(table.task, (row for _, row in _rows(table.points, left))):
+        index = int(left[end.index])
+        row = table.points.rows(index, index + 1)[0]
+        if end.failure:
+            table.failed[index] = end.failure
+            told.step()
+        else:
+            _finish(table, index, row, end.value, shelf, told)
+
+
+def _finish(table: _Table, index: int, row: Array, packed: bytes, shelf: Kept | None, told: _Told) -> None:
+    table.fill(index, packed)
+    if shelf is not None:
+        shelf.put(row.tobytes(), packed)
+    told.step()
+
+
+def _rows(points: Points, indices: NDArray[np.intp]) -> Iterator[tuple[int, Array]]:
+    """(place, values) of each point, made a chunk at a time."""
+    for start in range(0, indices.size, CHUNK):
+        chosen = indices[start : start + CHUNK]
+        first = int(chosen[0])
+        block = points.rows(first, int(chosen[-1]) + 1) if chosen[-1] - first < 4 * CHUNK else None
+        for index in map(int, chosen):
+            yield index, block[index - first] if block is not None else points.rows(index, index + 1)[0]
+
+
+class _Told:
+    """Progress, told now and then."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self.progress, self.total, self.done, self.last = progress, total, 0, 0.0
+
+    def step(self) -> None:
+        self.done += 1
+        now = time.perf_counter()
+        if self.progress and now - self.last > TOLD:
+            self.last = now
+            self.progress(self.done, self.total, "points")
+
+    def close(self) -> None:
+        if self.progress:
+            self.progress(self.total, self.total, "points")
+
+
+# --- what is asked ---
+
+
+def _check(
+    model: Model, experiments: Sequence[Experiment], points: Points, base: Mapping[str, float], want: Sequence[str]
+) -> None:
+    known = [*model.parameters, *model.inputs]
+    for name in (*points.names, *base):
+        if name not in model.parameters and name not in model.inputs:
+            raise unknown_name("parameter or input", name, known, where="sweep")
+    for name in want:
+        if name not in ("rmse", "poles", "bode"):
+            raise unknown_name("result of a sweep", name, ("rmse", "poles", "bode"))
+    names = [e.name for e in experiments]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise StudyError("two experiments of one name", where="sweep", got=twice[0], expected="distinct names")
+    if "rmse" in want and not experiments:
+        raise StudyError("a sweep has nothing to compare", where="sweep", expected="at least one experiment")
+    for axis in points.axes:
+        for column, name in enumerate(axis.names):
+            _check_values(model, experiments, name, axis.values[:, column])
+
+
+def _check_values(model: Model, experiments: Sequence[Experiment], name: str, values: Array) -> None:
+    for e in experiments:
+        if name in e.inputs:
+            raise StudyError(f"'{name}' is moved by experiment '{e.name}' and cannot be swept", where="sweep")
+    own = model.parameters.get(name)
+    if own is not None and not (own.min <= values.min() and values.max() <= own.max):
+        raise StudyError(
+            f"a value of '{name}' lies outside the model's own bounds",
+            where=f"sweep of {name}",
+            expected=f"values in [{own.min:g}, {own.max:g}]",
+            got=f"{values.min():g} to {values.max():g}",
+        )
+
+
+def _task(
+    model: Model,
+    experiments: tuple[Experiment, ...],
+    names: tuple[str, ...],
+    base: FrozenMap[float],
+    against: Literal["data", "base"] | Model,
+    outputs: Sequence[str] | None,
+    want: Sequence[str],
+    linear: tuple[Sequence[str], Sequence[str]] | None,
+    omega: Array | None,
+) -> PointTask:
+    references: list[Reference] = []
+    method: Method = "rosenbrock"
+    if "rmse" in want:
+        method = _method(model, experiments, base)
+        for e in experiments:
+            references += _references(model, e, base, against, outputs, method)
+        if not references:
+            raise StudyError(
+                "no experiment has a recorded output to compare",
+                where="sweep",
+                hint='against="base", or another model, needs no recording',
+            )
+    poles = 0
+    channels: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    frequencies = np.empty(0)
+    if "poles" in want or "bode" in want:
+        from hvdc_ident.linearize import find_operating_point, linearize
+
+        at = linearize(
+            model,
+            find_operating_point(model, base),
+            inputs=linear[0] if linear else None,
+            outputs=linear[1] if linear else None,
+        )
+        poles = int(np.size(at.poles())) if "poles" in want else 0
+        channels = tuple(at.input_names), tuple(at.output_names)
+        if "bode" in want:
+            frequencies = np.asarray(omega if omega is not None else at.bode().omega, dtype=float)
+    return PointTask(model, experiments, names, base, tuple(references), poles, frequencies, *channels, method=method)
+
+
+def _method(model: Model, experiments: tuple[Experiment, ...], base: FrozenMap[float]) -> Method:
+    """The integrator of every point: the one that serves at the base values."""
+    first = experiments[0]
+    try:
+        found = simulate(model, first, base, outputs=first.outputs or None).statistics.method
+    except ComputationError:
+        return "rosenbrock"
+    except InputError as e:
+        if type(e).__name__ != "SteadyStateError":
+            raise
+        return "rosenbrock"
+    return "explicit" if found == "explicit" else "rosenbrock"
+
+
+def _references(
+    model: Model,
+    e: Experiment,
+    base: FrozenMap[float],
+    against: Literal["data", "base"] | Model,
+    outputs: Sequence[str] | None,
+    method: Method,
+) -> list[Reference]:
+    """What each output of one experiment is compared with."""
+    if against == "data":
+        recorded = [o for o in (e.outputs if outputs is None else outputs) if o in e.outputs]
+        found = []
+        for o in recorded:
+            assert e.measured is not None
+            rows = np.flatnonzero(e.compared & np.isfinite(e.measured[o]))
+            if not rows.size:
+                hint = "a wider window"
+                raise StudyError(f"no row of '{o}' can be compared", where=f"experiment '{e.name}'", hint=hint)
+            found.append(Reference(e.name, o, rows, np.array(e.measured[o][rows])))
+        return found
+    chosen = tuple(outputs if outputs is not None else (e.outputs or model.outputs))
+    rows = np.flatnonzero(e.compared)
+    if isinstance(against, Model):
+        missing = [o for o in chosen if o not in against.outputs and o not in against.names]
+        if missing and outputs is None:
+            chosen = tuple(o for o in chosen if o not in missing)
+        run = simulate(against, e.with_(measured=None), {}, outputs=chosen).trajectory.values
+    elif against == "base":
+        run = simulated(model, e, base, chosen, method)
+    else:
+        raise StudyError(
+            "what a sweep is compared with is unknown", expected='"data", "base" or a Model', got=repr(against)[:60]
+        )
+    return [Reference(e.name, o, rows, np.array(run[rows, k])) for k, o in enumerate(chosen)]
+
+
+def _unit(model: Model, name: str) -> str:
+    return model.parameters[name].unit if name in model.parameters else model.inputs[name].unit
+
+
+def _base_value(model: Model, base: Mapping[str, float], name: str) -> float:
+    own = model.parameters[name].value if name in model.parameters else model.inputs[name].value
+    return float(base.get(name, own))

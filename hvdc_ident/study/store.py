@@ -1,0 +1,211 @@
+"""Finished work kept in the folder of results, so that a second run does only what is missing.
+
+One sqlite file (write-ahead log) holds bytes by job and key. A job is a hash of all that decides its results: model,
+data, settings, code. What was committed survives a kill at any instant; what was not is done again, with the same
+result. One process at a time works in a folder: the operating system's lock, which ends with the process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+from hvdc_ident.errors import InputError
+from hvdc_ident.files import digest, make_folder
+
+FOLDER, FILE = ".store", "results.sqlite"
+EVERY = 0.2  # s between two commits
+MOST_KEYS = 500  # of one query
+SCHEMA = 1
+
+_HELD: dict[Path, list[int]] = {}
+"""Folders this process holds: [handle, how often it was asked for]."""
+
+
+@contextmanager
+def exclusive(folder: Path) -> Iterator[None]:
+    """Nothing; inside, no other process works in the folder. Made where missing, removed again where left empty.
+
+    Raises InputError where another one does. May be nested within a process. The lock lies on the folder itself and
+    ends with the process, however that ends.
+    """
+    made = not folder.exists()
+    make_folder(folder)
+    place = folder.resolve()
+    if place not in _HELD:
+        _HELD[place] = [_locked(place), 0]
+    _HELD[place][1] += 1
+    try:
+        yield
+    finally:
+        _HELD[place][1] -= 1
+        if _HELD[place][1] == 0:
+            os.close(_HELD.pop(place)[0])
+        if made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def _locked(folder: Path) -> int:
+    """A handle that holds the lock of a folder."""
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system: no lock is taken
+        return os.open(os.devnull, os.O_RDONLY)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise InputError(
+            "another run is at work in this folder",
+            where=str(folder),
+            expected="one run at a time in a folder of results",
+            hint="wait for it to end, end it, or give --out another folder",
+        ) from None
+    except OSError:  # a file system without locks
+        pass
+    return handle
+
+
+class Store:
+    """The kept work of a folder. Use it as a context; inside it the folder is exclusive.
+
+    Raises InputError where the folder cannot be written to, another process works in it, or the file is no store.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / FOLDER / FILE
+        self._stack = contextlib.ExitStack()
+        self._base: sqlite3.Connection | None = None
+        self._last = 0.0
+        self._open = False
+        self._folder = folder
+
+    def __enter__(self) -> Store:
+        self._stack.enter_context(exclusive(self._folder))
+        try:
+            make_folder(self.path.parent)
+            self._base = self._connected()
+        except BaseException:
+            self._stack.close()
+            raise
+        self._last = time.monotonic()
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        try:
+            if self._base is not None:
+                with self._clear():
+                    self._commit()
+        finally:
+            if self._base is not None:
+                self._base.close()
+                self._base = None
+            self._stack.close()
+
+    def job(self, *parts: str) -> Job:
+        """The part of the store for one kind of work; parts: texts that decide its results, beside the code."""
+        return Job(self, digest("\n".join([code_version(), *parts]).encode()))
+
+    def _connected(self) -> sqlite3.Connection:
+        with self._clear():
+            base = sqlite3.connect(self.path, isolation_level=None)
+            try:
+                base.execute("PRAGMA journal_mode = WAL")
+                base.execute("PRAGMA synchronous = NORMAL")
+                version = base.execute("PRAGMA user_version").fetchone()[0]
+                if version not in (0, SCHEMA):
+                    raise InputError("the store is of another version", where=str(self.path), hint="remove this file")
+                base.execute(
+                    "CREATE TABLE IF NOT EXISTS kept (job TEXT, key BLOB, value BLOB, PRIMARY KEY (job, key)) WITHOUT ROWID"
+                )
+                base.execute(f"PRAGMA user_version = {SCHEMA}")
+            except BaseException:
+                base.close()
+                raise
+        return base
+
+    @contextmanager
+    def _clear(self) -> Iterator[None]:
+        """Nothing; a database error inside becomes an InputError."""
+        try:
+            yield
+        except sqlite3.DatabaseError as e:
+            text = str(e)
+            if "disk is full" in text or "disk I/O" in text:
+                hint = "free some space; what was kept is intact, and the same command goes on from there"
+            elif "readonly" in text or "unable to open" in text:
+                hint = "a folder that can be written to, with --out DIR"
+            else:
+                hint = "remove this file: what it keeps can be computed again"
+            raise InputError(f"the store cannot be used: {text}", where=str(self.path), hint=hint) from None
+
+    def _get(self, job: str, keys: Sequence[bytes]) -> dict[bytes, bytes]:
+        assert self._base is not None
+        found: dict[bytes, bytes] = {}
+        with self._clear():
+            for start in range(0, len(keys), MOST_KEYS):
+                part = keys[start : start + MOST_KEYS]
+                marks = ",".join("?" * len(part))
+                rows = self._base.execute(
+                    f"SELECT key, value FROM kept WHERE job = ? AND key IN ({marks})", [job, *part]
+                )
+                found.update((bytes(k), bytes(v)) for k, v in rows)
+        return found
+
+    def _put(self, job: str, key: bytes, value: bytes) -> None:
+        assert self._base is not None
+        with self._clear():
+            if not self._open:
+                self._base.execute("BEGIN IMMEDIATE")
+                self._open = True
+            self._base.execute("INSERT OR REPLACE INTO kept VALUES (?, ?, ?)", (job, key, value))
+            if time.monotonic() - self._last > EVERY:
+                self._commit()
+
+    def _commit(self) -> None:
+        if self._open and self._base is not None:
+            self._base.execute("COMMIT")
+            self._open = False
+        self._last = time.monotonic()
+
+
+class Job:
+    """Bytes by key of one kind of work in a store."""
+
+    def __init__(self, store: Store, name: str) -> None:
+        self._store, self.name = store, name
+
+    def get(self, keys: Sequence[bytes]) -> Mapping[bytes, bytes]:
+        """What is kept under the keys; a key without a result is missing."""
+        return self._store._get(self.name, keys)
+
+    def put(self, key: bytes, value: bytes) -> None:
+        """Nothing; the value is kept, and on the disk within a fifth of a second of the next call."""
+        self._store._put(self.name, key, value)
+
+
+@cache
+def code_version() -> str:
+    """A hash of the package's source and of the versions of what its numbers rest on."""
+    parts = [source_hash()]
+    for name in ("numpy", "scipy", "sympy", "numba", "llvmlite"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            parts.append(f"{name} {metadata.version(name)}")
+    return digest("\n".join(parts).encode())
+
+
+@cache
+def source_hash() -> str:
+    """A hash of the package's own source: another state of it may find other numbers."""
+    root = Path(__file__).resolve().parents[1]
+    files = sorted(p for p in root.rglob("*.py"))
+    return digest("\n".join(f"{p.relative_to(root).as_posix()} {digest(p.read_bytes())}" for p in files).encode())
