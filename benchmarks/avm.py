@@ -29,13 +29,16 @@ def case(model):
 
 
 def compiled(model, sensitivities):
-    """Seconds from the model to its first steady start, at best of three."""
+    """Seconds from the model to its first steady start, with all the code a run needs, at best of three."""
     p = np.array(list(model.values.values()))
     u = np.array([i.value for i in model.inputs.values()])
     times = []
     for _ in range(3):
         start = time.perf_counter()
-        Engine(model, sensitivities).start(p, u)
+        code = Engine(model, sensitivities)
+        code.start(p, u)
+        if model.algebraic:  # the Rosenbrock method, whose own code is compiled with its first run
+            code._compile_late()
         times.append(time.perf_counter() - start)
     return min(times)
 
