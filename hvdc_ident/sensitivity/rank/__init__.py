@@ -1,0 +1,1 @@
+"""How structural identifiability is decided: series over exact numbers, random points, ranks, and words for what is seen."""

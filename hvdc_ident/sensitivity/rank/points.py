@@ -1,0 +1,159 @@
+"""Rows of the observability-identifiability matrix at random points: over a prime field, or with 120 decimals.
+
+The unknowns are the start of the states and the parameters. Rows: the derivatives of the outputs' Taylor coefficients in
+every stretch of the experiment, and of the equations the start obeys, so that a steady start needs no solution formula.
+After A. Sedoglavic, "A probabilistic algorithm to test local algebraic observability in polynomial time", J. Symbolic
+Computation 33 (2002) 735-755.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from random import Random
+from typing import Any, Literal
+
+import numpy as np
+
+from hvdc_ident.sensitivity.rank.equations import Equations, Source
+from hvdc_ident.sensitivity.rank.prime_field import Array, NoSuchNumber
+from hvdc_ident.sensitivity.rank.ring import Ring
+from hvdc_ident.sensitivity.rank.taylor import Taylor
+
+InputClass = Literal["constant", "step", "ramp", "free"]
+JUMPS = 8  # step sizes tried from one start before another start is drawn
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked: the equations at rest and after the event, which parameters, which inputs move and how.
+
+    moved: {position in w: class}. parameters: positions in p. rested: whether every state starts at rest.
+    """
+
+    source: Source
+    rest: Equations
+    move: Equations
+    parameters: tuple[int, ...]
+    moved: tuple[tuple[int, InputClass], ...]
+    rested: bool
+
+    @property
+    def order(self) -> int:
+        """The Taylor order: enough for a linear model's outputs and their derivatives, and for a nonlinear one's in general."""
+        n = len(self.rest.derivatives)
+        return max(n + len(self.parameters) + 2, 2 * n + 3)
+
+    @property
+    def start(self) -> list[int]:
+        """The nodes that are 0 at the start."""
+        zero = self.rest.graph.zero
+        return [n for n in (*(s for s in self.rest.starts if s is not None), *self.rest.residuals) if n != zero]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What is seen at one point: the reduced rows over the parameters alone, and the parameters' values there."""
+
+    ring: Ring
+    matrix: Array
+    pivots: tuple[int, ...]
+    theta: tuple[Any, ...]
+
+    @property
+    def seen(self) -> tuple[int, ...]:
+        """Positions of the parameters that are seen: their unit row is among the rows."""
+        return tuple(c for r, c in zip(self.matrix, self.pivots, strict=True) if np.count_nonzero(r) == 1)
+
+
+@dataclass(frozen=True)
+class Base:
+    """A point: parameters, start [states, unknowns], inputs with time first, and the values of roots already chosen."""
+
+    p: list[Any]
+    y: list[Any]
+    w: list[Any]
+    known: dict[tuple[str, Any], Any]
+    nonzero: frozenset[int] = frozenset()  # nodes that are not 0 at the start
+
+
+Jump = Callable[[Base, list[Any], "set[int]", Random], list[Any]]
+
+
+def rows(question: Question, ring: Ring, base: Base, jump: Jump, random: Random, deadline: float) -> Rows:
+    """The rows at one base point. jump: the unknowns right after the inputs have jumped to the given values."""
+    q, nx = question, len(question.rest.derivatives)
+    found: list[Array] = []
+    theta = [base.p[k] for k in q.parameters]
+
+    def series(
+        e: Equations, y: list[Any], w: Sequence[Sequence[Any]], order: int, roots: Sequence[int]
+    ) -> Mapping[int, Array]:
+        t = Taylor(e, ring, base.p, q.parameters, random.randrange(2**31), deadline)
+        t.known = base.known
+        return t.run(y, w, order, roots)
+
+    def watch(e: Equations, y: list[Any], w: Sequence[Sequence[Any]], order: int) -> None:
+        result = series(e, y, w, order, e.outputs)
+        found.extend(result[n][:, 1:] for n in e.outputs)
+
+    still = [[v] for v in base.w]
+    uses_time = [[base.w[0], 1], *still[1:]]
+    watch(q.rest, base.y, still if q.rested else uses_time, 0 if q.rested else q.order)
+    constraint = series(q.rest, base.y, still, 0, q.start)
+    for n in q.start:
+        if ring.p and int(constraint[n][0, 0]) % ring.p:
+            raise NoSuchNumber("the start does not hold")
+        found.append(constraint[n][:, 1:])
+    for group in stretches(q):
+        y, w = _after(q, ring, base, jump, group, random)
+        watch(q.move, y, w, q.order)
+    reduced, pivots = ring.rref(np.concatenate(found))
+    first = sum(c < nx for c in pivots)
+    return Rows(ring, reduced[first:, nx:], tuple(c - nx for c in pivots[first:]), tuple(theta))
+
+
+def stretches(q: Question) -> list[dict[int, InputClass]]:
+    """The moves that are watched: each moved input on its own, then all together."""
+    groups: list[dict[int, InputClass]] = [{k: kind} for k, kind in q.moved]
+    return groups + ([dict(q.moved)] if len(groups) > 1 else [] if groups or q.move is q.rest else [{}])
+
+
+def _after(
+    q: Question, ring: Ring, base: Base, jump: Jump, group: Mapping[int, InputClass], random: Random
+) -> tuple[list[Any], list[list[Any]]]:
+    """The start and the inputs' series right after the inputs of a group have begun to move."""
+    for _ in range(JUMPS):
+        w = [_move(group[k], ring, v, random, q.order) if k in group else [v] for k, v in enumerate(base.w)]
+        w[0] = [base.w[0], 1]
+        jumped = {k for k in range(len(w)) if w[k][0] != base.w[k]}
+        if not (q.move.residuals and (jumped or q.move is not q.rest)):
+            return base.y, w
+        try:
+            return [*base.y[: len(q.rest.derivatives)], *jump(base, [v[0] for v in w], jumped, random)], w
+        except NoSuchNumber:
+            continue
+    raise NoSuchNumber("no jump was found")
+
+
+def _move(kind: InputClass, ring: Ring, level: Any, random: Random, order: int) -> list[Any]:
+    def size() -> Any:
+        return ring.number(Fraction(random.randrange(2, 10**6) if ring.p else random.randrange(5000, 20000), 10**6))
+
+    if kind == "step":
+        return [ring.reduce(level + size())]
+    return [level, *(size() for _ in range(1 if kind == "ramp" else order))]
+
+
+def affected(q: Question, jumped: set[int]) -> set[int]:
+    """Positions of the unknowns that jump when inputs do, or when a limiter's branch changes."""
+    g, nx = q.move.graph, len(q.move.derivatives)
+    leaves = [{g.nodes[n][1:] for n in g.reachable([r]) if g.nodes[n][0] == "leaf"} for r in q.move.residuals]
+    found = {i for i, (a, b) in enumerate(zip(q.rest.residuals, q.move.residuals, strict=True)) if a != b}
+    found |= {i for i, used in enumerate(leaves) if any(("w", k) in used for k in jumped)}
+    while True:
+        more = {i for i, used in enumerate(leaves) if any(("y", nx + j) in used for j in found)} - found
+        if not more:
+            return found
+        found |= more
