@@ -29,7 +29,8 @@ JUMPS = 8  # step sizes tried from one start before another start is drawn
 class Question:
     """What is asked: the equations at rest and after the event, which parameters, which inputs move and how.
 
-    moved: {position in w: class}. parameters: positions in p. rested: whether every state starts at rest.
+    moved: (position in w, class). parameters: positions in p. rested: whether every state starts at rest. highest: the
+    Taylor order if it is not to be the usual one.
     """
 
     source: Source
@@ -38,12 +39,13 @@ class Question:
     parameters: tuple[int, ...]
     moved: tuple[tuple[int, InputClass], ...]
     rested: bool
+    highest: int = 0
 
     @property
     def order(self) -> int:
         """The Taylor order: enough for a linear model's outputs and their derivatives, and for a nonlinear one's in general."""
         n = len(self.rest.derivatives)
-        return max(n + len(self.parameters) + 2, 2 * n + 3)
+        return self.highest or max(n + len(self.parameters) + 2, 2 * n + 3)
 
     @property
     def start(self) -> list[int]:
