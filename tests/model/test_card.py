@@ -199,7 +199,7 @@ def models(draw: st.DrawFn) -> Model:
         states={n: {"derivative": text(), "start": draw(st.sampled_from([None, "free", p[0]]))} for n in x},
         signals={n: {"value": text(), "description": draw(TEXTS)} for n in s},
         algebraic={"z": {"equation": f"z/2 + {s[0]}", "start": draw(DOUBLES)}},
-        outputs={n: draw(st.sampled_from([*x, *s, "z"])) for n in draw(prefixed)},
+        outputs={f"o_{n}": draw(st.sampled_from([*x, *s, "z"])) for n in draw(prefixed)},
         delays={"d": {"of": x[0], "time": draw(st.floats(1e-6, 10))}},
         sampled={"q": {"value": s[0], "period": p[0], "compute": 0}},
         description=draw(TEXTS),
