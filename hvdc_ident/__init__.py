@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hvdc_ident.experiment import Experiment, InputSignal
     from hvdc_ident.fit import fit
     from hvdc_ident.formats import read_waveforms
+    from hvdc_ident.identifiability import identifiability
     from hvdc_ident.linearize import LinearModel, OperatingPoint, find_operating_point, linearize
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
@@ -40,6 +41,7 @@ __all__ = [
     "export",
     "find_operating_point",
     "fit",
+    "identifiability",
     "linearize",
     "load_model",
     "load_study",
@@ -59,6 +61,7 @@ _HOME = {
     "export": "study.export",
     "find_operating_point": "linearize",
     "fit": "fit",
+    "identifiability": "identifiability",
     "linearize": "linearize",
     "load_model": "models",
     "load_study": "study.study",
@@ -67,7 +70,7 @@ _HOME = {
 }
 
 
-_VERBS = ("fit", "linearize", "simulate")
+_VERBS = ("fit", "identifiability", "linearize", "simulate")
 """Names of a function and of the folder it lives in."""
 
 

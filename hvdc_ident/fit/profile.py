@@ -219,9 +219,12 @@ class _Walker:
             if ahead == end:
                 return self._at_end(direction, end), points
             root = np.sqrt(2.0 * max(rise, 0.0))
+            if root < z - 0.1 * goal:
+                self._look_for_another(there)
             per_step = (root - z) / abs(ahead - x)
             wish = 1.02 * (goal - root) / per_step if per_step > 0 else np.inf
-            step = float(np.clip(wish, 0.3 * step, 4.0 * step))
+            growth = 4.0 if root < 0.1 * goal else 1.0 if root < z else 2.0  # downhill again: there may be a well
+            step = float(np.clip(wish, 0.3 * step, growth * step))
             x, at, z = ahead, there, root
         return self._ended("not-found", f"no crossing found up to {self._value(x):.4g}"), points
 
@@ -261,6 +264,18 @@ class _Walker:
         if fall > 0.02 * self.rise and not self.last:
             raise _BetterFoundError(self.name, found.theta, fall)
         return found
+
+    def _look_for_another(self, point: Reached) -> None:
+        """Where the profile falls away from the optimum there is another basin: its own optimum may be the better."""
+        if self.last:
+            return
+        end = descend(
+            self.objective, point.theta, np.zeros_like(self.fixed), enough=0.1 * self.walk.tolerance * self.rise
+        )
+        self.evaluations += end.evaluations
+        fall = self.best.at.cost - end.at.cost
+        if fall > 0.02 * self.rise:
+            raise _BetterFoundError(self.name, end.theta, fall)
 
     def _refine(self, x: float, at: Reached, ahead: float, there: Reached) -> tuple[float, Reached]:
         """The crossing between a point below the threshold and one above, by false position (Illinois)."""

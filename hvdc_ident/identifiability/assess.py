@@ -10,13 +10,20 @@ import numpy as np
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
-from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.estimate import Executor, Progress
-from hvdc_ident.fit.objective import LeastSquares, descend
-from hvdc_ident.fit.profile import TWO_SIDED, Profile, Walk, profiles
+from hvdc_ident.fit.objective import LeastSquares
+from hvdc_ident.fit.profile import Profile, Walk, profiles
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability import verdicts
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
+from hvdc_ident.identifiability.evidence import (
+    bounded,
+    joint_limits,
+    partner,
+    physical_bounds,
+    rise_at_ends,
+    thresholds,
+)
 from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogeneity, misspecification
 from hvdc_ident.identifiability.pilot import Optimum, pilot
 from hvdc_ident.identifiability.recommend import Recommendation, recommend
@@ -73,6 +80,7 @@ class _Assessment:
         self.thresholds: dict[str, float] = {}
         self.norms: dict[str, float] = {}
         self.notes: list[str] = []
+        self.remark = ""
 
     def report(self, starts: int, executor: Executor | None) -> IdentifiabilityReport:
         """The report."""
@@ -115,6 +123,7 @@ class _Assessment:
         if optimum.deterministic:
             names = ", ".join(optimum.deterministic)
             self.notes.append(f"The records of {names} have no noise: standard deviations are those of the misfit.")
+            self.remark = "The data have no noise; what noise they stand for is taken from the misfit."
         if result.status in ("two-optima", "not-converged"):
             self.notes.append(f"Pilot fit: {result.status}, {result.message}.")
 
@@ -144,7 +153,7 @@ class _Assessment:
             limit = self.thresholds[n]
             if rise_over_range(matrix[i, i] / optimum.slope[i] ** 2, self.free[n].span) >= limit:
                 continue
-            rise = _rise_at_ends(optimum, i, self.free[n])
+            rise = rise_at_ends(optimum, i, self.free[n])
             if rise is None or rise >= limit:
                 continue
             self._judge(verdicts.insensitive(self.free[n], rise, limit, self.units[n], self.quiet))
@@ -174,7 +183,7 @@ class _Assessment:
         while optimum is not None:
             limits = thresholds(optimum)
             self.thresholds |= limits
-            physical = _physical(optimum.problem)
+            physical = physical_bounds(optimum.problem)
             around = profiles(
                 LeastSquares.of(optimum.problem),
                 optimum.theta,
@@ -186,14 +195,15 @@ class _Assessment:
             )
             self.notes += [f"A better optimum was found: {r}." for r in around.restarts]
             optimum = Optimum(optimum.problem, around.theta)
-            opened = [n for n, p in around.by_name.items() if not _bounded(p)]
+            around_by_name = joint_limits(optimum, around.by_name, limits, seed=self.seed)
+            opened = [n for n, p in around_by_name.items() if not bounded(p)]
             if not opened:
-                self._closed(optimum, around.by_name, physical)
+                self._closed(optimum, around_by_name, physical)
                 return optimum
             combo = self._open_combination(optimum, opened)
             for n in opened:
                 words = combo.words if combo and n in combo.members else ""
-                self._judge(verdicts.practical(around.by_name[n], words, self.units[n]))
+                self._judge(verdicts.practical(around_by_name[n], words, self.units[n]))
             order = [optimum.names[i] for i in pivoted_order(optimum.information.matrix)]
             victim = max(opened, key=order.index)
             if combo:
@@ -233,7 +243,7 @@ class _Assessment:
             best = max(shares, key=lambda e: shares[e][n])
             std = optimum.uncertainty.std(n)
             std = None if std is None else std * float(np.sqrt(optimum.excess))
-            judged = verdicts.closed(p, free, std, float(index[i]), _partner(optimum, i), f"'{best}'", unit)
+            judged = verdicts.closed(p, free, std, float(index[i]), partner(optimum, i), f"'{best}'", unit)
             given = conditional.get(n, ())
             judged = replace(judged, conditional_on=given)
             if n in self.found:  # a member of a combination: its verdict stands, its interval is that of the set fitted
@@ -268,7 +278,7 @@ class _Assessment:
             if n not in fitted
         }
         for n in self.free:
-            self.found[n] = replace(self.found[n], sensitivity_norm=self.norms.get(n))
+            self.found[n] = replace(self.found[n], sensitivity_norm=self.norms.get(n)).noted(self.remark)
             if n in held:
                 self.found[n] = replace(self.found[n], value=held[n][0])
             elif last is not None and not np.isfinite(self.found[n].value):
@@ -323,61 +333,6 @@ class _Assessment:
             return None
 
 
-def thresholds(optimum: Optimum) -> dict[str, float]:
-    """The rise of the cost at the ends of each parameter's 95 % interval.
-
-    1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error add to the
-    variance in its direction (vertical scaling of an independence likelihood: Chandler and Bate 2007,
-    doi 10.1093/biomet/asm015): the larger of the AR(1) sandwich times the excess misfit and, where the misfit shows
-    model error, the sandwich over experiments with t(n - 1).
-    """
-    from scipy.stats import t
-
-    u = optimum.uncertainty
-    quantile = 0.5 * float(t.ppf(0.975, u.dof)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
-    raw, corrected = np.diag(u.raw), np.diag(u.corrected)
-    factor = np.where(raw > 0, corrected / np.where(raw > 0, raw, 1.0), 1.0) * optimum.excess
-    limits = quantile * np.maximum(factor, 1.0)
-    if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
-        covariance, dof = cluster_sandwich(optimum.blocks)
-        ratio = np.where(raw > 0, np.diag(covariance) / np.where(raw > 0, raw, 1.0), 0.0)
-        limits = np.maximum(limits, 0.5 * float(t.ppf(0.975, dof)) ** 2 * ratio)
-    return {n: float(v) for n, v in zip(optimum.names, limits, strict=False)}
-
-
-def _rise_at_ends(optimum: Optimum, i: int, free: Free) -> float | None:
-    """How much the cost rises at the worse end of the range, the others re-fitted; None where an end cannot be run."""
-    fixed = np.arange(optimum.theta.size) == i
-    rises = []
-    for end in free.drawn:
-        theta = optimum.theta.copy()
-        theta[i] = end
-        try:
-            rises.append(descend(LeastSquares.of(optimum.problem), theta, fixed, enough=1e-3).at.cost - optimum.cost)
-        except SimulationError:
-            return None
-    return max(*rises, 0.0)
-
-
-def _physical(problem: Problem) -> dict[str, tuple[bool, bool]]:
-    """By parameter whether its bounds are the model's own."""
-    own = problem.simulator.parameters
-    return {f.name: (f.min == own[f.name].min, f.max == own[f.name].max) for f in problem.free}
-
-
-def _bounded(p: Profile) -> bool:
-    """Whether the interval is known: both ends, or the one that a parameter on its bound has."""
-    return p.closed or (p.one_sided and "closed" in (p.lower.status, p.upper.status))
-
-
-def _partner(optimum: Optimum, i: int) -> str:
-    """The parameter whose column is most like the i-th."""
-    matrix = optimum.information.matrix
-    d = np.sqrt(np.diag(matrix))
-    cosines = np.abs(matrix[i] / np.where(d > 0, d * d[i], 1.0))
-    cosines[i] = -1.0
-    return optimum.names[int(np.argmax(cosines))] if len(optimum.names) > 1 else ""
-
-
 def _lower(text: str) -> str:
-    return text[3:] if text.startswith("It is ") is False else text[6:]
+    """A verdict's reason without its first words, to go on with after "it is"."""
+    return text.removeprefix("It is ")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import log10
 from typing import Literal
 
 from hvdc_ident.fit.profile import Profile
@@ -107,7 +108,7 @@ def closed(
     half = 0.5 * (high - low)
     share, of = (half / abs(profile.value), "of its value") if free.min > 0 else (half / free.span, "of its range")
     common = {"collinearity": collinearity, "partner": partner, "profile": profile}
-    span = f"{low:.4g} … {_with_unit(high, unit)}"
+    span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
     if share > WIDE or collinearity > COLLINEAR:
         told = f"It is known only to lie in {span}, ±{100 * share:.3g} % {of}"
         if collinearity > COLLINEAR:
@@ -128,6 +129,13 @@ def closed(
         relative,
         **common,  # type: ignore[arg-type]
     )
+
+
+def _digits(value: float, half: float) -> str:
+    """The value with as many digits as its half-width has meaning for."""
+    if half <= 0 or not value:
+        return f"{value:.6g}"
+    return f"{value:.{max(2, min(12, int(log10(abs(value) / half)) + 3))}g}"
 
 
 def _with_unit(value: float, unit: str) -> str:

@@ -1,0 +1,139 @@
+"""How far the data's word reaches: thresholds of profiles, refits at the ends of a range, limits at several bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
+from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
+from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile, Side
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.identifiability.pilot import Optimum
+from hvdc_ident.trajectory import Array
+
+DRAWS = 999
+
+
+def thresholds(optimum: Optimum) -> dict[str, float]:
+    """The rise of the cost at the ends of each parameter's 95 % interval.
+
+    1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error add to the
+    variance in its direction (vertical scaling of an independence likelihood: Chandler and Bate 2007,
+    doi 10.1093/biomet/asm015): the larger of the AR(1) sandwich times the excess misfit and, where the misfit shows
+    model error, the sandwich over experiments with t(n - 1).
+    """
+    from scipy.stats import t
+
+    u = optimum.uncertainty
+    quantile = 0.5 * float(t.ppf(0.975, u.dof)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
+    raw, corrected = np.diag(u.raw), np.diag(u.corrected)
+    factor = np.where(raw > 0, corrected / np.where(raw > 0, raw, 1.0), 1.0) * optimum.excess
+    limits = quantile * np.maximum(factor, 1.0)
+    if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
+        covariance, dof = cluster_sandwich(optimum.blocks)
+        ratio = np.where(raw > 0, np.diag(covariance) / np.where(raw > 0, raw, 1.0), 0.0)
+        limits = np.maximum(limits, 0.5 * float(t.ppf(0.975, dof)) ** 2 * ratio)
+    return {n: float(v) for n, v in zip(optimum.names, limits, strict=False)}
+
+
+def rise_at_ends(optimum: Optimum, i: int, free: Free) -> float | None:
+    """How much the cost rises at the worse end of the range, the others re-fitted; None where an end cannot be run."""
+    fixed = np.arange(optimum.theta.size) == i
+    rises = []
+    for end in free.drawn:
+        theta = optimum.theta.copy()
+        theta[i] = end
+        try:
+            rises.append(descend(LeastSquares.of(optimum.problem), theta, fixed, enough=1e-3).at.cost - optimum.cost)
+        except SimulationError:
+            return None
+    return max(*rises, 0.0)
+
+
+def physical_bounds(problem: Problem) -> dict[str, tuple[bool, bool]]:
+    """By parameter whether its bounds are the model's own."""
+    own = problem.simulator.parameters
+    return {f.name: (f.min == own[f.name].min, f.max == own[f.name].max) for f in problem.free}
+
+
+def bounded(p: Profile) -> bool:
+    """Whether the interval is known: both ends, or the one that a parameter on its bound has."""
+    return p.closed or (p.one_sided and "closed" in (p.lower.status, p.upper.status))
+
+
+def partner(optimum: Optimum, i: int) -> str:
+    """The parameter whose column is most like the i-th."""
+    matrix = optimum.information.matrix
+    d = np.sqrt(np.diag(matrix))
+    cosines = np.abs(matrix[i] / np.where(d > 0, d * d[i], 1.0))
+    cosines[i] = -1.0
+    return optimum.names[int(np.argmax(cosines))] if len(optimum.names) > 1 else ""
+
+
+def joint_limits(
+    optimum: Optimum, found: Mapping[str, Profile], limits: Mapping[str, float], *, seed: int = 0
+) -> FrozenMap[Profile]:
+    """The profiles, with the limits of parameters on bounds found anew where several are on bounds together.
+
+    Then 1.353 is not the right rise, for the others on bounds do not scatter freely: a parametric bootstrap of the
+    linearised problem, from the limit and the bounds, gives the rise that 95 % of the samples stay below. The limit is
+    then read from the profile's own points.
+    """
+    on_bound = [n for n, p in found.items() if p.one_sided]
+    if len(on_bound) < 2:
+        return FrozenMap(found)
+    result = dict(found)
+    for n in on_bound:
+        low = found[n].lower.limit is None
+        side = found[n].upper if low else found[n].lower
+        if side.status == "closed" and side.limit is not None:
+            share = bootstrap_rise(optimum, n, side.limit, seed) / ONE_SIDED
+            result[n] = _with_rise(found[n], low, share * limits[n] * ONE_SIDED / TWO_SIDED)
+    return FrozenMap(result)
+
+
+def bootstrap_rise(optimum: Optimum, name: str, value: float, seed: int = 0) -> float:
+    """The 95 % quantile of the rise at the true value of `name`, where estimates stop at their bounds.
+
+    Noise is drawn for the linearised problem whose truth is `value` and, for the others, the optimum.
+    """
+    i = optimum.problem.names.index(name)
+    slope, matrix = optimum.slope, optimum.columns.T @ optimum.columns
+    truth = optimum.theta.copy()
+    truth[i] = value
+    low, high = (
+        (np.array([getattr(u, side) for u in optimum.problem.unknowns]) - truth) / slope for side in ("min", "max")
+    )
+    above = value > optimum.theta[i]
+    low_fixed, high_fixed = low.copy(), high.copy()
+    low_fixed[i] = high_fixed[i] = 0.0
+    values, vectors = np.linalg.eigh(matrix)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    rises = []
+    for z in np.random.default_rng(seed).standard_normal((DRAWS, slope.size)):
+        g = root @ z
+        best = bounded_step(g, matrix, 0.0, low, high)
+        at = bounded_step(g, matrix, 0.0, low_fixed, high_fixed)
+        outside = best[i] < 0 if above else best[i] > 0
+        rises.append(_cost(g, matrix, at) - _cost(g, matrix, best) if outside else 0.0)
+    return float(np.quantile(rises, 0.95))
+
+
+def _cost(g: Array, h: Array, p: Array) -> float:
+    return float(g @ p + 0.5 * p @ h @ p)
+
+
+def _with_rise(profile: Profile, low: bool, rise: float) -> Profile:
+    """The profile with the limit at another rise, between its points; kept where it does not reach so far."""
+    beyond = profile.values >= profile.value if low else profile.values <= profile.value
+    order = np.argsort(profile.rises[beyond])
+    roots, values = np.sqrt(np.clip(profile.rises[beyond][order], 0, None)), profile.values[beyond][order]
+    if np.sqrt(rise) > roots[-1]:
+        return profile
+    limit = Side("closed", float(np.interp(np.sqrt(rise), roots, values)), "bootstrap, several on bounds")
+    return replace(profile, upper=limit, threshold=rise) if low else replace(profile, lower=limit, threshold=rise)

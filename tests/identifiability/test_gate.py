@@ -1,0 +1,140 @@
+"""The gated fit: what is held, what is stated, what --force does."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hvdc_ident.cli import app
+from hvdc_ident.errors import UnknownNameError
+from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.identifiability import gate, gated_fit, identifiability
+from hvdc_ident.parameters import Parameter
+from tests.fit.simulators import line
+from tests.identifiability.cases import closed, line_and_nothing, measured, product
+
+
+def both(plant, data, free, force=()):
+    report = identifiability(plant, data, free, starts=2).to_dict()
+    return report, gated_fit(Problem(plant, tuple(data), tuple(free)), report, partial(fit, starts=2), force=force)
+
+
+def test_members_of_a_combination_are_conditional_on_the_held() -> None:
+    plant = closed(product, a=2.0, b=3.0, c=1.0)
+    free = [Free("a", 2, 0.1, 20), Free("b", 3, 0.1, 20), Free("c", 1, -5, 5)]
+    _, found = both(plant, [measured(plant, {"a": 2.5}, 0.01)], free)
+    assert found.fitted == ("a", "c") and found.status == "converged"
+    assert "structurally-unidentifiable, held at 3" in found.held["b"]
+    assert found.estimates["a"].conditional_on == ("b",) and found.estimates["c"].conditional_on == ()
+    assert found.estimates["a"].value == pytest.approx(2.5, abs=0.02) and found.values["b"] == 3.0
+
+
+def test_weak_ones_have_an_interval_and_no_std() -> None:
+    plant = closed(line, a=1.0, b=1.0)
+    free = [Free("a", 1, 0.1, 50), Free("b", 1, 0.01, 50)]
+    report, found = both(plant, [measured(plant, {"a": 5, "b": 1.5}, 2.0, t=np.linspace(0, 1, 80))], free)
+    b = found.estimates["b"]
+    assert b.std is None and b.std_raw is None and b.method == "profile" and b.reason.startswith("weak")
+    assert list(b.ci95) == report["parameters"]["b"]["ci95"] and b.ci95[0] <= b.value <= b.ci95[1]
+    assert found.estimates["a"].std is not None
+
+
+def test_one_at_a_bound_stands_there_with_its_limit() -> None:
+    plant = closed(line, a=Parameter(1.0), b=Parameter(0.5, min=0.0))
+    free = [Free("a", 1, -5, 5), Free("b", 0.5, 0.0, 5.0)]
+    _, found = both(plant, [measured(plant, {"a": 1, "b": -0.05}, 0.05)], free)
+    assert found.fitted == ("a",) and "b" in found.held
+    b = found.estimates["b"]
+    assert b.value == 0.0 and b.std is None and b.method == "one-sided" and b.ci95[0] == 0.0 < b.ci95[1]
+
+
+def test_forced_ones_are_fitted_and_marked() -> None:
+    plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
+    free = [Free("a", 0, -5, 5), Free("b", 0, -5, 5), Free("c", 1.0, -100, 100)]
+    data = [measured(plant, {"a": 1, "b": 2}, 0.01)]
+    report, found = both(plant, data, free, force=("c",))
+    assert set(found.fitted) == {"a", "b", "c"} and "forced" in found.estimates["c"].reason
+    assert gate(report, ("c", "a")).forced == ("c",)
+    with pytest.raises(UnknownNameError, match="no candidate 'd'"):
+        gate(report, ("d",))
+
+
+def test_nothing_identifiable_is_no_success() -> None:
+    plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
+    free = [Free("c", 1.0, -100, 100)]
+    _, found = both(plant, [measured(plant, {}, 0.01)], free)
+    assert found.status == "failed" and found.fitted == () and "insensitive" in found.held["c"]
+
+
+CARD = """schema = 1
+name = "two"
+[parameters]
+k = {value = 5.0, min = 0.1, max = 50}
+flat = {value = 1.0, min = 0.0, max = 10}
+[inputs]
+u = {value = 0.0}
+[states]
+x = {derivative = "k*(u - x)"}
+z = {derivative = "flat*(0*u - z)"}
+[outputs]
+y = "x"
+"""
+STUDY = """schema = 1
+name = "two"
+[model]
+source = "two.toml"
+[parameters]
+k = {start = 3}
+flat = {start = 2}
+[fit]
+starts = 2
+[[experiment]]
+name = "step"
+data = "step.csv"
+inputs = ["u"]
+outputs = ["y"]
+noise = {y = 0.01}
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    t = np.linspace(0, 2, 201)
+    u = np.where(t >= 0.2, 1.0, 0.0)
+    y = np.where(t >= 0.2, 1 - np.exp(-5 * (t - 0.2)), 0) + 0.01 * np.random.default_rng(0).normal(size=t.size)
+    rows = "\n".join(f"{a:.6g},{b:g},{c:.8g}" for a, b, c in zip(t, u, y, strict=True))
+    (tmp_path / "step.csv").write_text(f"time,u,y\n{rows}\n")
+    (tmp_path / "two.toml").write_text(CARD)
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    return path
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def test_the_commands(study) -> None:
+    result = call("identify", study, "--quiet")
+    assert result.exit_code == 0, result.output
+    folder = study.parent / "study-results"
+    report = json.loads((folder / "identifiability.json").read_text())
+    assert {"schema", "study", "model", "software", "seed"} <= set(report)
+    assert report["identifiable"] == ["k"]
+    assert report["parameters"]["flat"]["verdict"] in ("insensitive", "structurally-unidentifiable")
+    result = call("fit", study, "--quiet")
+    assert result.exit_code == 0, result.output
+    found = json.loads((folder / "fit.json").read_text())
+    assert found["fitted"] == ["k"] and "flat" in found["held"] and found["forced"] == []
+    assert abs(found["estimates"]["k"]["value"] - 5) < 0.1 and found["estimates"]["k"]["method"] == "profile"
+    result = call("fit", study, "--force", "flat", "--json")
+    assert json.loads(result.stdout)["forced"] == ["flat"]
+    result = call("report", study)
+    page = (folder / "report.html").read_text()
+    assert "What the data tell about the parameters" in page and "What to measure next" in page
+    result = call("fit", study, "--force", "nothing")
+    assert result.exit_code == 2 and "no candidate 'nothing'" in result.output

@@ -1,0 +1,185 @@
+"""Every verdict, earned by a case made for it; the set to fit; what is said of the data."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from hvdc_ident import load_model
+from hvdc_ident.errors import InputError, SimulationError, StudyError
+from hvdc_ident.experiment import InputSignal
+from hvdc_ident.fit import Free
+from hvdc_ident.identifiability import identifiability
+from hvdc_ident.parameters import Parameter
+from tests.fit.simulators import decay, line
+from tests.identifiability.cases import (
+    STEPS,
+    closed,
+    failing,
+    line_and_nothing,
+    measured,
+    on_model,
+    pi_loop,
+    product,
+    saturating,
+)
+
+
+def test_identifiable() -> None:
+    plant = closed(decay, a=1.0, k=1.0)
+    report = identifiability(
+        plant, [measured(plant, {"a": 2, "k": 3}, 0.01)], [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)], starts=3
+    )
+    assert [v.verdict for v in report.parameters.values()] == ["identifiable"] * 2
+    assert report.identifiable == ("a", "k") and not report.held and not report.combinations
+    k = report.parameters["k"]
+    assert k.ci95[0] < 3 < k.ci95[1] and k.std == pytest.approx((k.ci95[1] - k.ci95[0]) / 3.92, rel=0.05)
+    assert "It is known to ±" in k.reason and "'e'" in k.reason
+    assert not report.misspecification.flag
+
+
+def test_structurally_unidentifiable_by_numbers() -> None:
+    plant = closed(product, a=2.0, b=3.0, c=1.0)
+    free = [Free("a", 2, 0.1, 20), Free("b", 3, 0.1, 20), Free("c", 1, -5, 5)]
+    report = identifiability(plant, [measured(plant, {"a": 2.5}, 0.01)], free, starts=3)
+    assert {n: v.verdict for n, v in report.parameters.items()} == {
+        "a": "structurally-unidentifiable",
+        "b": "structurally-unidentifiable",
+        "c": "identifiable",
+    }
+    assert report.identifiable == ("a", "c") and report.held["b"][0] == 3.0
+    assert report.parameters["a"].conditional_on == ("b",)
+    assert report.combinations[0].seen == ("a*b",)
+    assert report.structure.method == "numerical, local"
+
+
+@pytest.mark.parametrize("outputs", [["y"], ["y", "control"]])
+def test_structurally_unidentifiable_on_a_loop(outputs) -> None:
+    model = pi_loop()
+    free = [Free(n, 1.3 * v, v / 10, v * 10) for n, v in model.values.items()]
+    report = identifiability(model, [on_model(model, "e", {"r": STEPS}, outputs, 1e-3)], free, starts=4)
+    if outputs == ["y"]:
+        assert {n for n, v in report.parameters.items() if v.verdict == "structurally-unidentifiable"} == {
+            "b",
+            "kp",
+            "ki",
+        }
+        assert len(report.identifiable) == 3 and "a" in report.identifiable
+        assert "b" in report.parameters["b"].reason and "b*k" in report.combinations[0].words
+        (held,) = report.held
+        others = [n for n in ("b", "kp", "ki") if n != held]
+        assert all(report.parameters[n].conditional_on == (held,) for n in others)
+    else:
+        assert report.identifiable == ("a", "b", "kp", "ki")
+    assert report.parameters["a"].ci95[0] < 0.8 < report.parameters["a"].ci95[1]
+
+
+def test_insensitive_is_confirmed_at_both_ends() -> None:
+    plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
+    free = [Free("a", 0, -5, 5), Free("b", 0, -5, 5), Free("c", 1.0, -100, 100)]
+    report = identifiability(plant, [measured(plant, {"a": 1, "b": 2}, 0.01)], free, starts=2)
+    c = report.parameters["c"]
+    assert c.verdict == "insensitive" and c.value == 1.0 and report.held["c"][0] == 1.0
+    assert "would be needed" in c.reason and report.identifiable == ("a", "b")
+
+
+def test_practically_unidentifiable_where_the_profile_stays_open() -> None:
+    plant = closed(saturating, a=1.0, k=20.0)
+    t = np.linspace(0.2, 1.0, 41)
+    free = [Free("a", 1, 0.1, 10), Free("k", 10, 1, 1000)]
+    report = identifiability(plant, [measured(plant, {"a": 2, "k": 60}, 0.02, t=t)], free, starts=3)
+    k = report.parameters["k"]
+    assert k.verdict == "practically-unidentifiable" and "from above" in k.reason and k.ci95[1] is None
+    assert report.identifiable == ("a",) and report.held["k"][0] == 10.0
+
+
+def test_weak_is_fitted_but_has_no_std() -> None:
+    plant = closed(line, a=1.0, b=1.0)
+    free = [Free("a", 1, 0.1, 50), Free("b", 1, 0.01, 50)]
+    report = identifiability(plant, [measured(plant, {"a": 5, "b": 1.5}, 2.0, t=np.linspace(0, 1, 80))], free, starts=2)
+    b = report.parameters["b"]
+    assert b.verdict == "weak" and b.std is None and b.relative_std is None and "known only to lie in" in b.reason
+    assert report.identifiable == ("a", "b")
+
+
+def test_at_bound_has_a_one_sided_limit_and_is_held() -> None:
+    plant = closed(line, a=Parameter(1.0), b=Parameter(0.5, min=0.0))
+    free = [Free("a", 1, -5, 5), Free("b", 0.5, 0.0, 5.0)]
+    report = identifiability(plant, [measured(plant, {"a": 1, "b": -0.05}, 0.05)], free, starts=2)
+    b = report.parameters["b"]
+    assert b.verdict == "at-bound" and b.value == 0.0 and b.ci95[0] == 0.0 and 0 < b.ci95[1] < 0.1
+    assert "physical bound" in b.reason and report.held["b"][0] == 0.0 and report.identifiable == ("a",)
+
+
+def test_the_link_at_its_bound_and_with_a_flat_gain() -> None:
+    model = load_model("vsc-hvdc-link")
+    step = {"Pref2": InputSignal.step(0.1, 0.4, 0.5)}
+    data = on_model(model, "p", step, ["Irorder2", "Iiorder2"], 1e-4, end=0.5, rows=251)
+    free = [Free("KIP", 25, 5, 50), Free("KPP", 0.1, 0, 2), Free("KIQ2", 20, 5, 50)]
+    report = identifiability(model, [data], free, starts=3)
+    assert {n: v.verdict for n, v in report.parameters.items()} == {
+        "KIP": "identifiable",
+        "KPP": "at-bound",
+        "KIQ2": "insensitive",
+    }
+    assert report.parameters["KPP"].value == 0.0 and report.held["KIQ2"][0] == 20.0
+    assert report.recommended is not None and report.recommended.input == "Qref2"
+    assert report.recommended.predicted["KIQ2"] < 1.0 and "KIQ2 would be known" in report.recommended.text
+
+
+def test_to_dict_is_the_json() -> None:
+    plant = closed(decay, a=1.0, k=1.0)
+    data = [measured(plant, {"a": 2, "k": 3}, 0.01, seed=s, name=f"e{s}") for s in range(3)]
+    free = [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)]
+    found = identifiability(plant, data, free, starts=2).to_dict()
+    wanted = "parameters identifiable combinations collinearity correlation structural misspecified experiments"
+    assert {*wanted.split(), "recommended_experiment"} <= set(found)
+    line = found["parameters"]["k"]
+    assert {"verdict", "reason", "value", "ci95", "relative_std", "sensitivity_norm"} <= set(line)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert set(found["experiments"]) == {"e0", "e1", "e2"} and found["misspecified"] is False
+
+
+# --- bad input ---
+
+
+def test_data_without_noise_say_so() -> None:
+    plant = closed(decay, a=1.0, k=1.0)
+    free = [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)]
+    report = identifiability(plant, [measured(plant, {"a": 2, "k": 3}, 0.0)], free, starts=2)
+    assert any("no noise" in n for n in report.notes) and report.identifiable == ("a", "k")
+    assert "no noise" in report.parameters["k"].reason
+
+
+def test_no_excitation_says_so() -> None:
+    model = pi_loop()
+    data = on_model(model, "still", {"r": InputSignal.constant(0.0)}, ["y"], 1e-3)
+    report = identifiability(model, [data], [Free("a", 1, 0.1, 10), Free("kp", 1, 0.1, 10)], starts=2)
+    assert report.identifiable == () and any("No input moves" in n for n in report.notes)
+    for v in report.parameters.values():
+        assert v.verdict in ("insensitive", "structurally-unidentifiable")
+
+
+def test_more_unknowns_than_rows() -> None:
+    plant = closed(line, a=1.0, b=1.0)
+    data = measured(plant, {"a": 1, "b": 2}, 0.1, t=np.array([0.5]))
+    report = identifiability(plant, [data], [Free("a", 1, -50, 50), Free("b", 1, -50, 50)], starts=2)
+    assert len(report.identifiable) == 1 and any("1 measured values cannot" in n for n in report.notes)
+
+
+def test_an_experiment_that_fails_is_named() -> None:
+    plant = closed(failing, a=1.0)
+    good = closed(decay, a=1.0, k=1.0)
+    with pytest.raises(SimulationError, match="experiment 'e'"):
+        identifiability(plant, [measured(good, {}, 0.1)], [Free("a", 1, 0, 2)], starts=2)
+
+
+def test_nothing_measured_and_unknown_names_are_refused() -> None:
+    plant = closed(line, a=1.0, b=1.0)
+    data = measured(plant, {}, 0.1)
+    with pytest.raises(InputError):
+        identifiability(plant, [data], [Free("c", 1, 0, 2)])
+    with pytest.raises(StudyError, match="nothing to fit"):
+        identifiability(plant, [data.with_(measured=None)], [Free("a", 1, 0, 2)])

@@ -1,0 +1,138 @@
+"""Profiles of functions whose intervals are known in closed form.
+
+LikelihoodProfiler.jl, models/AnalyticFuncs (https://github.com/insysbio/LikelihoodProfiler.jl); the function rises by 4
+at the ends. Costs here are half a sum of squares, so the threshold is 2.
+"""
+
+from __future__ import annotations
+
+from math import log, sqrt
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, minimize_scalar
+
+from hvdc_ident.fit import Free
+from hvdc_ident.fit.objective import LeastSquares, Smooth
+from hvdc_ident.fit.profile import Walk, profiles
+
+EXACT = Walk(tolerance=1e-10)
+
+
+def free(*names):
+    return tuple(Free(n, 0.0) for n in names)
+
+
+def quadratic(t):
+    return np.array([t[0] - 3, t[0] - t[1] - 1]), np.array([[1.0, 0, 0], [1, -1, 0]])
+
+
+def exponential(t):
+    return np.exp(t) - 1, np.exp(t)[:, None]
+
+
+def rosenbrock(t):
+    return np.array([1 - t[0], 10 * (t[1] - t[0] ** 2)]), np.array([[-1.0, 0], [-20 * t[0], 10]])
+
+
+def ends(residual, names, start):
+    found = profiles(LeastSquares(free(*names), residual), np.array(start, float), threshold=2.0, walk=EXACT)
+    assert found.restarts == ()
+    return {n: p.ci95 for n, p in found.by_name.items()}, found
+
+
+def test_quadratic_with_a_parameter_that_is_not_there() -> None:
+    ci, found = ends(quadratic, ["x1", "x2", "x3"], [3, 2, 0])
+    assert ci["x1"] == pytest.approx((1, 5), abs=1e-8)
+    assert ci["x2"] == pytest.approx((2 - 2 * sqrt(2), 2 + 2 * sqrt(2)), abs=1e-8)
+    assert ci["x3"] == (None, None)
+    assert {found.by_name["x3"].lower.status, found.by_name["x3"].upper.status} == {"not-found"}
+
+
+def test_exponential_is_open_below() -> None:
+    ci, found = ends(exponential, ["x"], [0.0])
+    assert ci["x"][1] == pytest.approx(log(3), abs=1e-9)
+    assert ci["x"][0] is None and "no crossing" in found.by_name["x"].lower.reason
+
+
+def test_rosenbrock() -> None:
+    ci, _ = ends(rosenbrock, ["x1", "x2"], [1, 1])
+    assert ci["x1"] == pytest.approx((-1, 3), abs=1e-8)
+
+    def best(x2):
+        return min(
+            minimize_scalar(lambda a: (1 - a) ** 2 + 100 * (x2 - a * a) ** 2, bounds=b, options={"xatol": 1e-12}).fun
+            for b in ((-4, 0), (0, 4))
+        )
+
+    low = brentq(lambda v: best(v) - 4, -0.5, 0.0)
+    high = brentq(lambda v: best(v) - 4, 8.0, 10.0)
+    assert ci["x2"] == pytest.approx((low, high), abs=1e-6)
+    assert ci["x2"] == pytest.approx((-0.174, 9.0), abs=5e-3)  # as published
+
+
+def test_a_cost_given_with_its_gradient_alone_has_the_same_profile() -> None:
+    def cost(t):
+        r, j = rosenbrock(t)
+        return float(r @ r), 2 * j.T @ r
+
+    found = profiles(Smooth(free("x1", "x2"), cost), np.array([1.0, 1.0]), ["x1"], threshold=4.0, walk=EXACT)
+    assert found.by_name["x1"].ci95 == pytest.approx((-1, 3), abs=1e-6)
+
+
+def test_bounds_open_a_profile_and_physical_ones_end_it() -> None:
+    unknowns = (Free("x", 0.0, -0.5, 5.0),)
+    found = profiles(LeastSquares(unknowns, exponential), np.zeros(1), threshold=2.0, walk=EXACT).by_name["x"]
+    assert found.lower.status == "open-at-bound" and found.lower.limit is None
+    assert found.upper.limit == pytest.approx(log(3), abs=1e-9)
+    own = {"x": (True, False)}
+    found = profiles(LeastSquares(unknowns, exponential), np.zeros(1), threshold=2.0, physical=own).by_name["x"]
+    assert found.lower.status == "closed" and found.lower.limit == -0.5
+
+
+def test_at_a_bound_the_limit_is_one_sided() -> None:
+    unknowns = (Free("x", 0.0, 0.0, 50.0),)
+
+    def line(t):
+        return t + 1.0, np.ones((1, 1))  # would like to be at -1
+
+    found = profiles(LeastSquares(unknowns, line), np.zeros(1), walk=EXACT).by_name["x"]
+    assert found.one_sided and found.lower.status == "open-at-bound"
+    assert found.upper.limit == pytest.approx(sqrt(1 + 2 * 1.353) - 1, rel=1e-9)
+
+
+def test_a_crossing_that_leans_on_a_search_bound_does_not_count() -> None:
+    def pair(t):
+        return np.array([10 * (t[0] - t[1]), 0.01 * t[1]]), np.array([[10.0, -10], [0, 0.01]])
+
+    unknowns = (Free("x", 0.0, -20, 20), Free("y", 0.0, -1, 1))
+    found = profiles(LeastSquares(unknowns, pair), np.zeros(2), ["x"]).by_name["x"]
+    assert found.upper.status == "not-found" and "y cannot leave the bounds" in found.upper.reason
+    found = profiles(LeastSquares(unknowns, pair), np.zeros(2), ["x"], physical={"y": (True, True)}).by_name["x"]
+    assert found.closed
+
+
+def test_a_better_optimum_on_the_way_starts_all_over_and_is_told() -> None:
+    def wells(t):
+        x, y = t
+        return (x * x - 1) ** 2 * 8 + 1.0 * x + (y - x) ** 2, np.array(
+            [32 * x * (x * x - 1) + 1.0 - 2 * (y - x), 2 * (y - x)]
+        )
+
+    unknowns = (Free("x", 1.0, -3, 3), Free("y", 1.0, -3, 3))
+    found = profiles(Smooth(unknowns, wells), np.array([1.0, 1.0]), ["x"], threshold=20.0)
+    assert found.theta[0] < -0.9 and len(found.restarts) == 1 and "profile of x" in found.restarts[0]
+
+
+def test_many_parameters_cost_few_evaluations() -> None:
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(40, 6))
+
+    def linear(t):
+        return a @ t, a
+
+    found = profiles(LeastSquares(tuple(Free(f"p{i}", 0.0, -9, 9) for i in range(6)), linear), np.zeros(6))
+    inverse = np.linalg.inv(a.T @ a)
+    for i, p in enumerate(found.by_name.values()):
+        assert p.ci95[1] == pytest.approx(sqrt(2 * 1.92 * inverse[i, i]), rel=1e-3)
+        assert p.evaluations <= 16
