@@ -14,6 +14,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.reduce import without_sliding_means
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,7 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 
     A model with delays is searched on its exact response. Raises LinearizationError for an unstable one.
     """
-    if model.delay_free is not None:
-        return _peak_on_grid(model)
-    a, b, c, d = model.standard()
+    a, b, c, d = without_sliding_means(model)
     poles = np.linalg.eigvals(a) if a.shape[0] else np.zeros(0)
     if (poles.real >= 0).any():
         raise LinearizationError(
@@ -58,6 +57,9 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
             got=f"eigenvalue {poles[np.argmax(poles.real)]:.6g}",
             hint="compare with nu_gap, which takes unstable models",
         )
+
+    if model.delay_free is not None:
+        return _peak_on_grid(model)
 
     def gain(w: float) -> float:
         value = c @ np.linalg.solve(1j * w * np.eye(a.shape[0]) - a, b) + d if a.shape[0] else d
@@ -118,7 +120,7 @@ def _peak_on_grid(model: LinearModel) -> Peak:
 
 def h2_norm(model: LinearModel) -> float:
     """The H2 norm, by a Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0."""
-    a, b, c, d = model.standard()
+    a, b, c, d = without_sliding_means(model)
     if np.any(d):
         raise LinearizationError("the H2 norm is infinite: D is not 0", where=f"linear model '{model.name}'")
     if a.shape[0] == 0:
@@ -134,12 +136,9 @@ def h2_norm(model: LinearModel) -> float:
 def difference(first: LinearModel, second: LinearModel) -> LinearModel:
     """The model first - second. Raises LinearizationError where their inputs or outputs differ."""
     _same_channels(first, second)
-    a1, b1, c1, d1 = first.standard()
-    a2, b2, c2, d2 = second.standard()
-    names = (
-        *(f"1.{n}" for n in first.state_names[: a1.shape[0]]),
-        *(f"2.{n}" for n in second.state_names[: a2.shape[0]]),
-    )
+    a1, b1, c1, d1 = without_sliding_means(first)
+    a2, b2, c2, d2 = without_sliding_means(second)
+    names = (*_names("1", first, a1.shape[0]), *_names("2", second, a2.shape[0]))
     return replace(
         first,
         A=scipy.linalg.block_diag(a1, a2) if names else np.zeros((0, 0)),
@@ -155,6 +154,12 @@ def difference(first: LinearModel, second: LinearModel) -> LinearModel:
         delay_free=None,
         name=f"{first.name} - {second.name}",
     )
+
+
+def _names(prefix: str, model: LinearModel, count: int) -> tuple[str, ...]:
+    """The states' names; numbers where some states have been projected out."""
+    known = model.state_names if count == len(model.state_names) else [f"x{k + 1}" for k in range(count)]
+    return tuple(f"{prefix}.{n}" for n in known)
 
 
 def _same_channels(first: LinearModel, second: LinearModel) -> None:
@@ -203,8 +208,8 @@ def _chordal(p1: Array, p2: Array) -> Array:
 
 def winding_count(first: LinearModel, second: LinearModel) -> int:
     """wno det(1 + P2~ P1) + eta(P1) - eta(P2) - eta0(P2), the count that must be 0; delays in their Pade form."""
-    a1, b1, c1, d1 = first.standard()
-    a2, b2, c2, d2 = second.standard()
+    a1, b1, c1, d1 = without_sliding_means(first)
+    a2, b2, c2, d2 = without_sliding_means(second)
     # P2~(s) = P2(-s)^T, in series behind P1, with unit negative feedback.
     at, bt, ct, dt = -a2.T, -c2.T, b2.T, d2.T
     through = np.eye(d1.shape[1]) + dt @ d1

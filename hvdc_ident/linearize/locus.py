@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.jacobian import state_matrix
-from hvdc_ident.linearize.modal import eigen
+from hvdc_ident.linearize.modal import ZERO, eigen
 from hvdc_ident.linearize.newton import newton
 from hvdc_ident.linearize.operating_point import solve
 from hvdc_ident.linearize.search import Search
@@ -43,8 +43,8 @@ class Locus:
 
     @property
     def stable(self) -> Array:
-        """(points,) whether every eigenvalue lies left of the axis."""
-        return np.asarray((self.eigenvalues.real < 0).all(axis=1))
+        """(points,) whether every eigenvalue lies left of the axis, those that stay at 0 apart."""
+        return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
 
     def plot(self) -> Any:
         """A figure of the locus."""
@@ -135,6 +135,11 @@ class _Along:
         return state_matrix(self.model, search.system, point.y, point.w, point.p)
 
 
+def at_zero(table: Array) -> Array:
+    """Which eigenvalues (points, modes) are 0 but for rounding."""
+    return np.asarray(np.abs(table) <= ZERO * np.maximum(1.0, np.abs(table).max(axis=1, keepdims=True)))
+
+
 def match(before: Array, left: Array, after: Array, right: Array) -> Array:
     """The order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding between alike."""
     likeness = np.abs(left @ right)
@@ -149,9 +154,10 @@ def match(before: Array, left: Array, after: Array, right: Array) -> Array:
 def _limits(at: _Along, values: Array, table: Array) -> tuple[StabilityLimit, ...]:
     """Where a mode's real part changes sign, to the last digits: bisection on the mode nearest to the axis."""
     found = []
+    resting = at_zero(table)
     for k in range(values.size - 1):
         a, b = table[k].real, table[k + 1].real
-        for j in np.flatnonzero((a < 0) != (b < 0)):
+        for j in np.flatnonzero(((a < 0) != (b < 0)) & ~(resting[k] & resting[k + 1])):
             if table[k, j].imag < 0:
                 continue
             value, eigenvalue = _crossing(

@@ -15,6 +15,7 @@ from hvdc_ident.linearize.frequency import Response, default_omega, transfer
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
+from hvdc_ident.linearize.reduce import without_sliding_means
 from hvdc_ident.model.definition import Model, Output, State
 from hvdc_ident.model.transform import driven, fresh
 from hvdc_ident.parameters import Input
@@ -32,8 +33,11 @@ class Loop:
         return self.open.bode(omega)
 
     def closed_poles(self) -> Array:
-        """Poles with the loop closed, delays in their Pade form. Raises LinearizationError for an ill-posed loop."""
-        a, b, c, d = self.open.standard()
+        """Poles with the loop closed, delays in their Pade form, sliding means without their hidden zero.
+
+        Raises LinearizationError for an ill-posed loop.
+        """
+        a, b, c, d = without_sliding_means(self.open)
         through = 1.0 + float(d[0, 0])
         if abs(through) < 1e-12:
             raise LinearizationError(

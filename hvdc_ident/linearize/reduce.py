@@ -98,6 +98,30 @@ def _refuse_unstable(model: LinearModel, hidden: Array, verb: str) -> None:
         )
 
 
+def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D without the zero eigenvalues that a Pade approximant leaves where a sliding mean stands.
+
+    y' = (u - u(t - T))/T has no pole at 0; with the delay approximated it has one that no input reaches: what it keeps
+    is the difference between y and the mean, which is 0 for ever. Models without delays are left as they are.
+    """
+    a, b, c, d = model.standard()
+    if model.delay_free is None or a.shape[0] == 0:
+        return a, b, c, d
+    a, b, c = _scale(a, b, c)
+    rows = scipy.linalg.null_space(a.T, rcond=1e-13).T
+    if rows.shape[0] == 0:
+        return a, b, c, d
+    # Within the left null space, the combinations that no input drives.
+    driven = rows @ b
+    u, sizes, _ = np.linalg.svd(driven, full_matrices=True)
+    rank = int((sizes > 1e-9 * max(float(np.linalg.norm(b)), 1e-300)).sum())
+    free = u[:, rank:].T @ rows
+    if free.shape[0] == 0:
+        return a, b, c, d
+    keep = scipy.linalg.null_space(free)
+    return keep.T @ a @ keep, keep.T @ b, c @ keep, d
+
+
 def _renamed(model: LinearModel, a: Array, b: Array, c: Array, d: Array, how: str) -> LinearModel:
     names = tuple(f"{how}{k + 1}" for k in range(a.shape[0]))
     return replace(

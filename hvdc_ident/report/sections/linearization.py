@@ -26,7 +26,8 @@ def _render(results: Results) -> str:
 
 
 def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
-    right = max(float(m["eigenvalue"][0]) for m in data["modes"])
+    real = [float(m["eigenvalue"][0]) for m in data["modes"] if "sliding mean" not in str(m.get("kind", ""))]
+    right = max(real, default=0.0)
     verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
     return (
         f"<p>{len(data['modes'])} modes; the operating point is <strong>{verdict}</strong>, rightmost real part "
