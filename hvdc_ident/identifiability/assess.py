@@ -28,7 +28,8 @@ from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogen
 from hvdc_ident.identifiability.pilot import Optimum, pilot
 from hvdc_ident.identifiability.recommend import Recommendation, recommend
 from hvdc_ident.identifiability.report import IdentifiabilityReport
-from hvdc_ident.identifiability.structure import Structure, numerical_structure
+from hvdc_ident.identifiability.structure import Structure
+from hvdc_ident.identifiability.structure import structure as structure_of
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.fisher import (
@@ -78,7 +79,6 @@ class _Assessment:
         self.held: dict[str, str] = {}
         self.combinations: list[Combination] = []
         self.thresholds: dict[str, float] = {}
-        self.norms: dict[str, float] = {}
         self.notes: list[str] = []
         self.remark = ""
 
@@ -86,7 +86,7 @@ class _Assessment:
         """The report."""
         self._check()
         self._tell("structure")
-        structure = numerical_structure(self.problem, self.seed)
+        structure = structure_of(self.model, self.problem, self.seed)
         self._structural(structure)
         first = replace(
             self.problem,
@@ -95,7 +95,6 @@ class _Assessment:
         )
         optimum, result = pilot(first, starts=starts, seed=self.seed, executor=executor, progress=self.progress)
         self._data_notes(optimum, result)
-        self.norms.update(optimum.information.norms)
         rest: Optimum | None = self._insensitive(optimum)
         rest = self._lost(rest) if rest else None
         last = self._profiled(rest) if rest else None
@@ -130,6 +129,7 @@ class _Assessment:
     # --- the stages, each taking parameters out ---
 
     def _structural(self, structure: Structure) -> None:
+        self.unmoved = structure.unmoved
         stuck = [n for n in self.free if n not in structure.admissible]
         self.combinations += [
             replace(c, held=tuple(n for n in c.members if n in stuck)) for c in structure.combinations
@@ -138,7 +138,12 @@ class _Assessment:
             for n in c.members:
                 at = self.free[n].start if n in stuck else None
                 others = [m for m in c.members if m in stuck]
-                self.found.setdefault(n, verdicts.structural(n, c.words, at, self.units[n], others))
+                self.found.setdefault(
+                    n,
+                    verdicts.structural(
+                        n, c.words, at, self.units[n], others, local=structure.method.endswith("local")
+                    ),
+                )
         for n in stuck:
             self.held[n] = self.found[n].reason if n in self.found else "not seen"
         if structure.note:
@@ -156,9 +161,15 @@ class _Assessment:
             rise = rise_at_ends(optimum, i, self.free[n])
             if rise is None or rise >= limit:
                 continue
-            self._judge(verdicts.insensitive(self.free[n], rise, limit, self.units[n], self.quiet))
+            self._judge(verdicts.insensitive(self.free[n], rise, limit, self.units[n], self._still(n)))
             out[n] = self.found[n].reason
         return self._without(optimum, out)
+
+    def _still(self, name: str) -> str:
+        """The remark that it is for want of moving an input, where it is."""
+        if self.quiet:
+            return "No input moves in any of these experiments."
+        return "It shows only where an input is moved that was not." if name in self.unmoved else ""
 
     def _lost(self, optimum: Optimum) -> Optimum | None:
         """The optimum with the fewest parameters held so that no direction is invisible in these data."""
@@ -278,7 +289,7 @@ class _Assessment:
             if n not in fitted
         }
         for n in self.free:
-            self.found[n] = replace(self.found[n], sensitivity_norm=self.norms.get(n)).noted(self.remark)
+            self.found[n] = self.found[n].noted(self.remark)
             if n in held:
                 self.found[n] = replace(self.found[n], value=held[n][0])
             elif last is not None and not np.isfinite(self.found[n].value):
@@ -287,20 +298,21 @@ class _Assessment:
             heterogeneity(last) if last is not None and len(last.problem.fitted_experiments) > 1 else FrozenMap()
         )
         judged = misspecification(last, different, self.units) if last is not None else Misspecification(False, ())
+        whole = self._whole(last or first)
         matrix = first.information.matrix
         collinear = collinear_subsets(matrix, first.names)[:200] if len(first.names) > 1 else ()
         return IdentifiabilityReport(
-            FrozenMap({n: self.found[n] for n in self.free}),
+            FrozenMap({n: replace(self.found[n], sensitivity_norm=whole.information.norms[n]) for n in self.free}),
             fitted,
             FrozenMap(held),
             structure,
             tuple(self.combinations),
             collinear,
             last.uncertainty.correlation() if last is not None else {},
-            first.information.shares(),
+            whole.information.shares(),
             different,
             judged,
-            self._recommended(last or first),
+            self._recommended(whole),
             FrozenMap(self.thresholds),
             {
                 "status": result.status,
@@ -314,16 +326,18 @@ class _Assessment:
             tuple(self.notes),
         )
 
-    def _recommended(self, at: Optimum) -> Recommendation | None:
+    def _whole(self, at: Optimum) -> Optimum:
+        """All candidates free, at the values found or held."""
+        values = {**{n: f.start for n, f in self.free.items()}, **at.problem.values(at.theta)}
+        theta = [values[n] for n in self.free]
+        theta += [v for u, v in zip(at.problem.names, at.theta, strict=True) if u not in self.free]
+        return Optimum(replace(self.problem, weights=at.problem.weights), np.array(theta, dtype=float))
+
+    def _recommended(self, whole: Optimum) -> Recommendation | None:
         """What to measure next, where the model's inputs are known."""
         if self.model is None:
             return None
         self._tell("what to measure next")
-        values = {**{n: f.start for n, f in self.free.items()}, **at.problem.values(at.theta)}
-        theta = [values[n] for n in self.free] + [
-            u_value for u, u_value in zip(at.problem.names, at.theta, strict=True) if u not in self.free
-        ]
-        whole = Optimum(replace(self.problem, weights=at.problem.weights), np.array(theta, dtype=float))
         inputs = {n: i.value for n, i in self.model.inputs.items()}
         units = {**self.units, **{n: i.unit for n, i in self.model.inputs.items()}}
         try:

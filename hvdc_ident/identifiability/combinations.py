@@ -22,6 +22,7 @@ class Combination:
     members: in the order listed. seen: the combinations, in words. kind: "structural" (no data could tell) or
     "practical" (these data do not). direction: the change of the members that leaves the outputs alone, in scaled
     coordinates (relative, or share of the range). held: those put at their start value so that the others can be told.
+    text: the finding in words where `seen` has none.
     """
 
     members: tuple[str, ...]
@@ -29,11 +30,14 @@ class Combination:
     kind: Literal["structural", "practical"]
     direction: FrozenMap[float] = field(default_factory=FrozenMap)
     held: tuple[str, ...] = ()
+    text: str = ""
 
     @property
     def words(self) -> str:
         """The finding as a sentence."""
         names = _list(self.members)
+        if self.text:
+            return self.text
         if not self.seen:
             return f"{names} cannot be told apart" if len(self.members) > 1 else f"{names} is not seen"
         verb = "is" if len(self.seen) == 1 else "are"

@@ -48,9 +48,20 @@ class Verdict:
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
 
 
-def structural(name: str, words: str, held_at: float | None, unit: str, conditional_on: Sequence[str] = ()) -> Verdict:
-    """Only a combination shows, whatever the data. held_at: its start value where it is one of those held."""
-    text = f"Whatever the data, {words}"
+def structural(
+    name: str,
+    words: str,
+    held_at: float | None,
+    unit: str,
+    conditional_on: Sequence[str] = (),
+    *,
+    local: bool = False,
+) -> Verdict:
+    """Only a combination shows, whatever the data. held_at: its start value where it is one of those held.
+
+    local: whether that was found from numbers at a few points.
+    """
+    text = f"{'At every point tried' if local else 'However good the data'}, {words}"
     if held_at is not None:
         text += f": it is held at {_with_unit(held_at, unit)}."
         return Verdict(name, "structurally-unidentifiable", text, held_at, unit)
@@ -58,13 +69,12 @@ def structural(name: str, words: str, held_at: float | None, unit: str, conditio
     return Verdict(name, "structurally-unidentifiable", text, float("nan"), unit, conditional_on=tuple(conditional_on))
 
 
-def insensitive(free: Free, rise: float, threshold: float, unit: str, quiet: bool) -> Verdict:
-    """Its whole range moves the outputs by less than noise may. rise: of the cost at the worse end. quiet: no input moves."""
+def insensitive(free: Free, rise: float, threshold: float, unit: str, also: str = "") -> Verdict:
+    """Its whole range moves the outputs by less than noise may. rise: of the cost at the worse end. also: a remark."""
     span = f"Anywhere between {free.min:.4g} and {_with_unit(free.max, unit)}"
     told = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
-    also = " No input moves in any of these experiments." if quiet else ""
-    return Verdict(free.name, "insensitive", f"{span} {told}{why}.{also}", free.start, unit)
+    return Verdict(free.name, "insensitive", f"{span} {told}{why}. {also}".rstrip(), free.start, unit)
 
 
 def practical(profile: Profile, words: str, unit: str) -> Verdict:

@@ -68,7 +68,9 @@ def test_structurally_unidentifiable_on_a_loop(outputs) -> None:
         }
         assert len(report.identifiable) == 3 and "a" in report.identifiable
         assert "b" in report.parameters["b"].reason and "b*k" in report.combinations[0].words
+        assert report.structure.method == "prime field"
         (held,) = report.held
+        assert held == "ki"  # of equals the later listed
         others = [n for n in ("b", "kp", "ki") if n != held]
         assert all(report.parameters[n].conditional_on == (held,) for n in others)
     else:
