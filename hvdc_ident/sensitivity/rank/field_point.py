@@ -44,7 +44,14 @@ class Tear:
     equation: int
 
 
-Step = Solve | Draw | Tear
+@dataclass(frozen=True)
+class Check:
+    """The equation has nothing left to solve for and must hold by itself."""
+
+    equation: int
+
+
+Step = Solve | Draw | Tear | Check
 
 
 class Sparse:
@@ -177,7 +184,9 @@ def plan(s: Sparse, drawable: set[int], first: set[int], random: Random | None =
         if not left or done or _peel(s, left, known, last):
             continue
         _tear(s, left, known, steps, drawable, random)
-    unknown = {v for e in s.equations for v in s.variables(e)} - known - {x.variable for x in last}
+    unknown = (
+        {v for e in s.equations for v in s.variables(e)} - known - {x.variable for x in last if isinstance(x, Solve)}
+    )
     return [*steps, *(Draw(v) for v in sorted(unknown)), *reversed(last)]
 
 
@@ -218,7 +227,9 @@ def _tear(
         for v in s.variables(e) - known:
             counts[v] = counts.get(v, 0) + 1
     if not counts:
-        raise NotRational("the start is overdetermined")
+        steps.extend(Check(e) for e in left)
+        left.clear()
+        return
     surplus = len(counts) > len(left)
     order = sorted(counts, key=lambda v: (-counts[v], v))
     if random is not None:

@@ -41,8 +41,10 @@ class Values:
                 self.of[step.variable] = self.ring.random(self.random)
             elif isinstance(step, Solve):
                 self._solve(step)
-            else:
+            elif isinstance(step, Tear):
                 self._tear(step)
+            elif self._evaluate([step.equation])[0]:
+                raise NoSuchNumber("an equation contradicts the others")
 
     def _solve(self, step: Solve) -> None:
         g, p, v = self.s.graph, self.ring.p, step.variable
@@ -66,7 +68,11 @@ class Values:
             return self._evaluate([step.equation])[0]
 
         self.chose = True
-        found = roots(numerator(residual, self.ring.p, self.random), self.ring.p, self.random)
+        polynomial = numerator(residual, self.ring.p, self.random)
+        if not polynomial:  # the equation follows from the others: the variable is as free as it looked
+            residual(self.ring.random(self.random))
+            return
+        found = roots(polynomial, self.ring.p, self.random)
         for value in found:
             try:
                 if residual(value) == 0:
