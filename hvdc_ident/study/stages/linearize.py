@@ -58,7 +58,7 @@ def linear_model(study: Study) -> LinearModel:
 STAGE = Stage(
     name="linearize",
     file="linearization.json",
-    summary="The operating point, the linear model with its modes, and its transfer functions.",
+    summary="The operating point, linear model, modes and transfer functions.",
     run=run,
     wanted=lambda study: study.settings.linearize is not None,
     order=20,
