@@ -1,0 +1,259 @@
+"""Exact sensitivities of trajectories and of steady states, in units and normalised, with norms that sum them up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.errors import StudyError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.engine import simulate
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    import xarray
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """Derivatives of the outputs of some experiments by parameters.
+
+    values: of the parameters. factors: what a derivative is multiplied by to be normalised, in the parameter's unit:
+    its value, or its range where one is given or the value is 0. outputs: by experiment; times: (n,) s; gradients:
+    (n, outputs, parameters), output unit per parameter unit; compared: (n,) the rows inside the window.
+    notes: what makes a sensitivity say little, by experiment.
+    """
+
+    model: str
+    parameters: tuple[str, ...]
+    parameter_units: tuple[str, ...]
+    values: FrozenMap[float]
+    factors: FrozenMap[float]
+    outputs: FrozenMap[tuple[str, ...]]
+    output_units: FrozenMap[str]
+    times: FrozenMap[Array]
+    gradients: FrozenMap[Array]
+    compared: FrozenMap[np.ndarray[Any, np.dtype[np.bool_]]]
+    notes: FrozenMap[str]
+
+    def of(self, experiment: str, output: str, parameter: str, *, normalised: bool = False) -> Array:
+        """(n,) one derivative over time, in units, or times the parameter's factor."""
+        place, column = self._place(experiment, output, parameter)
+        found = self.gradients[experiment][:, place, column]
+        return found * self.factors[parameter] if normalised else found
+
+    def _place(self, experiment: str, output: str, parameter: str) -> tuple[int, int]:
+        if experiment not in self.gradients:
+            raise unknown_name("experiment", experiment, self.gradients)
+        if output not in self.outputs[experiment]:
+            raise unknown_name("output", output, self.outputs[experiment])
+        if parameter not in self.parameters:
+            raise unknown_name("parameter", parameter, self.parameters)
+        return self.outputs[experiment].index(output), self.parameters.index(parameter)
+
+    def array(self, experiment: str, *, normalised: bool = False) -> xarray.DataArray:
+        """One experiment's derivatives with labelled axes time, output, parameter."""
+        import xarray
+
+        if experiment not in self.gradients:
+            raise unknown_name("experiment", experiment, self.gradients)
+        values = self.gradients[experiment]
+        if normalised:
+            values = values * np.array([self.factors[p] for p in self.parameters])
+        axes = {
+            "time": self.times[experiment],
+            "output": list(self.outputs[experiment]),
+            "parameter": list(self.parameters),
+        }
+        return xarray.DataArray(
+            values, coords=axes, dims=tuple(axes), name="normalised sensitivity" if normalised else "sensitivity"
+        )
+
+    @cached_property
+    def table(self) -> FrozenMap[FrozenMap[FrozenMap[tuple[float, float]]]]:
+        """(rms, peak) of the normalised sensitivity over the compared rows, by experiment, output and parameter."""
+        found = {}
+        for e, gradient in self.gradients.items():
+            scaled = gradient[self.compared[e]] * np.array([self.factors[p] for p in self.parameters])
+            rms, peak = np.sqrt((scaled**2).mean(axis=0)), np.abs(scaled).max(axis=0)
+            found[e] = FrozenMap(
+                {
+                    o: FrozenMap({p: (float(rms[i, k]), float(peak[i, k])) for k, p in enumerate(self.parameters)})
+                    for i, o in enumerate(self.outputs[e])
+                }
+            )
+        return FrozenMap(found)
+
+    @property
+    def norms(self) -> xarray.Dataset:
+        """The RMS and the peak of the normalised sensitivities, over experiment, output and parameter; nan: no output."""
+        import xarray
+
+        outputs = list(dict.fromkeys(o for names in self.outputs.values() for o in names))
+        axes = {"experiment": list(self.gradients), "output": outputs, "parameter": list(self.parameters)}
+        values = np.full((2, *(len(a) for a in axes.values())), np.nan)
+        for i, e in enumerate(self.table):
+            for o, line in self.table[e].items():
+                for k, pair in enumerate(line.values()):
+                    values[:, i, outputs.index(o), k] = pair
+        dims = tuple(axes)
+        return xarray.Dataset({"rms": (dims, values[0]), "peak": (dims, values[1])}, coords=axes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Values, factors, units, norms and notes as plain numbers; without the trajectories."""
+        return {
+            "model": self.model,
+            "parameters": {
+                p: {"value": self.values[p], "factor": self.factors[p], "unit": u}
+                for p, u in zip(self.parameters, self.parameter_units, strict=True)
+            },
+            "output_units": dict(self.output_units),
+            "norms": {
+                e: {o: {p: {"rms": r, "peak": k} for p, (r, k) in line.items()} for o, line in lines.items()}
+                for e, lines in self.table.items()
+            },
+            "notes": dict(self.notes),
+        }
+
+    def plot(self, experiment: str | None = None) -> Any:
+        """A figure of one experiment (default: the first): an axes an output, a curve a parameter, normalised."""
+        import matplotlib.pyplot as plt
+
+        name = next(iter(self.gradients)) if experiment is None else experiment
+        if name not in self.gradients:
+            raise unknown_name("experiment", name, self.gradients)
+        outputs = self.outputs[name]
+        figure, axes = plt.subplots(len(outputs), 1, sharex=True, squeeze=False, layout="constrained")
+        for ax, output in zip(axes[:, 0], outputs, strict=True):
+            for p in self.parameters:
+                ax.plot(self.times[name], self.of(name, output, p, normalised=True), label=p)
+            ax.set_ylabel(output)
+        axes[0, 0].legend(fontsize=8)
+        axes[-1, 0].set_xlabel("time, s")
+        return figure
+
+
+def sensitivities(
+    model: Model,
+    experiments: Sequence[Experiment],
+    parameters: Sequence[str] | None = None,
+    *,
+    values: Mapping[str, float] | None = None,
+    outputs: Sequence[str] | None = None,
+    ranges: Ranges | None = None,
+) -> Sensitivities:
+    """The exact derivatives of each experiment's outputs over time, the start's dependence on the parameters included.
+
+    parameters: default, all of the model. values: parameters that differ from the model's. outputs: names of outputs or
+    signals (default: the recorded ones, else all outputs). ranges: (min, max) of a parameter, in its unit, as its factor.
+
+    Raises StudyError without an experiment, UnknownNameError, SteadyStateError or SimulationError.
+    """
+    if not experiments:
+        raise StudyError("sensitivities need an experiment and there is none", expected="at least one experiment")
+    names = tuple(model.parameters if parameters is None else parameters)
+    at, factors = _factors(model, names, values or {}, ranges or {})
+    shown, times, gradients, compared, notes = {}, {}, {}, {}, {}
+    for e in experiments:
+        if e.name in gradients:
+            raise StudyError("two experiments of one name", got=e.name, expected="distinct names")
+        shown[e.name] = tuple(outputs or e.outputs or model.outputs)
+        run = simulate(model, e, values, names, outputs=shown[e.name])
+        times[e.name], gradients[e.name], compared[e.name] = e.time, run.gradients, e.compared
+        if all(u.is_constant for u in e.inputs.values()):
+            notes[e.name] = "no input moves: only the steady state is seen"
+    units = {o: model.outputs[o].unit if o in model.outputs else "" for names_ in shown.values() for o in names_}
+    return Sensitivities(
+        model.name,
+        names,
+        tuple(model.parameters[p].unit for p in names),
+        at,
+        factors,
+        FrozenMap(shown),
+        FrozenMap(units),
+        FrozenMap(times),
+        FrozenMap(gradients),
+        FrozenMap(compared),
+        FrozenMap(notes),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SteadySensitivities:
+    """Derivatives of a steady state by parameters: state_values by name; gradients (outputs, parameters) in units."""
+
+    model: str
+    outputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    steady: FrozenMap[float]
+    factors: FrozenMap[float]
+    gradients: Array
+
+    def array(self, *, normalised: bool = False) -> xarray.DataArray:
+        """The derivatives with labelled axes output, parameter; in units, or times the parameters' factors."""
+        import xarray
+
+        values = self.gradients * np.array([self.factors[p] for p in self.parameters]) if normalised else self.gradients
+        axes = {"output": list(self.outputs), "parameter": list(self.parameters)}
+        return xarray.DataArray(values, coords=axes, dims=tuple(axes), name="steady sensitivity")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The steady values and derivatives, in units, as plain numbers."""
+        lines = {
+            o: dict(zip(self.parameters, row, strict=True))
+            for o, row in zip(self.outputs, self.gradients.tolist(), strict=True)
+        }
+        return {"model": self.model, "steady": dict(self.steady), "factors": dict(self.factors), "sensitivities": lines}
+
+
+def steady_sensitivities(
+    model: Model,
+    parameters: Sequence[str] | None = None,
+    *,
+    values: Mapping[str, float] | None = None,
+    outputs: Sequence[str] | None = None,
+    ranges: Ranges | None = None,
+) -> SteadySensitivities:
+    """The exact derivatives of the steady state of the given values of parameters and inputs.
+
+    outputs: names of outputs or signals; default, all outputs. Raises SteadyStateError where there is none.
+    """
+    names = tuple(model.parameters if parameters is None else parameters)
+    _, factors = _factors(model, names, values or {}, ranges or {})
+    shown = tuple(outputs or model.outputs)
+    rest = Experiment("rest", np.zeros(1))
+    run = simulate(model, rest, values, names, outputs=shown)
+    steady = dict(zip(shown, run.trajectory.values[0].tolist(), strict=True))
+    return SteadySensitivities(model.name, shown, names, FrozenMap(steady), factors, run.gradients[0])
+
+
+def _factors(
+    model: Model, names: Sequence[str], values: Mapping[str, float], ranges: Ranges
+) -> tuple[FrozenMap[float], FrozenMap[float]]:
+    """The parameters' values, and what their derivatives are multiplied by."""
+    at, factors = {}, {}
+    for name in names:
+        if name not in model.parameters:
+            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+        own = model.parameters[name]
+        at[name] = float(values.get(name, own.value))
+        low, high = ranges.get(name, (own.min, own.max))
+        width = high - low
+        if name in ranges and not (math.isfinite(width) and width > 0):
+            raise StudyError(
+                f"the range of '{name}' is wrong", expected="finite min < max", got=f"min {low:g}, max {high:g}"
+            )
+        if name in ranges or (at[name] == 0 and math.isfinite(width) and width > 0):
+            factors[name] = float(width)
+        else:
+            factors[name] = abs(at[name]) or own.size
+    return FrozenMap(at), FrozenMap(factors)

@@ -1,0 +1,204 @@
+"""Which parameters matter over their whole ranges: Morris' elementary effects and Sobol's indices, through SALib.
+
+SALib is an extra: pip install 'hvdc_ident[screening]'. Morris 1991, doi 10.1080/00401706.1991.10484804; Saltelli et al.
+2010, doi 10.1016/j.cpc.2009.09.018.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from hvdc_ident.errors import ComputationError, InputError, StudyError
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.sensitivity.axes import Samples
+from hvdc_ident.sensitivity.sweep import Progress, Runner, sweep
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """What a screening found for the RMSE of each (output, experiment) of `series`.
+
+    measures: (series, parameters) by name. Morris: mu_star, mu, sigma, mu_star_conf, in the output's unit over the
+    whole range. Sobol: S1, ST, S1_conf, ST_conf: shares of the variance. failed: points that failed; dropped: Morris
+    trajectories left out because of them.
+    """
+
+    method: str
+    parameters: tuple[str, ...]
+    series: tuple[tuple[str, str], ...]
+    measures: FrozenMap[Array]
+    evaluations: int
+    failed: int = 0
+    dropped: int = 0
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The measures over series ("OUTPUT.EXPERIMENT") and parameter."""
+        import xarray
+
+        axes = {"series": [f"{o}.{e}" for o, e in self.series], "parameter": list(self.parameters)}
+        data = {n: (tuple(axes), v) for n, v in self.measures.items()}
+        return xarray.Dataset(data, coords=axes, attrs={"method": self.method})
+
+    def to_dict(self) -> dict[str, Any]:
+        """The measures by output, experiment, parameter and name as plain numbers."""
+        found: dict[str, dict[str, Any]] = {}
+        for i, (o, e) in enumerate(self.series):
+            found.setdefault(o, {})[e] = {
+                p: {n: float(v[i, k]) for n, v in self.measures.items()} for k, p in enumerate(self.parameters)
+            }
+        head = {"method": self.method, "evaluations": self.evaluations, "failed": self.failed, "dropped": self.dropped}
+        return {**head, "measures": found}
+
+
+def morris(
+    model: Model,
+    experiments: Sequence[Experiment],
+    ranges: Mapping[str, tuple[float, float]],
+    *,
+    against: Literal["data", "base"] | Model = "data",
+    outputs: Sequence[str] | None = None,
+    values: Mapping[str, float] | None = None,
+    trajectories: int = 20,
+    levels: int = 4,
+    seed: int = 0,
+    executor: Runner | None = None,
+    progress: Progress | None = None,
+) -> Screening:
+    """Elementary effects of the RMSE over the ranges: trajectories (k + 1) runs for k parameters; same seed, same result.
+
+    ranges: (min, max) by parameter, in its unit. A trajectory with a failed run is left out and counted. Other arguments
+    as in `sweep`. Raises InputError where SALib is not installed, ComputationError where no trajectory is whole.
+    """
+    _installed()
+    from SALib.analyze import morris as analyse
+    from SALib.sample import morris as sample
+
+    problem = _problem(ranges, trajectories)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        x = np.asarray(sample.sample(problem, trajectories, num_levels=levels, seed=seed), dtype=float)
+    rmse, series, reasons = _errors(model, experiments, ranges, x, against, outputs, values, executor, progress)
+    whole = np.isfinite(rmse).all(axis=1).reshape(trajectories, -1).all(axis=1)
+    if whole.sum() < 2:
+        raise ComputationError(
+            "too few Morris trajectories are whole", got=f"{whole.sum()} of {trajectories}; {reasons}"
+        )
+    rows = np.repeat(whole, len(ranges) + 1)
+    names = ("mu_star", "mu", "sigma", "mu_star_conf")
+    found: dict[str, list[Any]] = {n: [] for n in names}
+    for column in range(len(series)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            line = analyse.analyze(problem, x[rows], rmse[rows, column], num_levels=levels, seed=seed)
+        for n in names:
+            found[n].append(np.asarray(line[n], dtype=float))
+    bad, dropped = int((~np.isfinite(rmse).all(axis=1)).sum()), int((~whole).sum())
+    return Screening("morris", tuple(ranges), series, _measures(found), x.shape[0], bad, dropped)
+
+
+def sobol(
+    model: Model,
+    experiments: Sequence[Experiment],
+    ranges: Mapping[str, tuple[float, float]],
+    *,
+    against: Literal["data", "base"] | Model = "data",
+    outputs: Sequence[str] | None = None,
+    values: Mapping[str, float] | None = None,
+    samples: int = 256,
+    seed: int = 0,
+    executor: Runner | None = None,
+    progress: Progress | None = None,
+) -> Screening:
+    """First-order and total shares of the RMSE's variance over the ranges: samples (k + 2) runs; same seed, same result.
+
+    samples: a power of 2. Other arguments as in `morris`. Raises InputError where SALib is not installed,
+    ComputationError where a run fails: the indices need every one.
+    """
+    _installed()
+    from SALib.analyze import sobol as analyse
+    from SALib.sample import sobol as sample
+
+    if samples < 2 or samples & (samples - 1):
+        raise StudyError("the number of samples is wrong", where="sobol", expected="a power of 2", got=str(samples))
+    problem = _problem(ranges, samples)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        x = np.asarray(sample.sample(problem, samples, calc_second_order=False, seed=seed), dtype=float)
+    rmse, series, reasons = _errors(model, experiments, ranges, x, against, outputs, values, executor, progress)
+    bad = int((~np.isfinite(rmse).all(axis=1)).sum())
+    if bad:
+        raise ComputationError(
+            "Sobol's indices need every run",
+            got=f"{bad} of {x.shape[0]} failed; {reasons}",
+            hint="narrower ranges, or morris",
+        )
+    names = ("S1", "ST", "S1_conf", "ST_conf")
+    found: dict[str, list[Any]] = {n: [] for n in names}
+    for column in range(len(series)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            line = analyse.analyze(problem, rmse[:, column], calc_second_order=False, seed=seed)
+        for n in names:
+            found[n].append(np.asarray(line[n], dtype=float))
+    return Screening("sobol", tuple(ranges), series, _measures(found), x.shape[0])
+
+
+def _installed() -> None:
+    """Raises InputError where SALib is missing."""
+    try:
+        import SALib  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "global screening needs SALib, which is not installed", hint="pip install 'hvdc_ident[screening]'"
+        ) from None
+
+
+def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str, Any]:
+    wrong = [n for n, (low, high) in ranges.items() if not (np.isfinite([low, high]).all() and low < high)]
+    if not ranges or wrong or count < 2:
+        raise StudyError(
+            "a screening's ranges or its size are wrong",
+            expected="finite min < max for at least one parameter, and at least 2 samples",
+            got=f"{', '.join(wrong) or len(ranges)}; {count} samples",
+        )
+    return {"num_vars": len(ranges), "names": list(ranges), "bounds": [list(map(float, r)) for r in ranges.values()]}
+
+
+def _errors(
+    model: Model,
+    experiments: Sequence[Experiment],
+    ranges: Mapping[str, tuple[float, float]],
+    x: Array,
+    against: Literal["data", "base"] | Model,
+    outputs: Sequence[str] | None,
+    values: Mapping[str, float] | None,
+    executor: Runner | None,
+    progress: Progress | None,
+) -> tuple[Array, tuple[tuple[str, str], ...], str]:
+    """(runs, series) RMSE, nan where a run failed; what the columns are; the first reason."""
+    found = sweep(
+        model,
+        experiments,
+        Samples(tuple(ranges), x),
+        against=against,
+        outputs=outputs,
+        values=values,
+        executor=executor,
+        progress=progress,
+    )
+    return found.rmse, found.series, next(iter(found.failed.values()), "")
+
+
+def _measures(found: Mapping[str, list[Any]]) -> FrozenMap[Array]:
+    return FrozenMap({n: np.vstack(v) for n, v in found.items()})
