@@ -128,6 +128,23 @@ def outside(t, ta, tb, still, pointer, times, values, at, start, count, h_t, h_h
 
 
 @njit(cache=True, error_model="numpy")
+def next_stop(t, end, breaks, i_break, echo_t, echoes, tick, publish):  # type: ignore[no-untyped-def]
+    """The next instant after t at which a step has to end: a break of an input, a returning jump, a sample, the end."""
+    stop = end
+    if i_break < breaks.size:
+        stop = min(stop, breaks[i_break])
+    for i in range(echoes):
+        if echo_t[i] > t:
+            stop = min(stop, echo_t[i])
+    for i in range(tick.size):
+        if tick[i] > t:
+            stop = min(stop, tick[i])
+        if publish[i] > t:
+            stop = min(stop, publish[i])
+    return stop
+
+
+@njit(cache=True, error_model="numpy")
 def violation(values, m, slack):  # type: ignore[no-untyped-def]
     """The switch that is furthest beyond its mode, or -1."""
     worst, which = 0.0, -1
@@ -228,17 +245,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
     aim = -1
     while True:
         # --- a segment begins: what comes from outside is seen after its jump ---
-        tb = end
-        if i_break < breaks.size:
-            tb = min(tb, breaks[i_break])
-        for i in range(echoes):
-            if echo_t[i] > t:
-                tb = min(tb, echo_t[i])
-        for i in range(nq):
-            if tick[i] > t:
-                tb = min(tb, tick[i])
-            if publish[i] > t:
-                tb = min(tb, publish[i])
+        tb = next_stop(t, end, breaks, i_break, echo_t, echoes, tick, publish)
         final = not t < end
         segment_end = tb if not final else t + 1.0
         whole = enter_segment(t, segment_end, pointer, times, values, at)
@@ -287,14 +294,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         if published:
             if not consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
                 return INCONSISTENT, t
-            tb = end
-            if i_break < breaks.size:
-                tb = min(tb, breaks[i_break])
-            for i in range(echoes):
-                if echo_t[i] > t:
-                    tb = min(tb, echo_t[i])
-        for i in range(nq):
-            tb = min(tb, min(tick[i], publish[i]))
+        if nq:
+            tb = next_stop(t, end, breaks, i_break, echo_t, echoes, tick, publish)
         # --- jumps and corners of a delayed signal's source come back after the delay ---
         if nd and (first or published or disturbed):
             call(address[SRC], y, yd, w, wd, p, m, src)

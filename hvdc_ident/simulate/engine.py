@@ -15,7 +15,7 @@ from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unk
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.simulate.machine import Code
+from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.result import Simulation, Statistics
 from hvdc_ident.simulate.structure import NAMES, Structure
 from hvdc_ident.trajectory import Array, Trajectory
@@ -233,17 +233,6 @@ class Engine:
         evaluate(self._address[MODES], y, w, p, m, m)
         evaluate(self._address[JAC], y, w, p, m, jac.reshape(-1))
         return jac
-
-
-def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
-    """Calls one generated function from Python."""
-    import ctypes
-
-    pointer = ctypes.POINTER(ctypes.c_double)
-    kind = ctypes.CFUNCTYPE(None, *[pointer] * 7)
-    zero = np.zeros_like(w)
-    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, zero, p, m)]
-    kind(int(address))(*(a.ctypes.data_as(pointer) for a in arrays), out.ctypes.data_as(pointer))
 
 
 def announce_compilation() -> None:

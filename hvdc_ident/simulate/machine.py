@@ -7,16 +7,18 @@ one LLVM vector, which the compiler turns into the machine's own vector instruct
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import struct
 import weakref
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import llvmlite.binding as llvm
+import numpy as np
 
 from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.trajectory import Array
 
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
 _LIBM = ("tan", "tanh", "asin", "acos", "atan", "atan2")
@@ -230,3 +232,12 @@ class _Emitter:
             return self._emit(f"call double @llvm.pow.f64(double {x[0]}, double {x[1]})")
         name = f"llvm.{op}.f64" if op in _INTRINSIC else op
         return self._emit(f"call double @{name}(" + ", ".join(f"double {v}" for v in x) + ")")
+
+
+def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
+    """Calls one generated function from Python."""
+    pointer = ctypes.POINTER(ctypes.c_double)
+    kind = ctypes.CFUNCTYPE(None, *[pointer] * 7)
+    zero = np.zeros_like(w)
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, zero, p, m)]
+    kind(int(address))(*(a.ctypes.data_as(pointer) for a in arrays), out.ctypes.data_as(pointer))

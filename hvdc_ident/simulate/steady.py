@@ -17,7 +17,7 @@ ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
 
 def fallback(structure: Structure, address: NDArray[np.int64], p: Array, u: Array, guess: Array) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
-    from hvdc_ident.simulate.engine import evaluate
+    from hvdc_ident.simulate.machine import evaluate
     from hvdc_ident.simulate.steps import MODES, REST, REST_JAC, REST_P
 
     s = structure.sizes

@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.expression import parse
-from hvdc_ident.simulate.engine import evaluate
+from hvdc_ident.simulate.machine import evaluate
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function
 
