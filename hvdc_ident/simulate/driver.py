@@ -45,11 +45,12 @@ ACCEPTED, REJECTED, EVENTS, EVALUATIONS, SEGMENTS, FORCED = range(6)
 
 
 @njit(cache=True, error_model="numpy")
-def consistent(address, live, y, yd, w, wd, p, m, nx, nz, width, out, jac, small, pivots):  # type: ignore[no-untyped-def]
+def consistent(live, y, w, loop):  # type: ignore[no-untyped-def]
     """Solves the unknowns z (and their sensitivities) for the present states, with modes found from the values where `live`.
 
-    Returns whether Newton's method converged.
+    loop: what stays the same over a run. Returns whether Newton's method converged.
     """
+    address, yd, wd, p, m, nx, nz, width, out, jac, small, pivots = loop
     n = nx + nz
     if live:
         call(address[MODES], y, yd, w, wd, p, m, m)
@@ -118,8 +119,12 @@ def rates(address, y, w, wd, p, m, nx, nz, yd, out, jac, small, pivots):  # type
 
 
 @njit(cache=True, error_model="numpy")
-def outside(t, ta, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, first, total, w, wd):  # type: ignore[no-untyped-def]
-    """Writes all that comes from outside at t, within the segment that ends at tb, into w and wd."""
+def outside(t, ta, tb, still, sources, count, h_t, h_h, h_c, w, wd):  # type: ignore[no-untyped-def]
+    """Writes all that comes from outside at t, within the segment that ends at tb, into w and wd.
+
+    sources: what stays the same over a run, in one tuple, because the compiler's time grows with the arguments of a call.
+    """
+    pointer, times, values, at, start, before, lag, lag_p, width, first, total = sources
     w[0] = t
     if not still:
         inputs(t, tb, pointer, times, values, at, w, wd)
@@ -191,7 +196,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
     nw = 1 + nu + nd + nq
     stages = 8 if method == ROSENBROCK else 7
     k = np.zeros((stages, size))
-    u, yn, e = np.zeros(size), np.zeros(size), np.zeros(size)
+    u, yn, e, scratch = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     dense = np.zeros((4, size))
     ft = np.zeros(size)
     yd = np.zeros(max(n, 1))
@@ -222,6 +227,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         for c in range(width):
             lag_p[i, c] = constants[row0 + i * width + c]
             before[i, 1 + c] = w[nw + i * width + c]
+    loop = (address, yd, wd, p, m, nx, nz, width, scratch, jac, small, small_pivots)
+    sources = (pointer, times, values, at, start, before, lag, lag_p, width, 1 + nu, nw)
     count = 0
     h_t, h_h, h_c = np.empty(64 if nd else 1), np.empty(64 if nd else 1), np.empty((64 if nd else 1, nd, NODES, 1 + width))
     node_values = np.zeros((NODES, nd, 1 + width))
@@ -250,15 +257,15 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
         segment_end = tb if not final else t + 1.0
         whole = enter_segment(t, segment_end, pointer, times, values, at)
         wd[0] = 1.0
-        outside(t, t, segment_end, False, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
-        if not consistent(address, True, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
+        outside(t, t, segment_end, False, sources, count, h_t, h_h, h_c, w, wd)
+        if not consistent(True, y, w, loop):
             return INCONSISTENT, t
         if not first and width and echo_now:
             call(address[FS], y, yd, w, wd, p, m, f_after)
             for r in range(nx):
                 for c in range(width):
                     y[n + r * width + c] += (f_before[r] - f_after[r]) * jump_p[c]
-            consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots)
+            consistent(False, y, w, loop)
         echo_now = False
         # --- samples are taken and published ---
         for i in range(nq):
@@ -282,7 +289,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 w[1 + nu + nd + i] = pending[i]
                 for c in range(width):
                     w[nw + (nd + i) * width + c] = pending_p[i, c]
-                if not consistent(address, True, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
+                if not consistent(True, y, w, loop):
                     return INCONSISTENT, t
                 if width:
                     call(address[F], y, yd, w, wd, p, m, f_after)
@@ -291,9 +298,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                             y[n + r * width + c] += (f_before[r] - f_after[r]) * publish_p[i, c]
                 publish[i] = np.inf
                 published = True
-        if published:
-            if not consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
-                return INCONSISTENT, t
+        if published and not consistent(False, y, w, loop):
+            return INCONSISTENT, t
         if nq:
             tb = next_stop(t, end, breaks, i_break, echo_t, echoes, tick, publish)
         # --- jumps and corners of a delayed signal's source come back after the delay ---
@@ -376,7 +382,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 if quiet:
                     w[0] = t
                 else:
-                    outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                    outside(t, t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
                 if not rejected:
                     call(address[JAC], y, yd, w, wd, p, m, jac)
                     if forced:
@@ -401,7 +407,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         if quiet:
                             w[0] = ts
                         else:
-                            outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                            outside(ts, t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
                     counts[EVALUATIONS] += 1
                     if method == ROSENBROCK:
                         rodas_point(s, y, k, u)
@@ -465,7 +471,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     if quiet:
                         w[0] = ts
                     else:
-                        outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                        outside(ts, t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
                     call(address[SW], u, yd, w, wd, p, m, sv)
                     event = violation(sv, m, slack)
                     if event >= 0:
@@ -480,7 +486,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                         if quiet:
                             w[0] = t + middle * hs
                         else:
-                            outside(t + middle * hs, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                            outside(t + middle * hs, t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
                         call(address[SW], u, yd, w, wd, p, m, sv)
                         which = violation(sv, m, slack)
                         if which >= 0:
@@ -511,7 +517,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 if quiet:
                     w[0] = t_out[i_out]
                 else:
-                    outside(t_out[i_out], t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                    outside(t_out[i_out], t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
                 call(address[OUTS if width else OUT], u, yd, w, wd, p, m, out[i_out])
                 i_out += 1
             # --- the history of delayed signals ---
@@ -523,7 +529,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     if quiet:
                         w[0] = ts
                     else:
-                        outside(ts, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+                        outside(ts, t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
                     call(address[SRCS if width else SRC], u, yd, w, wd, p, m, src)
                     for i in range(nd):
                         node_values[j, i, 0] = src[i]
@@ -568,8 +574,8 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             if quiet:
                 w[0] = t
             else:
-                outside(t, t, tb, still, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
-            consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots)
+                outside(t, t, tb, still, sources, count, h_t, h_h, h_c, w, wd)
+            consistent(False, y, w, loop)
             if width:
                 rates(address, y, w, wd, p, m, nx, nz, yd, f_before, jac, small, small_pivots)
                 for i in range(nx):
@@ -579,7 +585,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                 speed = sv[event]
             m[event] = 1.0 - m[event]
             for _ in range(ns):
-                if not consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots):
+                if not consistent(False, y, w, loop):
                     return INCONSISTENT, t
                 call(address[SW], y, yd, w, wd, p, m, sv)
                 also = violation(sv, m, slack)
@@ -597,7 +603,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
                     for i in range(nx):
                         for c in range(width):
                             y[n + i * width + c] += (f_before[i] - f_after[i]) * jump_p[c]
-                    consistent(address, False, y, yd, w, wd, p, m, nx, nz, width, u, jac, small, small_pivots)
+                    consistent(False, y, w, loop)
             if nd:
                 for i in range(nd):
                     if t + lag[i] < end:
@@ -615,7 +621,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             h = min(h, hs)
 
         # --- the segment's end, seen from before its jump ---
-        outside(t, start, t, False, pointer, times, values, at, start, count, h_t, h_h, h_c, before, lag, lag_p, width, 1 + nu, nw, w, wd)
+        outside(t, start, t, False, sources, count, h_t, h_h, h_c, w, wd)
         if nd:
             call(address[SRC], y, yd, w, wd, p, m, src_left)
         while i_out + 1 < t_out.size and t_out[i_out] == t and t_out[i_out + 1] == t:
