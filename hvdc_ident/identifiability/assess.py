@@ -22,6 +22,7 @@ from hvdc_ident.identifiability.evidence import (
     partner,
     physical_bounds,
     rise_at_ends,
+    spreads,
     thresholds,
 )
 from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogeneity, misspecification
@@ -244,6 +245,7 @@ class _Assessment:
         """Verdicts on the set whose profiles are closed."""
         index = inflation_index(optimum.information.matrix)
         shares = optimum.information.shares()
+        spread = spreads(optimum)
         conditional = partners(self.combinations, self.held)
         for i, n in enumerate(optimum.names):
             p, free, unit = found[n], self.free[n], self.units[n]
@@ -252,9 +254,7 @@ class _Assessment:
                 self._judge(verdicts.at_bound(p, free, own, unit))
                 continue
             best = max(shares, key=lambda e: shares[e][n])
-            std = optimum.uncertainty.std(n)
-            std = None if std is None else std * float(np.sqrt(optimum.excess))
-            judged = verdicts.closed(p, free, std, float(index[i]), partner(optimum, i), f"'{best}'", unit)
+            judged = verdicts.closed(p, free, spread[n].std, float(index[i]), partner(optimum, i), f"'{best}'", unit)
             given = conditional.get(n, ())
             judged = replace(judged, conditional_on=given)
             if n in self.found:  # a member of a combination: its verdict stands, its interval is that of the set fitted

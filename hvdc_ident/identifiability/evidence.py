@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,26 +19,43 @@ from hvdc_ident.trajectory import Array
 DRAWS = 999
 
 
-def thresholds(optimum: Optimum) -> dict[str, float]:
-    """The rise of the cost at the ends of each parameter's 95 % interval.
+@dataclass(frozen=True)
+class Spread:
+    """How well one parameter is known. std: in its unit. threshold: rise of the cost at the ends of its interval."""
 
-    1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error add to the
-    variance in its direction (vertical scaling of an independence likelihood: Chandler and Bate 2007,
-    doi 10.1093/biomet/asm015): the larger of the AR(1) sandwich times the excess misfit and, where the misfit shows
-    model error, the sandwich over experiments with t(n - 1).
+    std: float
+    threshold: float
+
+
+def thresholds(optimum: Optimum) -> dict[str, float]:
+    """The rise of the cost at the ends of each parameter's 95 % interval: see `spreads`."""
+    return {n: s.threshold for n, s in spreads(optimum).items()}
+
+
+def spreads(optimum: Optimum) -> dict[str, Spread]:
+    """The standard deviation of each parameter, and the rise of the cost at the ends of its 95 % interval.
+
+    The rise is 1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error
+    add to the variance in the parameter's direction (vertical scaling of an independence likelihood: Chandler and Bate
+    2007, doi 10.1093/biomet/asm015): the wider of the AR(1) sandwich times the excess misfit and, where the misfit
+    shows model error, the sandwich over experiments with t(n - 1).
     """
     from scipy.stats import t
 
     u = optimum.uncertainty
     quantile = 0.5 * float(t.ppf(0.975, u.dof)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
-    raw, corrected = np.diag(u.raw), np.diag(u.corrected)
-    factor = np.where(raw > 0, corrected / np.where(raw > 0, raw, 1.0), 1.0) * optimum.excess
-    limits = quantile * np.maximum(factor, 1.0)
+    raw = np.diag(u.raw)
+    safe = np.where(raw > 0, raw, 1.0)
+    factor = np.maximum(np.where(raw > 0, np.diag(u.corrected) / safe, 1.0) * optimum.excess, 1.0)
+    limits = quantile * factor
     if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
         covariance, dof = cluster_sandwich(optimum.blocks)
-        ratio = np.where(raw > 0, np.diag(covariance) / np.where(raw > 0, raw, 1.0), 0.0)
-        limits = np.maximum(limits, 0.5 * float(t.ppf(0.975, dof)) ** 2 * ratio)
-    return {n: float(v) for n, v in zip(optimum.names, limits, strict=False)}
+        scatter = np.where(raw > 0, np.diag(covariance) / safe, 0.0)
+        wider = 0.5 * float(t.ppf(0.975, dof)) ** 2 * scatter
+        factor = np.where(wider > limits, scatter, factor)
+        limits = np.maximum(limits, wider)
+    stds = np.sqrt(raw * factor)
+    return {n: Spread(float(s), float(v)) for n, s, v in zip(optimum.names, stds, limits, strict=False)}
 
 
 def rise_at_ends(optimum: Optimum, i: int, free: Free) -> float | None:

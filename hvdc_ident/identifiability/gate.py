@@ -65,11 +65,13 @@ def gated_fit(
     fit: Callable[[Problem], FitResult],
     *,
     force: Sequence[str] = (),
+    whole: bool = True,
 ) -> FitResult:
     """The fit of the identifiable set, its estimates as the report allows them to be stated.
 
     report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak parameters get the profile's interval
     and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
+    whole: whether the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
     Where nothing is left to fit the status is "failed" and the message says so.
     """
     through = gate(report, force)
@@ -87,19 +89,19 @@ def gated_fit(
     result = fit(gated(problem, through))
     if result.status == "failed":
         return result
-    estimates = {n: _stated(n, e, report, through) for n, e in result.estimates.items()}
+    estimates = {n: _stated(n, e, report, through, whole=whole) for n, e in result.estimates.items()}
     ordered = {n: {**estimates, **_at_bound(report, through)}.get(n) for n in report["parameters"]}
     return replace(result, estimates=FrozenMap({n: e for n, e in ordered.items() if e is not None}))
 
 
-def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate) -> Estimate:
+def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate, *, whole: bool) -> Estimate:
     """An estimate in the form its verdict allows."""
     line = report["parameters"][name]
     if name in through.forced:
         return replace(e, reason=f"forced, against the report: {line['verdict']}. {line['reason']}")
     interval = _interval(line)
     weak = line["verdict"] == "weak" or (line.get("std") is None)
-    other_set = bool(through.forced)
+    other_set = bool(through.forced) or not whole
     if interval is None or (other_set and not weak):
         return replace(e, std=None, std_raw=None) if weak else e
     if not interval[0] <= e.value <= interval[1]:
@@ -110,7 +112,7 @@ def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate) ->
         )
     if not weak:
         return replace(e, std=line["std"], ci95=interval, method="profile")
-    note = "; its interval is of the set without the forced ones" if other_set else ""
+    note = " (its interval is that of the report's own fit, of all data and without forced ones)" if other_set else ""
     return replace(e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"weak: {line['reason']}{note}")
 
 

@@ -110,7 +110,7 @@ def at_bound(profile: Profile, free: Free, physical: bool, unit: str) -> Verdict
 
 
 def closed(
-    profile: Profile, free: Free, std: float | None, collinearity: float, partner: str, best: str, unit: str
+    profile: Profile, free: Free, std: float, collinearity: float, partner: str, best: str, unit: str
 ) -> Verdict:
     """Weak or identifiable: its interval is known. std: in its unit. best: the experiment that tells most about it."""
     low, high = profile.ci95
@@ -127,7 +127,7 @@ def closed(
     text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
     if collinearity > 0.5 * COLLINEAR:
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
-    relative = std / abs(profile.value) if std is not None and profile.value else None
+    relative = std / abs(profile.value) if profile.value else None
     return Verdict(
         profile.name,
         "identifiable",

@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.report.drawing import AFTER, MARK, figure
+from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMNS = 3
+
+
+def _joined(x: Array, y: Array) -> tuple[Array, Array]:
+    """The points joined by pieces of parabolas: straight lines in the signed root of the rise."""
+    root = np.sqrt(np.clip(y, 0.0, None)) * np.where(x < x[int(np.argmin(y))], -1.0, 1.0)
+    dense = np.unique(np.concatenate([x, np.linspace(x[0], x[-1], 200)]))
+    return dense, np.interp(dense, x, root) ** 2
 
 
 def profiles(found: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -22,7 +30,8 @@ def profiles(found: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Ma
     for place, (name, p) in enumerate(found.items(), start=1):
         axes = fig.add_subplot(rows, COLUMNS, place)
         x, y = np.array(p["values"], dtype=float), np.array(p["rises"], dtype=float) / p["threshold"]
-        axes.plot(x, y, color=AFTER, linewidth=1.2, marker="o", markersize=2.5)
+        axes.plot(*_joined(x, y), color=AFTER, linewidth=1.2)
+        axes.plot(x, y, color=AFTER, linewidth=0, marker="o", markersize=2.5)
         axes.axhline(1.0, color=MARK, linewidth=0.8, linestyle="--")
         for end in ("lower", "upper"):
             if p[end]["limit"] is not None:

@@ -32,7 +32,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     if "parameters" not in report:
         why = f"nothing can be fitted before the stage identify has run: {report.get('message', 'it failed')}"
         return Outcome({"status": "failed", "message": why}, failed=why)
-    result = gated_fit(problem, report, lambda p: _fitted(study, options, p), force=options.force)
+    whole = study.settings.fit is None or study.settings.fit.mode == "simultaneous"
+    result = gated_fit(problem, report, lambda p: _fitted(study, options, p), force=options.force, whole=whole)
     found = result.to_dict()
     data = {
         **found,

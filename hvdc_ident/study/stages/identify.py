@@ -10,6 +10,9 @@ from hvdc_ident.study.stage import Options, Outcome, Stage
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
+FEWEST_STARTS = 4
+"""The pilot fit is a multistart of its own, however few starts the fit has."""
+
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """A verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
@@ -20,7 +23,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     need_experiments(study, "identify", role="fit")
     need_candidates(study, "identify")
     need_start(study)
-    starts = study.settings.fit.starts if study.settings.fit else 8
+    starts = max(study.settings.fit.starts, FEWEST_STARTS) if study.settings.fit else 8
     with processes(options.workers) as executor:
         report = identifiability(
             study.model,
