@@ -102,7 +102,8 @@ def structural_identifiability(
     (unknown) or "given" (as the model says), for all states or by name; None: as the model says. regime: {signal: branch
     of its limiter after the event}, a clip's "low", "inside" or "high", a min's or max's "first" or "second"; all
     others stay as they are at the operating point. An input or a known parameter that is 0 in the model is 0 here; other
-    known numbers are taken as general. time_limit in s: where it is reached the result says "not decided".
+    known numbers are taken as general. time_limit in s, the search for the operating point not counted: where it is
+    reached the result says "not decided".
 
     Raises UnknownNameError for a name the model lacks, InputError for a class or branch there is none of.
     """

@@ -27,6 +27,20 @@ CHECK = 0.4  # share of the time left that a confirmation may take
 FEW = 8  # members of a combination up to which polynomials are looked for
 
 
+Drawn = tuple[list[Rows], Callable[[], Rows], str]
+
+
+class _Precise:
+    """Real points, each computed with all its digits."""
+
+    def __init__(self, points: RealPoints) -> None:
+        self.points = points
+
+    def __call__(self) -> Rows:
+        with context():
+            return self.points()
+
+
 class Ask:
     """One question, its points and the answer put together."""
 
@@ -50,6 +64,8 @@ class Ask:
         if self.model.delays or self.model.sampled:
             raise NotRational("it has delays or sampled parts")
         source = Source(self.model, self.outputs, self._known_starts())
+        if source.graph.switches:
+            self._operating(source)
         self.regime_words += [x for x in source.active() if x.split(":")[0] not in self.regime]
         rest = source.equations({})
         move = source.equations(self.regime) if self.regime else rest
@@ -63,6 +79,12 @@ class Ask:
             return result
         return {"status": "not decided", "reason": "from this start one move of the inputs may show less than several"}
 
+    def _operating(self, source: Source) -> None:
+        """Finds the operating point; that the machine code may have to be made first is not counted as time."""
+        begun = time.monotonic()
+        _ = source.point
+        self.deadline += time.monotonic() - begun
+
     def _known_starts(self) -> dict[str, Start]:
         """A free start that is one of the parameters asked for is given by it."""
         mine = {n for n in self.starts if f"{n}_start" in self.names and self.model.states[n].start == "free"}
@@ -75,48 +97,53 @@ class Ask:
         return Question(source, rest, move, tuple(places.index(n) for n in self.names), inputs, rested)
 
     def _decide(self, q: Question) -> dict[str, Any]:
+        """The verdict: from a few coefficients where they show all there is to see, else from all that are needed."""
+        for question in (replace(q, highest=LOW), q) if q.order > LOW else (q,):
+            points, make, method = self._points(question)
+            if points and len(points[0].pivots) == len(self.names):
+                break
+        if not points:
+            return {"status": "not decided", "reason": "the random points disagree"}
+        with context():
+            return self._result(points, make, method)
+
+    def _points(self, q: Question) -> Drawn:
+        """Points that agree, what makes more of them, and the method's name; no points where they disagree."""
         try:
-            return self._exact(q)
+            drawn = self._exact(q)
+            if drawn is not None:
+                return drawn
         except NotRational:
-            with context():
-                return self._numeric(q)
+            pass
+        self._operating(q.source)
+        make = _Precise(RealPoints(q, Random(self.seed), self.deadline))
+        points = [make() for _ in range(REAL_POINTS)]
+        return (points if len({_pattern(r) for r in points}) == 1 else []), make, "numeric, local"
 
-    # --- over prime fields ---
-
-    def _exact(self, q: Question) -> dict[str, Any]:
+    def _exact(self, q: Question) -> Drawn | None:
+        """Points over prime fields; None where a real point sees something else."""
         makers = [FieldPoints(q, PrimeField(p), Random(self.seed + i), self.deadline) for i, p in enumerate(PRIMES[:3])]
         points = [make() for make in makers[:2]]
         if _pattern(points[0]) != _pattern(points[1]):
             points.append(makers[2]())  # an unlucky point sees less, never more
             points.sort(key=lambda r: (-len(r.pivots), len(r.seen)))
             if _pattern(points[0]) != _pattern(points[1]):
-                return {"status": "not decided", "reason": "the random points disagree"}
+                return [], makers[0], ""
         if any(m.chose for m in makers) and not self._confirmed(q, points[0]):
-            with context():
-                return self._numeric(q)
-        make = next(m for m in makers if m.ring == points[0].ring)
-        return self._result(points[:1], make, "prime field")
+            return None
+        return points[:1], next(m for m in makers if m.ring == points[0].ring), "prime field"
 
     def _confirmed(self, q: Question, found: Rows) -> bool:
         """Whether a real point sees the same, where a point of the field may lie on another branch; yes if time is short."""
+        if q.highest and len(found.pivots) < len(self.names):
+            return True  # it is asked again at the full order
+        self._operating(q.source)
         now = time.monotonic()
-        full = len(found.pivots) == len(self.names)
-        for question in (replace(q, highest=LOW), q) if full and q.order > LOW else (q,):
-            try:
-                with context():
-                    real = RealPoints(question, Random(self.seed), now + CHECK * (self.deadline - now))()
-            except (OutOfTime, NotRational, ArithmeticError):
-                return True
-            if _pattern(real) == _pattern(found):
-                return True
-        return False
-
-    def _numeric(self, q: Question) -> dict[str, Any]:
-        make = RealPoints(q, Random(self.seed), self.deadline)
-        points = [make() for _ in range(REAL_POINTS)]
-        if len({_pattern(r) for r in points}) > 1:
-            return {"status": "not decided", "reason": "the random points disagree"}
-        return self._result(points, make, "numeric, local")
+        try:
+            real = _Precise(RealPoints(q, Random(self.seed), now + CHECK * (self.deadline - now)))()
+        except (OutOfTime, NotRational, ArithmeticError):
+            return True
+        return _pattern(real) == _pattern(found)
 
     def _result(self, points: list[Rows], make: Callable[[], Rows], method: str) -> dict[str, Any]:
         rows = points[0]
