@@ -19,6 +19,7 @@ from hvdc_ident.identifiability.combinations import Combination, combinations_of
 from hvdc_ident.identifiability.evidence import (
     bounded,
     joint_limits,
+    pair_of,
     partner,
     physical_bounds,
     rise_at_ends,
@@ -52,6 +53,7 @@ def identifiability(
     starts: int = 8,
     seed: int = 0,
     held: Mapping[str, float] | None = None,
+    pair: tuple[str, str] | None = None,
     walk: Walk | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -60,13 +62,17 @@ def identifiability(
 
     subject: a model, or anything that can be simulated (then the structure is judged by numbers, at random points).
     candidates: the parameters to judge, with start and bounds. held: values of other parameters.
+    pair: two candidates whose common profile is wanted too, over twice their intervals, where both are fitted.
     Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates), held=FrozenMap(held or {}))
-    return _Assessment(problem, subject if isinstance(subject, Model) else None, seed, walk or Walk(), progress).report(
-        starts, executor
-    )
+    model = subject if isinstance(subject, Model) else None
+    report, last = _Assessment(problem, model, seed, walk or Walk(), progress).report(starts, executor)
+    if pair and last is not None and set(pair) <= set(report.identifiable):
+        return replace(report, pair=pair_of(last, report.parameters, pair))
+    note = f"No common profile of {' and '.join(pair)}: not both are fitted." if pair else ""
+    return replace(report, notes=(*report.notes, note)) if note else report
 
 
 class _Assessment:
@@ -83,8 +89,8 @@ class _Assessment:
         self.notes: list[str] = []
         self.remark = ""
 
-    def report(self, starts: int, executor: Executor | None) -> IdentifiabilityReport:
-        """The report."""
+    def report(self, starts: int, executor: Executor | None) -> tuple[IdentifiabilityReport, Optimum | None]:
+        """The report, and the optimum of the set that is fitted."""
         self._check()
         self._tell("structure")
         structure = structure_of(self.model, self.problem, self.seed)
@@ -99,7 +105,7 @@ class _Assessment:
         rest: Optimum | None = self._insensitive(optimum)
         rest = self._lost(rest) if rest else None
         last = self._profiled(rest) if rest else None
-        return self._assembled(structure, optimum, last, result)
+        return self._assembled(structure, optimum, last, result), last
 
     def _tell(self, text: str) -> None:
         if self.progress:

@@ -12,8 +12,10 @@ from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile, Side
+from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
+from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.trajectory import Array
 
 DRAWS = 999
@@ -154,3 +156,21 @@ def _with_rise(profile: Profile, low: bool, rise: float) -> Profile:
         return profile
     limit = Side("closed", float(np.interp(np.sqrt(rise), roots, values)), "bootstrap, several on bounds")
     return replace(profile, upper=limit, threshold=rise) if low else replace(profile, lower=limit, threshold=rise)
+
+
+def pair_of(optimum: Optimum, found: Mapping[str, Verdict], names: tuple[str, str], points: int = 13) -> PairProfile:
+    """The common profile of two fitted parameters, over twice their intervals but within the bounds.
+
+    Its rises are in units of the threshold for one parameter, so 95 % of both together lie within JOINT/1.92.
+    """
+    grids = []
+    for n in names:
+        u = optimum.problem.unknowns[optimum.problem.names.index(n)]
+        v = found[n]
+        low, high = v.ci95 or (None, None)
+        half = 0.5 * (high - low) if low is not None and high is not None else 0.25 * u.span
+        centre = optimum.value(n)
+        grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), points))
+    limit = max(thresholds(optimum)[n] for n in names)
+    pair = profile_pair(LeastSquares.of(optimum.problem), optimum.theta, names, *grids, enough=1e-3 * limit)
+    return replace(pair, rises=pair.rises / limit)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.fit.profile import Profile
+from hvdc_ident.fit.profile_pair import PairProfile
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
@@ -31,7 +32,7 @@ class IdentifiabilityReport:
     parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
     reason of each other one. combinations: what is seen of those that cannot be told apart. collinear: subsets with
     their index, worst first within each size. shares: of each parameter's information, by experiment.
-    notes: remarks on the data and on what the search met.
+    pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the search met.
     """
 
     parameters: FrozenMap[Verdict]
@@ -48,6 +49,7 @@ class IdentifiabilityReport:
     thresholds: FrozenMap[float] = field(default_factory=FrozenMap)
     pilot: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    pair: PairProfile | None = None
 
     @property
     def conditional_on(self) -> dict[str, tuple[str, ...]]:
@@ -90,6 +92,7 @@ class IdentifiabilityReport:
             "experiments": {e: {"information": dict(t)} for e, t in self.shares.items()},
             "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
+            "pair": self.pair,
             "pilot": self.pilot,
             "notes": [*self.notes, CONDITIONS],
         }

@@ -42,7 +42,28 @@ def profiles(found: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Ma
         axes.set_title(str(line.get("verdict", "")), fontsize=8)
         axes.set_ylim(-0.05, min(max(1.6, float(np.nanmax(y, initial=0.0)) * 1.05), 4.0))
         axes.tick_params(labelsize=7)
+        axes.ticklabel_format(axis="x", useOffset=False)
         axes.grid(True, color="#e4e4e4", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     fig.supylabel("rise of the cost / 95 % level", fontsize=8)
+    return fig
+
+
+def pair_map(pair: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Contours of the rise over two parameters, in units of the 95 % level of one; 1.56 is the joint 95 % region."""
+    fig = figure(4.6, 3.6)
+    axes = fig.add_subplot()
+    rises = np.array([[np.nan if v is None else v for v in row] for row in pair["rises"]], dtype=float).T
+    drawn = axes.contour(pair["first"], pair["second"], np.ma.masked_invalid(rises), levels=[0.25, 1.0, 1.56, 4.0])
+    axes.clabel(drawn, fontsize=7)
+    labels = []
+    for name in pair["names"]:
+        unit = parameters.get(name, {}).get("unit")
+        labels.append(f"{name}, {unit}" if unit else str(name))
+    axes.set_xlabel(labels[0], fontsize=8)
+    axes.set_ylabel(labels[1], fontsize=8)
+    axes.ticklabel_format(useOffset=False)
+    axes.tick_params(axis="x", labelrotation=20)
+    axes.tick_params(labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
     return fig

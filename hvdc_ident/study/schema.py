@@ -161,7 +161,9 @@ class Sweep(Table):
 
 
 class Identifiability(Table):
-    """[identifiability]: asks for the stage."""
+    """[identifiability]: asks for the stage. pair: two candidates whose common profile is wanted, on a grid."""
+
+    pair: Annotated[list[Name], Field(min_length=2, max_length=2)] | None = None
 
 
 class Group(Table):

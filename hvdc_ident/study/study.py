@@ -169,6 +169,8 @@ def _check_questions(study: Study, where: str) -> None:
 
         axes_of(s.sweep, 0, f"{where}, sweep")
         against_of(s.sweep, f"{where}, sweep")
+    if s.identifiability:
+        _all_known("candidate", s.identifiability.pair, study.candidates, f"{where}, identifiability.pair")
     for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
         place = f"{where}, fit.groups number {number}"
         _all_known("candidate", group.parameters, study.candidates, f"{place}.parameters")

@@ -136,5 +136,9 @@ def test_the_commands(study) -> None:
     result = call("report", study)
     page = (folder / "report.html").read_text()
     assert "What the data tell about the parameters" in page and "What to measure next" in page
+    study.write_text(study.read_text().replace("[fit]", '[identifiability]\npair = ["k", "flat"]\n[fit]'))
+    assert call("identify", study, "--quiet").exit_code == 0
+    notes = json.loads((folder / "identifiability.json").read_text())["notes"]
+    assert any("No common profile of k and flat" in n for n in notes)
     result = call("fit", study, "--force", "nothing")
     assert result.exit_code == 2 and "no candidate 'nothing'" in result.output

@@ -144,6 +144,17 @@ def test_to_dict_is_the_json() -> None:
     assert set(found["experiments"]) == {"e0", "e1", "e2"} and found["misspecified"] is False
 
 
+def test_a_pair_has_a_common_profile_where_both_are_fitted() -> None:
+    plant = closed(decay, a=1.0, k=1.0)
+    data = [measured(plant, {"a": 2, "k": 3}, 0.01)]
+    free = [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)]
+    found = identifiability(plant, data, free, starts=2, pair=("k", "a"))
+    assert found.pair is not None and found.pair.names == ("k", "a")
+    middle = found.pair.rises[6, 6]
+    assert abs(middle) < 1e-6 and found.pair.rises.min() >= -1e-6 and found.pair.rises[0, 0] > 1
+    assert len(found.to_dict()["pair"]["rises"]) == 13
+
+
 # --- bad input ---
 
 

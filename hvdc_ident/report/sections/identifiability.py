@@ -6,7 +6,7 @@ from typing import Any
 
 from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.profiles import profiles
+from hvdc_ident.report.profiles import pair_map, profiles
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
@@ -66,8 +66,10 @@ def _pictures(found: dict[str, Any]) -> str:
     drawn = {n: p for n, p in (found.get("profiles") or {}).items() if len(p.get("values") or []) > 1}
     if not drawn:
         return ""
+    both = found.get("pair")
+    more = svg(pair_map(both, found.get("parameters") or {}), "common profile of two parameters") if both else ""
     picture = svg(profiles(drawn, found.get("parameters") or {}), "profiles of the cost by parameter")
-    return f"<h3>Profiles</h3><figure>{picture}</figure>"
+    return f"<h3>Profiles</h3><figure>{picture}{more}</figure>"
 
 
 def _experiments(found: dict[str, Any]) -> str:

@@ -24,6 +24,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     need_candidates(study, "identify")
     need_start(study)
     starts = max(study.settings.fit.starts, FEWEST_STARTS) if study.settings.fit else 8
+    pair = study.settings.identifiability.pair if study.settings.identifiability else None
     with processes(options.workers) as executor:
         report = identifiability(
             study.model,
@@ -33,6 +34,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             seed=options.seed,
             executor=executor,
             progress=options.progress,
+            pair=(pair[0], pair[1]) if pair else None,
         )
     bounds = {n: {"start": f.start, "min": f.min, "max": f.max} for n, f in study.candidates.items()}
     return Outcome({**report.to_dict(), "candidates": bounds})
