@@ -53,7 +53,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 STAGE = Stage(
     name="sweep",
     file="sweep.json",
-    summary="The model at many points of some parameters, against every recording.",
+    summary="The errors over a range of parameters.",
     run=run,
     wanted=lambda study: bool(study.settings.sweep),
     order=25,
