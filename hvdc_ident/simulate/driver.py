@@ -453,7 +453,7 @@ def integrate(address, dims, hess_row, hess_column, method, p, y, w, wd, constan
             rejected = False
 
             # --- what happens within the step ---
-            needs_dense = nd > 0 or (i_out < t_out.size and t_out[i_out] < step_end) or ns > 0
+            needs_dense = nd > 0 or (i_out < t_out.size and t_out[i_out] <= step_end) or ns > 0
             if needs_dense:
                 if method == ROSENBROCK:
                     rodas_dense(k, y, yn, dense)
