@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
+    from hvdc_ident.sensitivity.sweep import sweep
     from hvdc_ident.simulate import simulate
     from hvdc_ident.study.export import export
     from hvdc_ident.study.study import load_study
@@ -47,6 +48,7 @@ __all__ = [
     "load_study",
     "read_waveforms",
     "simulate",
+    "sweep",
 ]
 
 _HOME = {
@@ -67,6 +69,7 @@ _HOME = {
     "load_study": "study.study",
     "read_waveforms": "formats",
     "simulate": "simulate",
+    "sweep": "sensitivity.sweep",
 }
 
 

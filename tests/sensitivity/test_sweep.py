@@ -1,0 +1,197 @@
+"""A sweep's rows: exact numbers, failures with reasons, one order whatever runs them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import InputError, StudyError, UnknownNameError
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.files import Rows, json_text
+from hvdc_ident.model.card import parse_card
+from hvdc_ident.models import load_model
+from hvdc_ident.sensitivity.axes import grid, latin_hypercube, listed
+from hvdc_ident.sensitivity.sweep import sweep
+from hvdc_ident.sensitivity.sweep_result import cell
+from hvdc_ident.study.executors import Ended
+from hvdc_ident.trajectory import trajectory
+
+CARD = """
+schema = 1
+name = "lag"
+[parameters]
+k = {value = 2.0, unit = "1/s", min = 0.0, max = 1000.0}
+g = {value = 1.0, min = -10.0, max = 10.0}
+[inputs]
+u = {value = 0.0}
+w = {value = 1.0}
+[states]
+x = {derivative = "u + w - k*x"}
+[outputs]
+y = "g*x"
+"""
+TIME = np.arange(101) * 0.01
+MODEL = parse_card(CARD)
+STEP = experiment("step", TIME, {"u": InputSignal.step(0.0, 0.0, 1.0)})
+
+
+def response(k, g=1.0):
+    """y after u has gone from 0 to 1 at t = 0, from rest."""
+    return g * (2 - np.exp(-k * TIME)) / k
+
+
+RECORDED = STEP.with_(measured=trajectory(TIME, {"y": response(3.0)}))
+
+
+def test_errors_are_those_of_the_closed_solution():
+    found = sweep(MODEL, [RECORDED], listed("k", [1, 3, 5]))
+    want = [np.sqrt(np.mean((response(k) - response(3.0)) ** 2)) for k in (1, 3, 5)]
+    assert np.allclose(found.error("y", "step"), want, atol=1e-8)
+    assert found.best("y", "step") == {"k": 3.0} and not found.failed
+
+
+def test_against_the_base_and_against_another_model():
+    base = sweep(MODEL, [STEP], grid("k", 1, 3, 3), against="base")
+    assert base.error("y", "step")[1] == 0.0 and base.base["k"] == 2.0
+    other = sweep(MODEL, [STEP], listed("k", [2, 4]), against=MODEL.with_values({"k": 4}))
+    assert other.error("y", "step")[1] < 1e-9 < other.error("y", "step")[0]
+
+
+def test_the_window_and_the_base_values_count():
+    windowed = RECORDED.with_(window=(0.5, 1.0))
+    found = sweep(MODEL, [windowed], listed("k", [1.0]), values={"g": 2.0})
+    rows = windowed.compared
+    assert found.rmse[0, 0] == pytest.approx(np.sqrt(np.mean((response(1, 2) - response(3))[rows] ** 2)), abs=1e-8)
+
+
+def test_a_failed_point_is_a_row_with_a_reason_and_no_number():
+    found = sweep(MODEL, [RECORDED], listed("k", [1, 0, 3]), want=("rmse", "poles"))
+    assert list(found.failed) == [1] and "steady state" in found.failed[1]
+    rows = list(csv.DictReader(io.StringIO(found.to_csv())))
+    assert [r["status"] for r in rows] == ["done", "failed", "done"]
+    assert rows[1]["rmse.y.step"] == "" and "steady state" in rows[1]["reason"]
+    point = found.to_dict()["points"][1]
+    assert point["rmse"] == {"y": {"step": None}} and point["poles"] is None and point["reason"]
+    assert str(found.to_xarray()["status"].values[1]) == "failed"
+
+
+def test_poles_and_response_at_each_point():
+    omega = np.array([0.1, 10.0])
+    found = sweep(MODEL, [], listed("k", [1, 5]), want=("poles", "bode"), linear=(["u"], ["y"]), omega=omega)
+    assert np.allclose(found.poles[:, 0], [-1, -5])
+    assert np.allclose(found.response[:, :, 0, 0], [[1 / (1j * w + k) for w in omega] for k in (1, 5)])
+    assert found.to_dict()["points"][0]["bode"]["y"]["u"][0] == pytest.approx([1 / 1.01, -0.1 / 1.01])
+
+
+def test_a_grid_of_two_and_an_input_as_an_axis():
+    found = sweep(MODEL, [STEP], [grid("k", 1, 3, 3), listed("w", [0, 1])], against="base")
+    dataset = found.to_xarray()
+    assert dataset["rmse"].dims == ("k", "w", "output", "experiment") and dataset["rmse"].shape == (3, 2, 1, 1)
+    assert float(dataset["rmse"].sel(k=2, w=1).squeeze()) == 0.0
+    assert found.row(3)["values"] == {"k": 2.0, "w": 1.0}
+    with pytest.raises(StudyError, match="moved by experiment"):
+        sweep(MODEL, [STEP], listed("u", [1]), against="base")
+
+
+class Backwards:
+    """Runs the last item first, as workers may."""
+
+    def run(self, function, items):
+        for index, item in reversed(list(enumerate(items))):
+            yield Ended(index, function(item)) if index % 7 else Ended(index, None, "its worker was ended by SIGSEGV")
+
+
+def test_rows_stand_where_their_points_stand(monkeypatch):
+    monkeypatch.setattr("hvdc_ident.sensitivity.sweep.PROBE", -1.0)
+    monkeypatch.setattr("hvdc_ident.sensitivity.sweep.WORTH", -1.0)
+    axis = latin_hypercube({"k": (1, 9), "g": (1, 2)}, 30, seed=1)
+    plain = sweep(MODEL, [RECORDED], axis)
+    found = sweep(MODEL, [RECORDED], axis, executor=Backwards())
+    failed = list(found.failed)
+    assert failed == list(range(1, 30, 7)) and set(found.failed.values()) == {"its worker was ended by SIGSEGV"}
+    kept = [i for i in range(30) if i not in failed]
+    assert np.array_equal(found.rmse[kept], plain.rmse[kept])
+
+
+class Shelf:
+    def __init__(self):
+        self.items, self.puts = {}, 0
+
+    def get(self, keys):
+        return {k: self.items[k] for k in keys if k in self.items}
+
+    def put(self, key, value):
+        self.items[key], self.puts = value, self.puts + 1
+
+
+def test_what_is_kept_is_not_run_again_and_what_differs_is_elsewhere():
+    shelves = {}
+
+    def kept(name):
+        return shelves.setdefault(name, Shelf())
+
+    first = sweep(MODEL, [RECORDED], grid("k", 0, 4, 5), kept=kept)
+    again = sweep(MODEL, [RECORDED], grid("k", 0, 4, 9), kept=kept)
+    (shelf,) = shelves.values()
+    assert shelf.puts == 9 and again.to_csv().splitlines()[1] == first.to_csv().splitlines()[1]
+    sweep(MODEL.with_values({"g": 1.5}), [RECORDED], grid("k", 0, 4, 5), kept=kept)
+    sweep(MODEL, [RECORDED.with_(window=(0, 0.5))], grid("k", 0, 4, 5), kept=kept)
+    assert len(shelves) == 3
+
+
+def test_text_that_a_spreadsheet_would_calculate_is_quoted():
+    assert [cell(t) for t in ("=1+1", "+a", "-a", "@a", "\ta", "plain", "two\nlines")] == [
+        "'=1+1", "'+a", "'-a", "'@a", "'\ta", "plain", "two lines",
+    ]  # fmt: skip
+    odd = RECORDED.with_(name="=cmd()")
+    assert "rmse.y.=cmd()" in sweep(MODEL, [odd], listed("k", [1])).to_csv()
+    assert sweep(MODEL, [odd], listed("k", [-0.0])).to_csv().splitlines()[1].startswith("-0.0,")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named", "kind"),
+    [
+        (([RECORDED], listed("q", [1])), {}, UnknownNameError),
+        (([RECORDED], listed("k", [1])), {"values": {"q": 1}}, UnknownNameError),
+        (([RECORDED], listed("k", [1])), {"want": ("poels",)}, UnknownNameError),
+        (([RECORDED], listed("k", [-1])), {}, StudyError),
+        (([], listed("k", [1])), {}, StudyError),
+        (([STEP], listed("k", [1])), {}, StudyError),
+        (([RECORDED, RECORDED], listed("k", [1])), {}, StudyError),
+        (([RECORDED], listed("k", [1])), {"against": "datum"}, StudyError),
+    ],
+)
+def test_what_does_not_fit_is_said_before_anything_runs(arguments, named, kind):
+    with pytest.raises(kind) as error:
+        sweep(MODEL, *arguments, **named)
+    assert isinstance(error.value, InputError) and str(error.value)
+
+
+def test_json_of_rows_made_one_by_one_is_json():
+    found = sweep(MODEL, [RECORDED], listed("k", [1, 0]))
+    data = {**found.summary(), "points": Rows(found.rows, len(found)), "none": Rows(list, 0)}
+    read = json.loads(json_text(data))
+    assert read.pop("none") == [] and read == json.loads(json_text(found.to_dict()))
+
+
+def test_it_draws_and_tells():
+    import matplotlib.pyplot as plt
+
+    found = sweep(MODEL, [RECORDED], listed("k", [1, 3]))
+    assert found.plot().get_xlabel() == "k, 1/s"
+    plt.close("all")
+    assert "k = 3" in str(found) and "<pre>" in found._repr_html_()
+
+
+def test_fifty_one_points_of_the_link_take_under_half_a_second():
+    link, times = load_model("vsc-hvdc-link"), np.arange(1001) * 1e-3
+    step = experiment("v", times, {"Vdcref1": InputSignal.step(0.1, 1, 1.019)})
+    sweep(link, [step], grid("KIVDC", 250, 1500, 2), against="base", outputs=["Irorder1"])
+    begin = time.process_time()
+    found = sweep(link, [step], grid("KIVDC", 250, 1500, 51), against="base", outputs=["Irorder1"])
+    assert time.process_time() - begin < 0.5 and not found.failed

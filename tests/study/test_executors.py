@@ -1,0 +1,41 @@
+"""The pool: every item ends with a value or a reason, whatever happens to its workers."""
+
+from __future__ import annotations
+
+import pool_jobs
+import pytest
+
+from hvdc_ident.errors import ComputationError, InputError
+from hvdc_ident.study.executors import LocalPool
+
+
+def ends(pool, job, items):
+    found = {e.index: e for e in pool.run(job, items)}
+    assert sorted(found) == list(range(len(items)))
+    return [found[i] for i in range(len(items))]
+
+
+def test_dying_hanging_and_failing_items_cost_only_themselves(tmp_path):
+    job = pool_jobs.Job(dies={3}, hangs={11}, fails={7}, once=str(tmp_path / "once"))
+    found = ends(LocalPool(2, timeout=1.0), job, list(range(40)))
+    bad = {i: e.failure for i, e in enumerate(found) if e.failure}
+    assert bad == {
+        3: "its worker was ended by SIGSEGV",
+        7: "ValueError: a bad number",
+        11: "no result after 1 s",
+    }
+    assert all(e.value == i * i for i, e in enumerate(found) if i not in bad)
+
+
+def test_map_keeps_the_order_and_raises():
+    assert list(LocalPool(2).map(pool_jobs.Job(), range(20))) == [i * i for i in range(20)]
+    with pytest.raises(ComputationError, match="item 3 failed"):
+        list(LocalPool(1).map(pool_jobs.Job(fails={2}), range(5)))
+
+
+def test_nothing_to_do_and_nothing_that_works():
+    assert list(LocalPool(2).run(pool_jobs.Job(), [])) == []
+    with pytest.raises(ComputationError, match="cannot be started"):
+        list(LocalPool(1).run(pool_jobs.Unloadable(), [1]))
+    with pytest.raises(InputError):
+        LocalPool(0)

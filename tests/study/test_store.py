@@ -1,0 +1,201 @@
+"""The store: what was kept survives a kill at any instant, one run at a time, the same table in the end."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hvdc_ident.cli import app
+from hvdc_ident.errors import InputError
+from hvdc_ident.study.store import Store, exclusive
+
+CARD = """
+schema = 1
+name = "lag"
+[parameters]
+k = {value = 2.0, min = 0.0, max = 1000.0}
+[inputs]
+u = {value = 1.0}
+[states]
+x = {derivative = "u - k*x"}
+[outputs]
+y = "x"
+"""
+STUDY = """
+schema = 1
+[model]
+source = "lag.toml"
+[[experiment]]
+name = "e"
+data = "e.csv"
+inputs = ["u"]
+outputs = ["y"]
+event = 0.5
+"""
+GRID = '[[sweep]]\nparameter = "k"\nmin = 0\nmax = 4\npoints = {points}\n'
+WORKER = """
+import sys, threading
+from pathlib import Path
+import hvdc_ident.sensitivity.point as point
+from hvdc_ident.study.pipeline import run_stage
+from hvdc_ident.study.stage import Options
+from hvdc_ident.study.study import load_study
+study = load_study(sys.argv[1])
+run, pause = point.PointTask.__call__, threading.Event()
+
+
+def slowed(self, p):
+    pause.wait(0.001)
+    if not told:
+        print("ready", flush=True)
+        told.append(True)
+    return run(self, p)
+
+
+told = []
+point.PointTask.__call__ = slowed
+run_stage(study, "sweep", Path(sys.argv[2]), Options())
+"""
+HOLD = "import sys; from pathlib import Path; from hvdc_ident.study.store import exclusive\n"
+HOLD += "with exclusive(Path(sys.argv[1])):\n print('held', flush=True); sys.stdin.read()"
+
+
+def study(folder: Path, sweep: str) -> Path:
+    t = np.arange(101) * 0.01
+    u = np.where(t >= 0.5, 2.0, 1.0)
+    y = 0.5 + np.where(t >= 0.5, 0.5 * (1 - np.exp(-2 * (t - 0.5))), 0)
+    rows = "\n".join(f"{a:.2f},{b:g},{c:.9f}" for a, b, c in zip(t, u, y, strict=True))
+    (folder / "e.csv").write_text(f"time,u,y\n{rows}\n")
+    (folder / "lag.toml").write_text(CARD)
+    (folder / "s.toml").write_text(STUDY + sweep)
+    return folder / "s.toml"
+
+
+def sweep(*arguments: object) -> str:
+    result = CliRunner().invoke(app, ["sweep", *map(str, arguments), "--quiet"])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_killed_at_random_instants_the_table_is_the_same(tmp_path):
+    path = study(tmp_path, GRID.format(points=4000))
+    sweep(path, "--out", tmp_path / "whole")
+    delays = random.Random(5)
+    for _ in range(4):
+        process = subprocess.Popen(
+            [sys.executable, "-c", WORKER, str(path), str(tmp_path / "killed")], stdout=subprocess.PIPE, text=True
+        )
+        with process:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            deadline = time.monotonic() + delays.uniform(0.1, 0.8)
+            while process.poll() is None and time.monotonic() < deadline:
+                pass
+            assert process.poll() is None, "the sweep ended before it was killed"
+            process.send_signal(signal.SIGKILL)
+    with Store(tmp_path / "killed") as store:
+        assert store._base is not None
+        kept = store._base.execute("SELECT count(*) FROM kept").fetchone()[0]
+        assert store._base.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+    assert 0 < kept < 4000
+    sweep(path, "--out", tmp_path / "killed")
+    for name in ("sweep.csv", "sweep.json"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_one_run_at_a_time_and_no_lock_left_behind(tmp_path):
+    path = study(tmp_path, GRID.format(points=5))
+    folder = tmp_path / "r"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        result = CliRunner().invoke(app, ["sweep", str(path), "--out", str(folder)])
+        assert result.exit_code == 2
+        assert "another run is at work in this folder" in result.stderr and str(folder) in result.stderr
+        process.kill()
+    sweep(path, "--out", folder)
+    with exclusive(folder), exclusive(folder):
+        pass  # within one process it may be asked for again
+
+
+def test_a_folder_made_for_nothing_is_removed(tmp_path):
+    with pytest.raises(InputError, match="stop"), exclusive(tmp_path / "new"):
+        raise InputError("stop")
+    assert not (tmp_path / "new").exists()
+
+
+def test_jobs_are_apart_and_a_second_run_finds_them(tmp_path):
+    with Store(tmp_path) as store:
+        store.job("a").put(b"1", b"one")
+        store.job("b").put(b"1", b"other")
+    with Store(tmp_path) as store:
+        keys = [b"%d" % i for i in range(1200)]
+        assert store.job("a").get(keys) == {b"1": b"one"} and store.job("b").get(keys) == {b"1": b"other"}
+        assert store.job("c").get(keys) == {}
+
+
+def test_a_file_that_is_no_store_is_said_and_left_alone(tmp_path):
+    file = tmp_path / ".store" / "results.sqlite"
+    file.parent.mkdir()
+    file.write_bytes(b"not a database" * 100)
+    with pytest.raises(InputError, match="the store cannot be used"), Store(tmp_path):
+        pass
+    assert file.read_bytes() == b"not a database" * 100
+
+
+def test_only_what_is_missing_is_run(tmp_path, monkeypatch):
+    calls = []
+    path = study(tmp_path, GRID.format(points=5))
+    sweep(path)
+    from hvdc_ident.sensitivity import point
+
+    run = point.PointTask.__call__
+    monkeypatch.setattr(point.PointTask, "__call__", lambda self, p: (calls.append(float(p[0])), run(self, p))[1])
+    sweep(path)
+    assert calls == []
+    path.write_text(STUDY + GRID.format(points=9))
+    sweep(path)
+    assert calls == [0.5, 1.5, 2.5, 3.5]
+
+
+def test_two_workers_give_the_bytes_of_one(tmp_path, monkeypatch):
+    monkeypatch.setattr("hvdc_ident.sensitivity.sweep.PROBE", -1.0)
+    monkeypatch.setattr("hvdc_ident.sensitivity.sweep.WORTH", -1.0)
+    cube = '[[sweep]]\nparameter = "k"\nmin = 0\nmax = 4\npoints = 40\nsampling = "latin-hypercube"\nwant = ["rmse", "poles"]\n'
+    path = study(tmp_path, cube)
+    sweep(path, "--out", tmp_path / "one", "--seed", 3)
+    sweep(path, "--out", tmp_path / "two", "--seed", 3, "--workers", 2)
+    for name in ("sweep.csv", "sweep.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    sweep(path, "--out", tmp_path / "other", "--seed", 4)
+    assert (tmp_path / "other" / "sweep.csv").read_bytes() != (tmp_path / "one" / "sweep.csv").read_bytes()
+
+
+def test_a_sweep_of_two_tables_is_their_product_and_reaches_the_page(tmp_path):
+    path = study(tmp_path, GRID.format(points=4) + 'want = ["rmse", "poles"]\n')
+    assert CliRunner().invoke(app, ["run", str(path), "--quiet"]).exit_code == 0
+    page = (tmp_path / "s-results" / "report.html").read_text()
+    assert "RMSE over k" in page and "poles over k" in page and "1 points failed" in page
+
+
+@pytest.mark.parametrize(
+    ("extra", "text"),
+    [
+        ("", "the study names none"),
+        (GRID.format(points=5) * 2, "swept twice"),
+        ('[[sweep]]\nparameter = "q"\nvalues = [1]\n', "no parameter 'q'"),
+        ('[[sweep]]\nparameter = "k"\nvalues = [-1]\n', "bounds"),
+        ('[[sweep]]\nparameter = "k"\nvalues = [1]\nsampling = "latin-hypercube"\n', "Latin hypercube"),
+    ],
+)
+def test_a_wrong_sweep_is_refused(tmp_path, extra, text):
+    result = CliRunner().invoke(app, ["sweep", str(study(tmp_path, extra))])
+    assert result.exit_code == 2 and text in result.stderr
