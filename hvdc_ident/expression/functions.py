@@ -15,7 +15,7 @@ def symbol(name: str) -> sp.Symbol:
 TIME = symbol("time")
 
 
-class clip(sp.Function):  # noqa: N801 - it prints under the name it has in model cards
+class clip(sp.Function):
     """clip(x, low, high): the hard limiter, low where x < low, high where x > high, else x."""
 
     nargs = 3
@@ -30,7 +30,9 @@ class clip(sp.Function):  # noqa: N801 - it prints under the name it has in mode
     def fdiff(self, argindex: int = 1) -> Any:
         x, low, high = self.args
         inside = sp.Piecewise((0, x < low), (0, x > high), (1, True))
-        return {1: inside, 2: sp.Piecewise((1, x < low), (0, True)), 3: sp.Piecewise((1, x > high), (0, True))}[argindex]
+        return {1: inside, 2: sp.Piecewise((1, x < low), (0, True)), 3: sp.Piecewise((1, x > high), (0, True))}[
+            argindex
+        ]
 
 
 def where(condition: Any, a: Any, b: Any) -> sp.Expr:

@@ -5,9 +5,8 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.expression import parse
-from hvdc_ident.simulate.machine import evaluate
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.machine import Code, Function
+from hvdc_ident.simulate.machine import Code, Function, evaluate
 
 NAMES = ("a", "b", "c")
 TEXTS = (
