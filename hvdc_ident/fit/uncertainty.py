@@ -85,7 +85,7 @@ def uncertainty(blocks: Sequence[Block], names: Sequence[str], spans: Array, sou
     norms = np.where(unseen, 1.0, norms)
     inverse, null = _inverse(jacobian / norms, ~unseen)
     rho, effective = _samples(blocks, p)
-    meat = sum((_meat(b.jacobian / norms, rho[b.output]) for b in blocks), np.zeros((p, p)))
+    meat = sum((score_covariance(b.jacobian / norms, rho[b.output]) for b in blocks), np.zeros((p, p)))
     sandwich = inverse @ meat @ inverse
     from_misfit = any(source[b.output] == MISFIT for b in blocks)
     if from_misfit and count > p:
@@ -145,7 +145,7 @@ def _samples(blocks: Sequence[Block], p: int) -> tuple[dict[str, float], dict[st
     return rho, effective
 
 
-def _meat(jacobian: Array, rho: float) -> Array:
+def score_covariance(jacobian: Array, rho: float) -> Array:
     """J'RJ with R_ij = rho^|i-j|, (p, p)."""
     if rho == 0.0:
         return jacobian.T @ jacobian

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.fit.uncertainty import _meat
+from hvdc_ident.fit.uncertainty import score_covariance
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.trajectory import Array
@@ -79,7 +79,7 @@ def _stacked(optimum: Optimum, names: list[str]) -> tuple[Array, list[Array], Ar
         e, j = names.index(b.experiment), b.jacobian * optimum.slope
         scores[e] += j.T @ b.residual
         informations[e] += j.T @ j
-        meats[e] += _meat(j, optimum.uncertainty.rho[b.output])
+        meats[e] += score_covariance(j, optimum.uncertainty.rho[b.output])
     whole = np.linalg.pinv(sum(informations, np.zeros((p, p))), hermitian=True)
     size = len(names) * p
     project, meat = np.eye(size), np.zeros((size, size))
