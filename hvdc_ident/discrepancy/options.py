@@ -1,0 +1,47 @@
+"""How a diagnosis is done: thresholds and budgets, each with the reason for its default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hvdc_ident.errors import StudyError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Thresholds and budgets of a diagnosis.
+
+    significance: largest max-T p of a named effect. bootstraps: noise records drawn for it (p is at least 1/(n + 1)).
+    named_bic: the delta BIC a named effect must exceed. set_bic: rivals within it join the ambiguity set.
+    shortlist: how many of the best by score are refitted; collinear: cosine from which a candidate is refitted beside
+    its partner. refits: candidates refitted in one round at most. most: effects at most.
+    holdout_share: the held-out gap has to shrink by more than this share of the noise.
+    refuted: share of what an effect explains that may be left, in structure, in the region it was put there for.
+    starts: runs of the nominal multistart. fallback: whether a form outside the catalogue is looked for.
+    declared nuisances are estimated with the parameters; free_start: the start state is a nuisance too.
+    """
+
+    significance: float = 0.01
+    bootstraps: int = 400
+    named_bic: float = 10.0
+    set_bic: float = 6.0
+    shortlist: int = 5
+    collinear: float = 0.9
+    refits: int = 24
+    most: int = 3
+    holdout_share: float = 0.1
+    refuted: float = 0.1
+    starts: int = 4
+    fallback: bool = True
+    free_start: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0 < self.significance < 1 and self.bootstraps * self.significance >= 1):
+            raise StudyError(
+                "the significance cannot be reached with so few bootstraps",
+                where="options of a diagnosis",
+                expected=f"at least {1 / self.significance:.0f} bootstraps",
+                got=f"{self.bootstraps}",
+            )
+        if min(self.shortlist, self.refits, self.most, self.starts) < 1:
+            raise StudyError("a budget of a diagnosis is below 1", where="options of a diagnosis")
