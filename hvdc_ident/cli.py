@@ -338,7 +338,7 @@ def convert(
         Path, typer.Argument(metavar="DATA", help="A file of waveforms in any known format.", show_default=False)
     ],
     to: Annotated[
-        Path | None, typer.Option("--to", metavar="FILE.csv", help="The CSV to write.", show_default=False)
+        Path | None, typer.Option("--to", metavar="FILE.csv", help="The CSV or Parquet file to write.", show_default=False)
     ] = None,
     signal: Annotated[
         list[str] | None, typer.Option("--signal", metavar="NAME", help="A signal wanted; default all.")
@@ -352,7 +352,7 @@ def convert(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Any waveform format to CSV; or, with --list, what a file holds."""
+    """Any waveform format to CSV or Parquet; or, with --list, what a file holds."""
     from hvdc_ident.formats import convert as to_csv
     from hvdc_ident.formats import list_signals
 

@@ -67,6 +67,8 @@ class Format(Protocol):
     def sample(self, path: Path) -> None:
         """Nothing; a small valid file is at the path afterwards."""
 
+    # A module that can also write its format has `write(trajectory, path) -> None`, for `convert`.
+
 
 @cache
 def _catalogue() -> tuple[tuple[str, Format], ...]:
@@ -112,19 +114,30 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
 
 
 def convert(
-    source: str | os.PathLike[str], target_csv: str | os.PathLike[str], signals: Iterable[str] | None = None
+    source: str | os.PathLike[str], target: str | os.PathLike[str], signals: Iterable[str] | None = None
 ) -> Trajectory:
-    """The waveforms of a file of any known format, after they were written to a CSV file.
+    """The waveforms of a file of any known format, after they were written to a CSV or Parquet file, by its ending.
 
     signals: names wanted; None for all. Raises WaveformError where the source cannot be used or the target not written.
     """
-    target = Path(target_csv)
-    if target.suffix.lower() != ".csv":
-        raise WaveformError("waveforms are converted to CSV only", expected="a name ending in .csv", got=str(target))
-    if target.exists() and Path(source).exists() and target.samefile(source):
-        raise WaveformError("source and target are the same file", where=str(target), hint="another name")
+    file = Path(target)
+    writers = {
+        suffix: module for module in formats().values() if hasattr(module, "write") for suffix in module.SUFFIXES
+    }
+    if file.suffix.lower() != ".csv" and file.suffix.lower() not in writers:
+        raise WaveformError(
+            "waveforms are not written in that format",
+            expected=f"a name ending in {' or '.join(['.csv', *writers])}",
+            got=str(file),
+        )
+    if file.exists() and Path(source).exists() and file.samefile(source):
+        raise WaveformError("source and target are the same file", where=str(file), hint="another name")
     found = read_waveforms(source, signals)
-    write_csv(found, target)
+    if file.suffix.lower() == ".csv":
+        write_csv(found, file)
+    else:
+        with _whole(file) as temporary:
+            writers[file.suffix.lower()].write(found, temporary)
     return found
 
 
@@ -139,10 +152,16 @@ def write_csv(trajectory: Trajectory, path: str | os.PathLike[str], *, units: bo
     _check(trajectory, target, rows=0)
     if "time" in trajectory.names:
         raise WaveformError("a signal is called 'time' like the first column", where=str(target), hint="rename it")
+    with _whole(target) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        file.writelines(_csv_text(trajectory, units))
+
+
+@contextlib.contextmanager
+def _whole(target: Path) -> Iterator[Path]:
+    """A path to write to, whose file takes the target's place when nothing went wrong."""
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        with open(temporary, "w", encoding="utf-8", newline="") as file:
-            file.writelines(_csv_text(trajectory, units))
+        yield temporary
         os.replace(temporary, target)
     except OSError as error:
         raise WaveformError(

@@ -1,5 +1,6 @@
 """CSV and its relatives: one header line, then numbers, separated by comma, semicolon, tab or blanks.
 
+A first column of dates or times of day, as phasor measurement units export them, counts in s from its first row.
 Two readers share one layout: a fast one that only says yes or no, and a careful one that either finds the line and
 column that is wrong or, where only columns nobody asked for are, reads around them.
 """
@@ -20,10 +21,11 @@ from numpy.typing import NDArray
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import FORMULA_START, event_rows, pick
+from hvdc_ident.formats._clock import Clock, is_clock
 from hvdc_ident.trajectory import Array, Trajectory
 
 NAME = "csv"
-SUMMARY = "text columns under one header line, the first column time in s; comma, semicolon, tab or blanks between"
+SUMMARY = "text columns under one header line, the first column time in s or a date; comma, semicolon, tab or blanks"
 SUFFIXES = (".csv", ".tsv", ".txt", ".ssv", ".asc")
 
 _MAX_COLUMNS = 100_000
@@ -38,7 +40,10 @@ _MANY_ROWS_SHARE = 0.2  # of the instants that may have more than two rows (even
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the top of a file says about the rest. labels: the header cells as they stand, the time's included."""
+    """What the top of a file says about the rest. labels: the header cells as they stand, the time's included.
+
+    absolute: the first column holds dates or times of day.
+    """
 
     path: Path
     encoding: str
@@ -48,6 +53,7 @@ class _Layout:
     labels: tuple[str, ...]
     names: tuple[str, ...]
     units: tuple[str, ...]
+    absolute: bool = False
 
     def column(self, i: int) -> str:
         return f"column {i + 1} ('{_short(self.labels[i])}')"
@@ -77,7 +83,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     _check_text(layout)
     wanted = pick(path, signals, layout.names[1:], layout.labels[1:])
     columns = [0] + [i + 1 for i in wanted]
-    table = _fast(layout, columns)
+    table = None if layout.absolute else _fast(layout, columns)
     if table is None:
         table = _careful(layout, columns)
     if len(table) < 2:
@@ -112,7 +118,8 @@ def _layout(path: Path) -> _Layout:
         trailing = len(cells) == len(labels) + 1 and not cells[-1].strip()
     _check_labels(labels, path, number)
     names, units = _names_and_units(labels)
-    if units[0].lower() not in _SECONDS:
+    absolute = separator is not None and is_clock(row.split(separator)[0].strip(' "'))
+    if not absolute and units[0].lower() not in _SECONDS:
         raise WaveformError(
             "the first column is not in seconds",
             where=f"{path}, line {number}, column 1",
@@ -120,7 +127,7 @@ def _layout(path: Path) -> _Layout:
             got=f"'{_short(labels[0])}'",
             hint="write the time in seconds",
         )
-    return _Layout(path, encoding, number, separator, trailing, tuple(labels), names, units)
+    return _Layout(path, encoding, number, separator, trailing, tuple(labels), names, units, absolute)
 
 
 def _encoding(path: Path) -> str:
@@ -283,6 +290,7 @@ def _rows(layout: _Layout) -> Iterator[str]:
 def _careful(layout: _Layout, columns: list[int]) -> Array:
     """(n, columns) the numbers, read cell by cell; WaveformError with line and column at the first that is wrong."""
     found = []
+    clock = Clock()
     width = len(layout.labels)
     comma_line = point_line = 0
     for number, line in _lines(layout.path, layout.encoding):
@@ -294,6 +302,9 @@ def _careful(layout: _Layout, columns: list[int]) -> Array:
         row = []
         for i in columns:
             cell = cells[i]
+            if i == 0 and layout.absolute:
+                row.append(_clock_time(clock, cell, layout, number))
+                continue
             if layout.separator != ",":
                 comma_line, point_line = comma_line or number * ("," in cell), point_line or number * ("." in cell)
                 cell = cell.replace(",", ".", 1)
@@ -306,6 +317,20 @@ def _careful(layout: _Layout, columns: list[int]) -> Array:
             )
         found.append(row)
     return np.array(found, dtype=float).reshape(len(found), len(columns))
+
+
+def _clock_time(clock: Clock, cell: str, layout: _Layout, line: int) -> float:
+    """The time of a cell in s from the first row."""
+    try:
+        return clock.seconds(cell)
+    except ValueError as error:
+        raise WaveformError(
+            f"{error} where the time stands",
+            where=f"{layout.path}, line {line}, {layout.column(0)}",
+            expected="as in 2026-11-21 10:15:00.020 (or 21/11/2026, day first)",
+            got=f"'{_short(cell)}'",
+            hint="write the time in seconds",
+        ) from None
 
 
 def _cells(line: str, layout: _Layout) -> list[str]:

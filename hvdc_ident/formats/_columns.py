@@ -1,0 +1,105 @@
+"""What several readers share: names of their own, records of several rates, packages that are an extra."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import MAX_BYTES
+from hvdc_ident.trajectory import Array, Trajectory
+
+TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds")
+"""What a time vector is called, lower case, in the order of preference."""
+
+
+def own_names(labels: Sequence[str]) -> tuple[str, ...]:
+    """The labels with those that stand more than once numbered: `a`, `a`, `b` become `a`, `a (2)`, `b`."""
+    taken = set(labels)
+    found: list[str] = []
+    for label in labels:
+        name, n = label, 1
+        while name in found:
+            n += 1
+            name = f"{label} ({n})"
+            if name in taken and name not in found:
+                continue
+        found.append(name)
+    return tuple(found)
+
+
+def time_name(names: Sequence[str]) -> str | None:
+    """The one of the names that is the time's; None where none is."""
+    lower = {name.lower(): name for name in reversed(names)}
+    return next((lower[n] for n in TIME_NAMES if n in lower), None)
+
+
+def joined(parts: Sequence[Trajectory], path: Path) -> Trajectory:
+    """Records of several rates over one time axis: that of the part with most rows, within the time all of them cover.
+
+    Slower signals are joined by lines in between. Raises WaveformError where the parts share no time.
+    """
+    finest = max(parts, key=len)
+    if all(part.time is finest.time or np.array_equal(part.time, finest.time) for part in parts):
+        values = np.column_stack([part.values for part in parts])
+        return Trajectory(finest.time, values, _names(parts), _units(parts))
+    start, end = max(float(p.time[0]) for p in parts), min(float(p.time[-1]) for p in parts)
+    time = finest.time[(finest.time >= start) & (finest.time <= end)]
+    if time.size < 2:
+        spans = ", ".join(f"{p.names[0]} {p.time[0]:g} to {p.time[-1]:g} s" for p in parts[:4])
+        raise WaveformError(
+            "the signals share no time",
+            where=str(path),
+            expected="records that overlap",
+            got=spans,
+            hint="select signals of one record",
+        )
+    values = np.column_stack([_at(part, j, time) for part in parts for j in range(len(part.names))])
+    return Trajectory(time, values, _names(parts), _units(parts))
+
+
+def check_size(rows: int, columns: int, path: Path) -> None:
+    """Nothing; WaveformError where so many numbers do not fit in the memory a table may take."""
+    size = rows * columns * 8
+    if size > MAX_BYTES:
+        raise WaveformError(
+            f"{columns} signals of {rows} rows take {size / 1e9:.1f} GB",
+            where=str(path),
+            expected=f"at most {MAX_BYTES / 1e9:.1f} GB",
+            hint="name the signals you need, or export a shorter time",
+        )
+
+
+def package(name: str, path: Path) -> Any:
+    """The package, imported; WaveformError naming the extra where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise WaveformError(
+            f"this file needs the package '{name}'",
+            where=str(path),
+            hint="pip install 'hvdc_ident[formats]', or export the file as CSV",
+        ) from None
+
+
+def damaged(path: Path, what: str, expected: str = "", got: str = "") -> WaveformError:
+    """An error for a file whose content does not hold together."""
+    return WaveformError(
+        what, where=str(path), expected=expected, got=got, hint="export it again; it may have been cut off"
+    )
+
+
+def _at(part: Trajectory, column: int, time: Array) -> Array:
+    return np.asarray(np.interp(time, part.time, part.values[:, column]))
+
+
+def _names(parts: Sequence[Trajectory]) -> tuple[str, ...]:
+    return own_names([name for part in parts for name in part.names])
+
+
+def _units(parts: Sequence[Trajectory]) -> tuple[str, ...]:
+    return tuple(unit for part in parts for unit in part.units)

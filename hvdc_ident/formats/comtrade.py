@@ -1,0 +1,272 @@
+"""COMTRADE records of fault recorders and relays: .cfg with its .dat, or both in one .cff.
+
+IEEE C37.111-1991, -1999 and -2013 (IEC 60255-24), data as ASCII, BINARY, BINARY32 or FLOAT32. The header and the data
+are taken apart by the package `comtrade`, in double precision; before it is asked, the number of channels and rows the
+header claims is held against what the file has, since the package would set memory aside for any claim. Times are
+computed here: from the sampling rates where the header gives them, else from the time stamps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import pick
+from hvdc_ident.formats._columns import check_size, damaged, own_names, package
+from hvdc_ident.trajectory import Array, Trajectory
+
+NAME = "comtrade"
+SUMMARY = "COMTRADE 1991, 1999 and 2013 of recorders and relays, ASCII, binary, float32, or all in one .cff"
+SUFFIXES = (".cfg", ".cff")
+
+_MAX_HEADER = 32 * 1024**2  # bytes
+_MAX_CHANNELS = 100_000
+_BYTES = {"BINARY": 2, "BINARY32": 4, "FLOAT32": 4}
+_COUNTS = re.compile(r"\s*(\d{1,6})\s*,\s*(\d{1,6})\s*A\s*,\s*(\d{1,6})\s*D\s*", re.IGNORECASE)
+_SECTION = re.compile(rb"^[ \t]*---[ \t]*file type:[ \t]*(\w+)(?:[ \t]+(\w+))?[ \t]*(?::[ \t]*(\d+))?[^\n]*---[ \t]*\r?$",
+                      re.IGNORECASE | re.MULTILINE)  # fmt: skip
+_REFUSALS = (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError, struct.error)
+
+
+@dataclass(frozen=True)
+class _Record:
+    """A record, its header taken apart. data: the bytes of the .dat part. names: analog channels, then digital ones."""
+
+    path: Path
+    text: str
+    header: Any
+    data: bytes
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is a .cff with a section header, or a .cfg whose second line counts channels."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        return False
+    with open(path, "rb") as file:
+        top = file.read(4096)
+    if suffix == ".cff":
+        found = _SECTION.search(top)
+        return found is not None and found[1].upper() == b"CFG"
+    return _counts(_decoded(top)) is not None
+
+
+def signals(path: Path) -> list[tuple[str, str]]:
+    """Name and unit of every channel, digital ones last, without a unit."""
+    text, _, _ = _parts(path, data=False)
+    _, names, units = _header(path, text)
+    return list(zip(names, units, strict=True))
+
+
+def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+    """The channels, all or those named in that order: a x + b in the header's unit, digital ones 0 or 1.
+
+    Primary or secondary values as recorded. A channel's skew moves it by interpolation. Time starts at 0.
+    Raises WaveformError for a header or data part that does not hold together.
+    """
+    record = _open(path)
+    wanted = pick(path, signals, record.names)
+    rows = _rows(record)
+    check_size(rows, len(record.names), path)
+    content = _content(record)
+    time = _time(record, content, rows)
+    analog = record.header.analog_count
+    columns = [
+        _skewed(time, content.analog[i], record.header.analog_channels[i].skew)
+        if i < analog
+        else content.status[i - analog]
+        for i in wanted
+    ]
+    values = np.column_stack([np.asarray(c, dtype=float) for c in columns]) if columns else np.empty((rows, 0))
+    return Trajectory(time, values, tuple(record.names[i] for i in wanted), tuple(record.units[i] for i in wanted))
+
+
+def sample(path: Path) -> None:
+    """Nothing; a small ASCII record with an analog channel of two kinds and a digital one is there afterwards."""
+    header = (
+        "STATION,REC,1999\r\n3,2A,1D\r\n1,Vdc,,,kV,0.5,1,0,-32767,32767,1,1,P\r\n2,P,,,MW,0.1,0,0,-32767,32767,1,1,P\r\n"
+        "1,TRIP,,,0\r\n50\r\n1\r\n1000,4\r\n01/01/2020,00:00:00.000000\r\n01/01/2020,00:00:00.002000\r\nASCII\r\n1\r\n"
+    )
+    rows = "1,0,100,-20,0\r\n2,1000,101,-21,0\r\n3,2000,140,-60,1\r\n4,3000,141,-61,1\r\n"
+    if path.suffix.lower() == ".cff":
+        text = f"--- file type: CFG ---\r\n{header}--- file type: DAT ASCII ---\r\n{rows}"
+        path.write_text(text, "ascii", newline="")
+        return
+    path.write_text(header, "ascii", newline="")
+    path.with_suffix(".dat").write_text(rows, "ascii", newline="")
+
+
+def _open(path: Path) -> _Record:
+    text, data, form = _parts(path)
+    header, names, units = _header(path, text)
+    if form and form != header.ft.upper():
+        raise damaged(path, "the sections contradict the header", expected=f"data {header.ft}", got=form)
+    return _Record(path, text, header, data, names, units)
+
+
+def _parts(path: Path, data: bool = True) -> tuple[str, bytes, str]:
+    """The header's text, the data's bytes, and the data's kind where the file says it outside the header."""
+    if path.suffix.lower() == ".cff":
+        return _sections(path)
+    if path.stat().st_size > _MAX_HEADER:
+        raise damaged(path, "the header is too long", expected=f"at most {_MAX_HEADER >> 20} MiB")
+    text = _decoded(path.read_bytes())
+    return text, _beside(path).read_bytes() if data else b"", ""
+
+
+def _beside(path: Path) -> Path:
+    """The .dat of a .cfg, whatever the case of its ending."""
+    for other in (path.with_suffix(".dat"), path.with_suffix(".DAT"), path.with_suffix(".Dat")):
+        if other.is_file():
+            return other
+    raise WaveformError(
+        "the record has no data file",
+        where=str(path),
+        expected=f"{path.with_suffix('.dat').name} beside it",
+        hint="copy the .dat with the .cfg",
+    )
+
+
+def _sections(path: Path) -> tuple[str, bytes, str]:
+    """Header, data and kind of the data of a .cff; binary data come last and reach as far as their mark says."""
+    content = path.read_bytes()
+    found: dict[str, tuple[bytes, str]] = {}
+    mark = _SECTION.search(content)
+    while mark:
+        kind, form = mark[1].decode("ascii").upper(), (mark[2] or b"").decode("ascii").upper()
+        start = mark.end() + 1  # the line's end
+        binary = kind == "DAT" and form not in ("", "ASCII")
+        mark_after = None if binary else _SECTION.search(content, start)
+        end = mark_after.start() if mark_after else start + int(mark[3]) if binary and mark[3] else len(content)
+        found.setdefault(kind, (content[start:end], form))
+        mark = mark_after
+    for kind in ("CFG", "DAT"):
+        if kind not in found:
+            raise damaged(path, f"no section {kind}", expected=f"a line '--- file type: {kind} ---'")
+    return _decoded(found["CFG"][0]), *found["DAT"]
+
+
+def _header(path: Path, text: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
+    """The header as the package reads it, and the names and units of all channels."""
+    counts = _counts(text)
+    if counts is None:
+        lines = text.splitlines()
+        got = f"'{lines[1][:60]}'" if len(lines) > 1 else "no second line"
+        raise damaged(path, "line 2 does not count the channels", expected="as in '3,2A,1D'", got=got)
+    total, analog, digital = counts
+    if total != analog + digital or total > _MAX_CHANNELS or total > len(text.splitlines()):
+        raise damaged(path, "the number of channels does not fit", got=f"{total} channels, {analog}A, {digital}D")
+    with _refusals(path, "the header"):
+        header = package("comtrade", path).Cfg(ignore_warnings=True)
+        header.read(text)
+    if header.ft.upper() not in ("ASCII", *_BYTES):
+        raise damaged(path, "no such kind of data", expected="ASCII, BINARY, BINARY32 or FLOAT32", got=f"'{header.ft}'")
+    _check_numbers(path, header)
+    channels = [*header.analog_channels, *header.status_channels]
+    plain = [c.name.strip() or f"{'A' if i < analog else 'D'}{c.n}" for i, c in enumerate(channels)]
+    double = {name for name in plain if plain.count(name) > 1} if len(set(plain)) < len(plain) else set()
+    names = [f"{n} {c.ph.strip()}".strip() if n in double else n for n, c in zip(plain, channels, strict=True)]
+    units = [c.uu.strip() for c in header.analog_channels] + [""] * digital
+    return header, own_names(names), tuple(units)
+
+
+def _check_numbers(path: Path, header: Any) -> None:
+    numbers = [x for c in header.analog_channels for x in (c.a, c.b, c.skew)]
+    numbers += [x for rate in header.sample_rates for x in rate] + [header.timemult]
+    if not all(map(math.isfinite, numbers)):
+        raise damaged(path, "a number in the header is not finite")
+    ends = [end for _, end in header.sample_rates]
+    if any(rate < 0 for rate, _ in header.sample_rates) or ends != sorted(set(ends)) or ends[0] < 1:
+        raise damaged(path, "the sampling rates do not fit", expected="rates above 0, last samples that increase")
+    if not header.timestamp_critical and any(rate == 0 for rate, _ in header.sample_rates):
+        raise damaged(path, "a sampling rate of 0", expected="0 rates, for time stamps that count, or rates above 0")
+    if header.timemult <= 0:
+        raise damaged(path, "the time multiplier is not above 0", got=f"{header.timemult}")
+
+
+def _rows(record: _Record) -> int:
+    """The number of rows, as the header claims and the data hold."""
+    header = record.header
+    claimed = int(header.sample_rates[-1][1])
+    if header.ft.upper() == "ASCII":
+        there = sum(1 for line in record.data.splitlines() if line.strip(b" \t\x1a"))
+    else:
+        width = 8 + _BYTES[header.ft.upper()] * header.analog_count + 2 * math.ceil(header.status_count / 16)
+        there = len(record.data) // width
+    if there < claimed:
+        raise damaged(record.path, "the data end early", expected=f"{claimed} samples as in the header", got=f"{there}")
+    return claimed
+
+
+def _content(record: _Record) -> Any:
+    """The record as the package reads it, in double precision."""
+    with _refusals(record.path, "the data"):
+        reader = package("comtrade", record.path).Comtrade(
+            ignore_warnings=True, use_numpy_arrays=True, use_double_precision=True
+        )
+        ascii_data = record.header.ft.upper() == "ASCII"
+        reader.read(io.StringIO(record.text), _lines(record.data) if ascii_data else record.data)
+        return reader
+
+
+def _time(record: _Record, content: Any, rows: int) -> Array:
+    """(n,) in s from the first sample: sample by sample at the rates of the header, else the time stamps."""
+    header = record.header
+    if header.timestamp_critical:
+        stamps = np.asarray(content.time, dtype=float)[:rows]
+        return stamps - stamps[0]
+    steps, before = [], 1
+    for rate, end in header.sample_rates:
+        steps.append(np.full(int(end) - before, 1.0 / rate))
+        before = int(end)
+    if len(steps) == 1:  # a multiple, not a sum: no rounding adds up
+        return np.arange(rows) / header.sample_rates[0][0]
+    return np.concatenate([[0.0], np.cumsum(np.concatenate(steps))])
+
+
+def _skewed(time: Array, values: Any, skew: float) -> Array:
+    """The values of a channel sampled `skew` microseconds late, at the instants of the record."""
+    return np.asarray(np.interp(time, time + 1e-6 * skew, values) if skew else values, dtype=float)
+
+
+def _counts(text: str) -> tuple[int, int, int] | None:
+    """Channels, analog and digital ones, from line 2 of a header; None where it does not count them."""
+    lines = text.splitlines()
+    match = _COUNTS.fullmatch(lines[1]) if len(lines) > 1 else None
+    return (int(match[1]), int(match[2]), int(match[3])) if match else None
+
+
+def _lines(data: bytes) -> str:
+    return "\n".join(line for line in _decoded(data).replace("\x1a", "").splitlines() if line.strip())
+
+
+def _decoded(content: bytes) -> str:
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+@contextlib.contextmanager
+def _refusals(path: Path, part: str) -> Iterator[None]:
+    """What the package stumbles over, as an error that names the file."""
+    try:
+        yield
+    except _REFUSALS as error:
+        raise damaged(path, f"{part} cannot be read: {error}") from None
+    except Exception as error:
+        if type(error).__name__ != "ComtradeError":  # a plain Exception of the package, which is imported late
+            raise
+        raise damaged(path, f"{part} cannot be read: {error}") from None

@@ -1,0 +1,128 @@
+"""HDF5 and netCDF files: every data set of numbers is a signal, over the time vector of its group.
+
+A group's time is its data set called time, t or tout; groups without one use that of the group above. Units come from
+the attribute `units` (netCDF's own word) or `unit`. netCDF 4 is HDF5; netCDF 3 is another format, read by scipy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
+from hvdc_ident.trajectory import Trajectory
+
+NAME = "hdf5"
+SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
+SUFFIXES = (".h5", ".hdf5", ".nc", ".cdf")
+
+_HDF5, _NETCDF3 = b"\x89HDF\r\n\x1a\n", (b"CDF\x01", b"CDF\x02", b"CDF\x05")
+_MAX_DEPTH = 8
+_MAX_SETS = 100_000
+
+
+def recognises(path: Path) -> bool:
+    """Whether the file starts as HDF5 or netCDF 3 does."""
+    with open(path, "rb") as file:
+        top = file.read(8)
+    return top == _HDF5 or top[:4] in _NETCDF3
+
+
+def signals(path: Path) -> list[tuple[str, str]]:
+    """Name, with the groups it stands in, and unit of every signal."""
+    found = _waveforms(path)
+    return list(zip(found.names, found.units, strict=True))
+
+
+def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+    """The signals, all or those named in that order; several rates are joined over the finest."""
+    found = _waveforms(path)
+    return found.select([found.names[i] for i in pick(path, signals, found.names)])
+
+
+def sample(path: Path) -> None:
+    """Nothing; a small HDF5 file with two signals and a unit is there afterwards."""
+    with package("h5py", path).File(path, "w") as file:
+        file["time"] = np.array([0.0, 0.1, 0.1, 0.3])
+        file["grid/P"] = np.array([1.0, 1.0, 1.5, 1.4])
+        file["grid/P"].attrs["units"] = "MW"
+        file["u"] = np.array([0.0, 0.0, 1.0, 1.0])
+
+
+def _waveforms(path: Path) -> Trajectory:
+    with open(path, "rb") as file:
+        newest = file.read(8) == _HDF5
+    try:
+        parts = _hdf5(path) if newest else _netcdf3(path)
+    except WaveformError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
+        raise damaged(path, f"the file cannot be read: {error}") from None
+    if not parts:
+        raise damaged(path, "no waveforms", expected="a data set 'time' and others of as many rows")
+    return joined([_checked(part, path) for part in parts], path)
+
+
+def _hdf5(path: Path) -> list[Trajectory]:
+    with package("h5py", path).File(path, "r") as file:
+        return list(_group(file, "", None, path, 0))
+
+
+def _group(group: Any, prefix: str, above: Any, path: Path, depth: int) -> Iterator[Trajectory]:
+    """The records of a group and of those inside it. above: the time of the groups around it."""
+    if depth > _MAX_DEPTH or len(group) > _MAX_SETS:
+        raise damaged(path, f"too many data sets in '{prefix or '/'}', or groups too deep")
+    local = [name for name in group if group.get(name, getclass=True, getlink=True).__name__ == "HardLink"]
+    sets = {n: group[n] for n in local if hasattr(group[n], "shape") and group[n].dtype.kind in "fiub"}
+    name = time_name(list(sets))
+    clock = above
+    if name is not None:
+        check_size(1, sets[name].size, path)
+        clock = np.asarray(sets[name], dtype=float).ravel()
+    columns, units = {}, []
+    for other, item in sets.items():
+        if other == name or clock is None or item.ndim not in (1, 2) or item.shape[0] != clock.size:
+            continue
+        check_size(item.shape[0], item.size // max(1, item.shape[0]), path)
+        values = np.asarray(item, dtype=float).reshape(clock.size, -1)
+        for i, column in enumerate(values.T):
+            columns[prefix + other + (f"({i + 1})" if values.shape[1] > 1 else "")] = column
+            units.append(_unit(item))
+    if columns:
+        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), tuple(units))
+    for inner in local:
+        if hasattr(group[inner], "keys"):
+            yield from _group(group[inner], f"{prefix}{inner}/", clock, path, depth + 1)
+
+
+def _unit(item: Any) -> str:
+    text = item.attrs.get("units", item.attrs.get("unit", ""))
+    return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+
+
+def _netcdf3(path: Path) -> list[Trajectory]:
+    from scipy.io import netcdf_file
+
+    with netcdf_file(path, "r", mmap=False) as file:
+        sets = {k: v for k, v in file.variables.items() if v.data.dtype.kind in "fiu"}
+        name = time_name(list(sets))
+        if name is None:
+            return []
+        clock = np.array(sets[name].data, dtype=float).ravel()
+        columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
+        units = [getattr(sets[k], "units", b"") for k in columns]
+    if not columns:
+        return []
+    texts = tuple(u.decode("utf-8", "replace") if isinstance(u, bytes) else str(u) for u in units)
+    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), texts)]
+
+
+def _checked(part: Trajectory, path: Path) -> Trajectory:
+    if len(part) < 2 or not np.isfinite(part.time).all() or (np.diff(part.time) < 0).any():
+        raise damaged(path, "a time vector is too short, not finite, or goes back")
+    return part.rows(event_rows(part.time))

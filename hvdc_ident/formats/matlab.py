@@ -1,0 +1,233 @@
+"""MATLAB files of version 5 to 7.2 (scipy) and 7.3 (HDF5), as Simulink and scripts save waveforms.
+
+Three layouts are understood: a vector called time, t or tout with vectors or matrices of as many rows beside it; a
+matrix whose first column is the time; Simulink's "structure with time" (fields `time` and `signals`, each with `values`
+and `label`). Several structures are several rates, joined over the finest. Objects (timeseries, Dataset) are stored in
+a form MathWorks does not publish: they are refused with the way out.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
+from hvdc_ident.trajectory import Array, Trajectory
+
+NAME = "matlab"
+SUMMARY = "MATLAB and Simulink, versions 5 to 7.3: time vector, time in the first column, or structure with time"
+SUFFIXES = (".mat",)
+
+_V5, _V73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
+_ADVICE = "save it as 'Structure with time' or as vectors: t = ts.Time; y = ts.Data; save('x.mat', 't', 'y')"
+_MAX_DEPTH = 4
+
+
+def recognises(path: Path) -> bool:
+    """Whether the file starts as MATLAB's versions 5 to 7.3 do."""
+    with open(path, "rb") as file:
+        return file.read(len(_V5)) in (_V5, _V73)
+
+
+def signals(path: Path) -> list[tuple[str, str]]:
+    """Name of every signal, without a unit: MATLAB keeps none."""
+    found = _waveforms(path)
+    return list(zip(found.names, found.units, strict=True))
+
+
+def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+    """The signals, all or those named in that order. An instant with more than two rows keeps its first and last."""
+    found = _waveforms(path)
+    wanted = pick(path, signals, found.names)
+    return found.select([found.names[i] for i in wanted])
+
+
+def sample(path: Path) -> None:
+    """Nothing; a small version 5 file with a time vector, a vector and a matrix is there afterwards."""
+    from scipy.io import savemat
+
+    time = np.array([0.0, 0.1, 0.1, 0.3])
+    savemat(path, {"t": time, "y": np.array([1.0, 1.0, 1.5, 1.4]), "u": np.column_stack([time, time + 1.0])})
+
+
+def _waveforms(path: Path) -> Trajectory:
+    with open(path, "rb") as file:
+        newest = file.read(len(_V73)) == _V73
+    parts = list(_parts(_version_73(path) if newest else _version_5(path), path))
+    if not parts:
+        raise damaged(path, "no waveforms", expected="a time vector with signals, or a structure with time")
+    return joined([_once(part, path) for part in parts], path)
+
+
+def _version_5(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat, whosmat
+    from scipy.io.matlab import MatReadError, MatReadWarning
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MatReadWarning)
+            for name, shape, kind in whosmat(path):
+                check_size(1, int(np.prod([int(n) for n in shape], dtype=object)), path)
+                if kind in ("opaque", "object", "function", "unknown") and name:
+                    raise _object(path, name)
+            return dict(loadmat(path, squeeze_me=True, struct_as_record=False))
+    except WaveformError:
+        raise
+    except (MatReadError, MemoryError) as error:
+        raise damaged(path, f"MATLAB file cannot be read: {error}") from None
+    except Exception as error:  # scipy's reader lets through whatever broken bytes lead to
+        raise damaged(path, f"MATLAB file cannot be read: {type(error).__name__}: {error}") from None
+
+
+def _version_73(path: Path) -> dict[str, Any]:
+    h5py = package("h5py", path)
+    try:
+        with h5py.File(path, "r") as file:
+            return {name: _from_hdf5(file[name], file, path, 0) for name in file if not name.startswith("#")}
+    except WaveformError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise damaged(path, f"MATLAB 7.3 file cannot be read: {error}") from None
+
+
+def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
+    """A dataset or group as scipy would give it: MATLAB's axes are the other way round."""
+    if depth > _MAX_DEPTH:
+        return None
+    if hasattr(item, "keys"):
+        return {k: _from_hdf5(item[k], file, path, depth + 1) for k in item}
+    kind = item.attrs.get("MATLAB_class", b"").decode("ascii", "replace")
+    if kind == "char":
+        check_size(1, item.size, path)
+        return "".join(map(chr, np.asarray(item).ravel().astype(int))) if item.size > 2 or not _empty(item) else ""
+    if item.dtype.kind == "O":  # references: the elements of a structure array
+        return [_from_hdf5(file[r], file, path, depth + 1) for r in np.asarray(item).ravel()]
+    if item.dtype.kind not in "fiub":
+        return None
+    check_size(1, item.size, path)
+    return np.squeeze(np.asarray(item, dtype=float).T) if not _empty(item) else np.empty(0)
+
+
+def _empty(item: Any) -> bool:
+    return bool(item.attrs.get("MATLAB_empty", 0))
+
+
+def _parts(variables: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
+    """The records among the variables, each with a time of its own."""
+    fields = {k: _fields(v) for k, v in variables.items() if not k.startswith("__")}
+    structures = {k: v for k, v in fields.items() if isinstance(v, dict)}
+    arrays = {k: np.asarray(v, dtype=float) for k, v in fields.items() if _numeric(v)}
+    for name, structure in structures.items():
+        yield from _structure(name, structure, path)
+    time = time_name(list(arrays))
+    if time is not None:
+        yield _beside(time, arrays, path)
+        return
+    for name, table in arrays.items():
+        if table.ndim == 2 and table.shape[0] >= 2 and table.shape[1] >= 2:
+            # To File blocks save one row a signal, logged arrays one column a signal: the time is what increases
+            across = _increases(table[0]) and (not _increases(table[:, 0]) or table.shape[1] > table.shape[0])
+            upright = table.T if across else table
+            if _increases(upright[:, 0]):
+                labels = _labels(name, upright.shape[1] - 1)
+                yield Trajectory(upright[:, 0], upright[:, 1:], labels)
+
+
+def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
+    """A structure with time, or a structure of vectors that has one called time."""
+    time = structure.get("time")
+    listed = structure.get("signals")
+    if not _numeric(time):
+        numeric = {k: np.asarray(v, dtype=float) for k, v in structure.items() if _numeric(v)}
+        other = time_name(list(numeric))
+        if other is not None:
+            yield _beside(other, numeric, path, prefix=f"{name}.")
+        return
+    clock = np.atleast_1d(np.asarray(time, dtype=float))
+    if listed is None:
+        numeric = {k: np.asarray(v, dtype=float) for k, v in structure.items() if _numeric(v)}
+        yield _beside("time", numeric, path, prefix=f"{name}.")
+        return
+    columns: dict[str, Array] = {}
+    for i, signal in enumerate(_list(listed)):
+        fields = _fields(signal)
+        if not isinstance(fields, dict) or not _numeric(fields.get("values")):
+            continue
+        label = str(fields.get("label") or "") if isinstance(fields.get("label"), str) else ""
+        _add(columns, label or f"{name}.{i + 1}", np.asarray(fields["values"], dtype=float), clock.size)
+    if columns:
+        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+
+
+def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = "") -> Trajectory:
+    """A time vector and every array of as many rows."""
+    clock = np.atleast_1d(arrays[time]).ravel()
+    columns: dict[str, Array] = {}
+    for name, values in arrays.items():
+        if name != time:
+            _add(columns, prefix + name, values, clock.size)
+    if not columns:
+        raise damaged(path, f"no signal has as many rows as '{time}'", expected=f"{clock.size} rows")
+    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+
+
+def _add(columns: dict[str, Array], name: str, values: Array, rows: int) -> None:
+    """Put a vector, or each column of a matrix, of so many rows among the columns; anything else is no signal."""
+    if values.ndim == 1 and values.size == rows:
+        columns[name] = values
+    elif values.ndim == 2 and rows in values.shape:
+        upright = values if values.shape[0] == rows else values.T
+        for label, column in zip(_labels(name, upright.shape[1]), upright.T, strict=True):
+            columns[label] = column
+
+
+def _labels(name: str, n: int) -> tuple[str, ...]:
+    return (name,) if n == 1 else tuple(f"{name}({i + 1})" for i in range(n))
+
+
+def _fields(value: Any) -> Any:
+    """A structure as a dict; anything else as it is."""
+    names = getattr(value, "_fieldnames", None)
+    return {k: getattr(value, k) for k in names} if names is not None else value
+
+
+def _list(value: Any) -> list[Any]:
+    """The elements of a structure array, however it was stored."""
+    if isinstance(value, dict):  # version 7.3: one list a field
+        n = max((len(v) for v in value.values() if isinstance(v, list)), default=0)
+        if n == 0:
+            return [value]
+        return [{k: v[i] for k, v in value.items() if isinstance(v, list) and i < len(v)} for i in range(n)]
+    return list(np.atleast_1d(value))
+
+
+def _numeric(value: Any) -> bool:
+    return isinstance(value, np.ndarray | float | int) and np.asarray(value).dtype.kind in "fiub"
+
+
+def _increases(values: Array) -> bool:
+    return bool(values.size > 1 and np.isfinite(values).all() and (np.diff(values) >= 0).all() and np.ptp(values) > 0)
+
+
+def _once(part: Trajectory, path: Path) -> Trajectory:
+    """The record with the first and last row of every instant alone."""
+    if len(part) < 2 or not np.isfinite(part.time).all():
+        raise damaged(path, "a time vector is too short or not finite", expected="at least 2 times")
+    if (np.diff(part.time) < 0).any():
+        raise damaged(path, "the time goes back", expected="increasing times")
+    return part.rows(event_rows(part.time))
+
+
+def _object(path: Path, name: str) -> WaveformError:
+    return WaveformError(
+        f"'{name}' is a MATLAB object, whose form is not published",
+        where=str(path),
+        expected="vectors, matrices or structures with time",
+        hint=_ADVICE,
+    )

@@ -1,0 +1,97 @@
+"""Parquet tables: the column called time (or the first one), and every other column of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._columns import check_size, damaged, package, time_name
+from hvdc_ident.trajectory import Trajectory
+
+NAME = "parquet"
+SUMMARY = "Parquet tables with a column `time`"
+SUFFIXES = (".parquet", ".pq")
+
+_MAGIC = b"PAR1"
+
+
+def recognises(path: Path) -> bool:
+    """Whether the file starts as Parquet does."""
+    with open(path, "rb") as file:
+        return file.read(4) == _MAGIC
+
+
+def signals(path: Path) -> list[tuple[str, str]]:
+    """Name and unit of every column but the time's; the unit where this package wrote it."""
+    _, _, names, units = _opened(path)
+    return list(zip(names, units, strict=True))
+
+
+def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+    """The columns, all or those named in that order; a column of time stamps counts in s from its first row."""
+    file, clock, names, units = _opened(path)
+    wanted = pick(path, signals, names)
+    check_size(file.metadata.num_rows, len(wanted) + 1, path)
+    table = _guarded(path, lambda: file.read(columns=[clock, *(names[i] for i in wanted)]))
+    time = _seconds(table.column(clock).to_numpy(), path)
+    columns = [np.asarray(table.column(names[i]).to_numpy(), dtype=float) for i in wanted]
+    values = np.column_stack(columns) if columns else np.empty((time.size, 0))
+    if not np.isfinite(time).all() or (np.diff(time) < 0).any():
+        raise damaged(path, f"column '{clock}' is not finite or goes back", expected="increasing times")
+    found = Trajectory(time, values, tuple(names[i] for i in wanted), tuple(units[i] for i in wanted))
+    return found.rows(event_rows(time))
+
+
+def write(trajectory: Trajectory, path: Path) -> None:
+    """Nothing; the trajectory is at the path afterwards, in double precision, units in the columns' metadata."""
+    arrow, parquet = package("pyarrow", path), package("pyarrow.parquet", path)
+    fields = [arrow.field("time", arrow.float64(), metadata={"unit": "s"})]
+    for name, unit in zip(trajectory.names, trajectory.units, strict=True):
+        fields.append(arrow.field(name, arrow.float64(), metadata={"unit": unit}))
+    columns = [trajectory.time, *trajectory.values.T]
+    parquet.write_table(arrow.table([arrow.array(c) for c in columns], schema=arrow.schema(fields)), path)
+
+
+def sample(path: Path) -> None:
+    """Nothing; a small table with a unit and a jump is there afterwards."""
+    values = np.array([[1.0, 0.5], [1.0, 0.5], [1.5, 0.5], [1.4, 0.25]])
+    write(Trajectory(np.array([0.0, 0.1, 0.1, 0.3]), values, ("u", "y"), ("pu", "")), path)
+
+
+def _opened(path: Path) -> tuple[Any, str, list[str], list[str]]:
+    """The file, its time column, and names and units of the other columns of numbers."""
+    package("pyarrow", path)
+    parquet = package("pyarrow.parquet", path)
+    file = _guarded(path, lambda: parquet.ParquetFile(path))
+    fields = list(file.schema_arrow)
+    labels = [f.name for f in fields]
+    if not labels or len(set(labels)) < len(labels):
+        raise damaged(path, "no columns, or two of one name")
+    clock = time_name(labels) or labels[0]
+    numeric = [f for f in fields if f.name != clock and _is_number(str(f.type))]
+    units = [(f.metadata or {}).get(b"unit", b"").decode("utf-8", "replace") for f in numeric]
+    return file, clock, [f.name for f in numeric], units
+
+
+def _is_number(kind: str) -> bool:
+    return kind.startswith(("double", "float", "halffloat", "int", "uint", "bool"))
+
+
+def _seconds(values: Any, path: Path) -> Any:
+    if values.dtype.kind == "M":
+        return (values - values[:1]) / np.timedelta64(1, "ns") * 1e-9
+    if values.dtype.kind not in "fiu":
+        raise damaged(path, "the time column is no number and no time stamp", got=str(values.dtype))
+    return np.asarray(values, dtype=float)
+
+
+def _guarded(path: Path, act: Any) -> Any:
+    arrow = package("pyarrow", path)
+    try:
+        return act()
+    except (arrow.ArrowException, OSError, ValueError) as error:
+        raise damaged(path, f"the table cannot be read: {error}") from None

@@ -1,0 +1,139 @@
+"""PSCAD output: an .inf that names the channels and numbered .out files of up to ten channels each.
+
+Channel n of `run.inf`, a line `PGB(n) Output Desc="P1" Group="Main" Max=2 Min=-2 Units="MW"`, stands in
+`run_01.out` for n = 1 to 10, `run_02.out` for 11 to 20, and so on, in column (n - 1) mod 10 behind the time in s.
+Source: PSCAD manual, "Output files"; the files themselves.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._columns import check_size, damaged, own_names
+from hvdc_ident.trajectory import Array, Trajectory
+
+NAME = "pscad"
+SUMMARY = "PSCAD output: the .inf, with its numbered .out files beside it"
+SUFFIXES = (".inf",)
+
+_PER_FILE = 10
+_MAX_HEADER = 32 * 1024**2  # bytes
+_MAX_CHANNELS = 100_000
+_CHANNEL = re.compile(r"^\s*PGB\((\d{1,6})\)\s+\w+\s+(.*)$", re.MULTILINE)
+_FIELD = re.compile(r'(\w+)="([^"]*)"')
+
+
+@dataclass(frozen=True)
+class _Channel:
+    number: int
+    name: str
+    unit: str
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is an .inf with a channel line."""
+    if path.suffix.lower() not in SUFFIXES:
+        return False
+    with open(path, "rb") as file:
+        return _CHANNEL.search(file.read(65536).decode("latin-1")) is not None
+
+
+def signals(path: Path) -> list[tuple[str, str]]:
+    """Name and unit of every channel; a name that stands twice carries its group, then a number."""
+    return [(c.name, c.unit) for c in _channels(path)]
+
+
+def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+    """The channels, all or those named in that order, over the time of the .out files.
+
+    Only the files with wanted channels are opened. An instant with more than two rows keeps its first and last.
+    Raises WaveformError for a file that is missing, cut off, or has another time than the first.
+    """
+    channels = _channels(path)
+    wanted = [channels[i] for i in pick(path, signals, [c.name for c in channels])]
+    tables: dict[int, Array] = {}
+    for channel in wanted:
+        number = (channel.number - 1) // _PER_FILE
+        if number not in tables:
+            last = max(c.number for c in channels if (c.number - 1) // _PER_FILE == number)
+            tables[number] = _table(_out_file(path, number + 1), (last - 1) % _PER_FILE + 1)
+    if not tables:
+        raise damaged(path, "no channels", expected="a line PGB(1) Output Desc=...")
+    first = next(iter(tables.values()))
+    for number, table in tables.items():
+        if table.shape[0] != first.shape[0] or not np.array_equal(table[:, 0], first[:, 0]):
+            raise damaged(_out_file(path, number + 1), "its times differ from those of the other .out files")
+    check_size(len(first), len(wanted), path)
+    values = np.column_stack([tables[(c.number - 1) // _PER_FILE][:, (c.number - 1) % _PER_FILE + 1] for c in wanted])
+    if (np.diff(first[:, 0]) < 0).any():
+        raise damaged(path, "the time goes back in the .out files")
+    keep = event_rows(first[:, 0])
+    return Trajectory(first[keep, 0], values[keep], tuple(c.name for c in wanted), tuple(c.unit for c in wanted))
+
+
+def sample(path: Path) -> None:
+    """Nothing; twelve channels in an .inf and two .out files are there afterwards."""
+    lines = [
+        f'PGB({n}) Output Desc="S{n}" Group="Main" Max=2.0 Min=-2.0 Units="{"kV" if n % 2 else "MW"}"'
+        for n in range(1, 13)
+    ]
+    path.write_text("\n".join(lines) + "\n", "ascii")
+    time = np.array([0.0, 0.05, 0.1])
+    for number, columns in ((1, range(1, 11)), (2, range(11, 13))):
+        rows = [[t, *(n + t for n in columns)] for t in time]
+        text = "\n".join("  ".join(f"{x:.10E}" for x in row) for row in rows) + "\n"
+        path.with_name(f"{path.stem}_{number:02d}.out").write_text(text, "ascii")
+
+
+def _channels(path: Path) -> list[_Channel]:
+    if path.stat().st_size > _MAX_HEADER:
+        raise damaged(path, "the list of channels is too long", expected=f"at most {_MAX_HEADER >> 20} MiB")
+    found = {}
+    for match in _CHANNEL.finditer(path.read_bytes().decode("latin-1")):
+        number, fields = int(match[1]), dict(_FIELD.findall(match[2]))
+        if number in found or not 1 <= number <= _MAX_CHANNELS:
+            raise damaged(path, f"channel {number} stands twice or is out of range", got=match[0].strip()[:80])
+        found[number] = (fields.get("Desc", "").strip() or f"PGB{number}", fields.get("Group", ""), fields)
+    if not found:
+        raise damaged(path, "no channels", expected='lines PGB(1) Output Desc="..."')
+    plain = [name for name, _, _ in found.values()]
+    labels = [f"{group}.{name}" if plain.count(name) > 1 and group else name for name, group, _ in found.values()]
+    units = [fields.get("Units", "").strip() for _, _, fields in found.values()]
+    return [_Channel(n, name, unit) for n, name, unit in zip(found, own_names(labels), units, strict=True)]
+
+
+def _out_file(path: Path, number: int) -> Path:
+    names = (f"{path.stem}_{number:02d}.out", f"{path.stem}_{number:02d}.OUT", f"{path.stem}.out")
+    for name in names[: 3 if number == 1 else 2]:
+        if (other := path.with_name(name)).is_file():
+            return other
+    raise WaveformError(
+        f"a file of channels {(number - 1) * _PER_FILE + 1} to {number * _PER_FILE} is missing",
+        where=str(path),
+        expected=f"{names[0]} beside it",
+        hint="copy all .out files of the run",
+    )
+
+
+def _table(path: Path, columns: int) -> Array:
+    """(n, columns + 1) the numbers of an .out file, time first; a first line of words is skipped."""
+    with open(path, encoding="latin-1") as file:
+        head = file.readline(65536)
+        try:
+            skip = 0 if [float(x) for x in head.split()] else 1
+        except ValueError:
+            skip = 1
+    try:
+        table = np.loadtxt(path, skiprows=skip, ndmin=2, dtype=float, encoding="latin-1")
+    except (ValueError, UserWarning) as error:
+        raise damaged(path, f"not a table of numbers: {error}") from None
+    if table.shape[0] < 2 or table.shape[1] < columns + 1:
+        raise damaged(path, "the table is too small", f"{columns + 1} columns, 2 rows", f"{table.shape}")
+    return np.asarray(table)

@@ -1,0 +1,159 @@
+"""MATLAB, PSCAD, HDF5, netCDF and Parquet files written by other packages or as their tools lay them out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import convert, list_signals, read_waveforms
+
+TIME = np.array([0.0, 0.1, 0.2, 0.3])
+Y = np.array([1.0, 1.0, 1.5, 1.25])
+
+
+def test_simulink_structure_with_time(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    signals = np.zeros(2, dtype=[("values", object), ("label", object), ("dimensions", object)])
+    signals[0] = (Y[:, None], "P ref", 1.0)
+    signals[1] = (np.column_stack([Y, -Y]), "", 2.0)
+    savemat(tmp_path / "s.mat", {"out": {"time": TIME[:, None], "signals": signals, "blockName": "m/Scope"}})
+    found = read_waveforms(tmp_path / "s.mat")
+    assert found.names == ("P ref", "out.2(1)", "out.2(2)")
+    np.testing.assert_array_equal(found.values, np.column_stack([Y, Y, -Y]))
+    np.testing.assert_array_equal(found.time, TIME)
+
+
+@pytest.mark.parametrize("rows", ["signals", "samples"])
+def test_a_matrix_with_time_first_either_way_round(tmp_path: Path, rows: str) -> None:
+    from scipy.io import savemat
+
+    table = np.column_stack([TIME, Y, 2 * Y])
+    savemat(tmp_path / "s.mat", {"ans": table.T if rows == "signals" else table})
+    found = read_waveforms(tmp_path / "s.mat")
+    assert found.names == ("ans(1)", "ans(2)")
+    np.testing.assert_array_equal(found.values[:, 1], 2 * Y)
+
+
+def test_structures_of_two_rates_are_joined_over_the_finer(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    fast = np.linspace(0.0, 0.3, 31)
+    savemat(
+        tmp_path / "s.mat",
+        {"a": {"time": fast, "x": fast**2}, "b": {"time": TIME, "y": Y}},
+    )
+    found = read_waveforms(tmp_path / "s.mat")
+    assert found.names == ("a.x", "b.y")
+    np.testing.assert_array_equal(found.time, fast)
+    np.testing.assert_allclose(found["b.y"], np.interp(fast, TIME, Y))
+
+
+def test_version_7_3(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "s.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in (("t", TIME[None, :]), ("y", Y[None, :]), ("u", np.vstack([Y, -Y]))):
+            file[name] = values  # MATLAB's column vectors and matrices, axes the other way round
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
+    found = read_waveforms(path)
+    assert found.names == ("u(1)", "u(2)", "y")
+    np.testing.assert_array_equal(found["u(2)"], -Y)
+
+
+def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> None:
+    from hvdc_ident.formats import pscad
+
+    pscad.sample(tmp_path / "run.inf")
+    found = read_waveforms(tmp_path / "run.inf", ["S12", "S3"])
+    np.testing.assert_allclose(found.values, np.column_stack([12 + found.time, 3 + found.time]))
+    assert found.units == ("MW", "kV")
+    (tmp_path / "run_02.out").unlink()
+    assert read_waveforms(tmp_path / "run.inf", ["S3"]).names == ("S3",)
+    with pytest.raises(WaveformError, match=r"run_02\.out"):
+        read_waveforms(tmp_path / "run.inf")
+
+
+def test_netcdf_of_both_kinds(tmp_path: Path) -> None:
+    from scipy.io import netcdf_file
+
+    with netcdf_file(tmp_path / "a.nc", "w") as file:
+        file.createDimension("time", 4)
+        for name, values, unit in (("time", TIME, "s"), ("P", Y, "MW")):
+            variable = file.createVariable(name, "d", ("time",))
+            variable[:] = values
+            variable.units = unit
+    found = read_waveforms(tmp_path / "a.nc")
+    assert (found.names, found.units) == (("P",), ("MW",))
+    np.testing.assert_array_equal(found["P"], Y)
+
+
+def test_hdf5_groups_without_a_time_use_the_one_above(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time"] = TIME
+        file["left/P"] = Y
+        file["right/time"] = TIME[::2]
+        file["right/Q"] = Y[::2]
+        file["away"] = h5py.ExternalLink("/etc/passwd", "/")
+    found = read_waveforms(tmp_path / "a.h5")
+    assert set(found.names) == {"left/P", "right/Q"}
+    np.testing.assert_allclose(found["right/Q"], [1.0, 1.25, 1.5])
+    assert found.time[-1] == pytest.approx(0.2)  # what both cover
+
+
+def test_parquet_written_by_another_package_with_time_stamps(tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    stamps = np.datetime64("2026-11-21T10:00:00") + (TIME * 1000).astype("timedelta64[ms]")
+    pq.write_table(pa.table({"y": Y, "Time": stamps, "site": ["a"] * 4}), tmp_path / "a.parquet")
+    found = read_waveforms(tmp_path / "a.parquet")
+    assert found.names == ("y",)
+    np.testing.assert_allclose(found.time, TIME, atol=1e-9)
+
+
+def test_to_parquet_and_back_keeps_every_bit_and_the_unit(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    (tmp_path / "a.csv").write_text("time,P [MW],q\n0,0.1,3\n0.1,0.30000000000000004,4\n", "utf-8")
+    convert(tmp_path / "a.csv", tmp_path / "a.parquet")
+    assert list_signals(tmp_path / "a.parquet") == [("P", "MW"), ("q", "")]
+    assert read_waveforms(tmp_path / "a.parquet")["P"][1] == 0.30000000000000004
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.parquet"]
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        (["2026-11-21 10:15:00.000", "2026-11-21 10:15:00.020", "2026-11-21T10:15:00.040"], [0, 0.02, 0.04]),
+        (["21/11/2026 23:59:59.98", "22/11/2026 00:00:00.00", "22/11/2026 00:00:00.02"], [0, 0.02, 0.04]),
+        (["23:59:59.980", "00:00:00.000", "00:00:00.020"], [0, 0.02, 0.04]),
+        (["2026-11-21T10:15:00+01:00", "2026-11-21T09:15:00.5Z", "2026-11-21T09:15:01Z"], [0, 0.5, 1.0]),
+    ],
+)
+def test_dates_count_from_the_first_row(tmp_path: Path, times: list[str], expected: list[float]) -> None:
+    rows = "\n".join(f"{t};{n},5" for n, t in enumerate(times))
+    (tmp_path / "pmu.csv").write_text(f"Timestamp;V:MAG\n{rows}\n", "utf-8")
+    found = read_waveforms(tmp_path / "pmu.csv")
+    np.testing.assert_allclose(found.time, expected, atol=1e-9)
+    np.testing.assert_array_equal(found["V:MAG"], [0.5, 1.5, 2.5])
+
+
+def test_a_broken_date_is_named_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "pmu.csv").write_text("t,v\n2026-11-21 10:15:00,1\n2026-13-21 10:15:01,2\n", "utf-8")
+    with pytest.raises(WaveformError, match=r"line 3.*2026-13-21"):
+        read_waveforms(tmp_path / "pmu.csv")
+
+
+def test_matlab_objects_are_refused_with_the_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "s.mat", {"ts": TIME})
+    monkeypatch.setattr("scipy.io.whosmat", lambda path: [("ts", (1, 1), "opaque")])
+    with pytest.raises(WaveformError, match="Structure with time"):
+        read_waveforms(tmp_path / "s.mat")
