@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.fit.estimate import Executor, Progress, fit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.unknown import Free
 from hvdc_ident.trajectory import Array
 
 
 def fit_each(
     problem: Problem,
     *,
+    runs: Mapping[str, Sequence[str]] | None = None,
     starts: int = 1,
     seed: int = 0,
     optimiser: Optimiser | None = None,
@@ -24,49 +30,80 @@ def fit_each(
 ) -> dict[str, Any]:
     """By parameter: the estimates of each experiment alone, and their spread, as the JSON's `per_experiment`.
 
-    Each: experiments {name: {value, std, status}}, n, mean, std, ci95 of one run and ci95_of_mean, all in the
-    parameter's unit. `ci95_of_mean` = mean -+ t std/sqrt(n) is an interval of the mean over runs, not of the parameter.
-    Fits that failed or did not converge are listed and left out of the spread; so are estimates on a bound.
+    runs: by a name of its own, the experiments of each fit, where one fit is to see several; left out: each alone.
+    executor: the fits are shared out over it.
+    Each: experiments {name: {value, std, status}}, on_bound, and what `spread` gives, all in the parameter's unit.
+    Fits that failed or did not converge are listed and left out of the spread; so are estimates on a bound, whose
+    number is `on_bound`. Raises UnknownNameError for a run's experiment that is not fitted, StudyError for an empty run.
     """
-    results = {
-        e.name: fit(
-            problem.with_(experiments=[e]),
-            starts=starts,
-            seed=seed,
-            optimiser=optimiser,
-            executor=executor,
-            progress=progress,
-        )
-        for e in problem.fitted_experiments
-    }
-    table: dict[str, Any] = {}
-    for name in (f.name for f in problem.free):
-        rows: dict[str, dict[str, Any]] = {}
-        for experiment, result in results.items():
-            e = result.estimates.get(name)
-            rows[experiment] = {
-                "value": None if e is None else e.value,
-                "std": None if e is None else e.std,
-                "status": result.status,
-            }
-        good = [
-            row["value"]
-            for row in rows.values()
-            if row["status"] in ("converged", "at-bound") and row["std"] is not None
-        ]
-        table[name] = {"experiments": rows, **spread(np.array(good, dtype=float))}
-    return table
+    parts = _parts(problem, runs)
+    one = partial(_alone, starts=starts, seed=seed, optimiser=optimiser)
+    outcomes: Iterator[FitResult] = (executor.map if executor else map)(one, list(parts.values()))
+    results: dict[str, FitResult] = {}
+    for name, result in zip(parts, outcomes, strict=True):
+        results[name] = result
+        if progress:
+            progress(len(results), len(parts), f"'{name}': {result.status}")
+    return {f.name: _row(f, results) for f in problem.free}
+
+
+def _parts(problem: Problem, runs: Mapping[str, Sequence[str]] | None) -> dict[str, Problem]:
+    """The problem of each run."""
+    known = {e.name: e for e in problem.fitted_experiments}
+    parts = {}
+    for run, names in ({n: (n,) for n in known} if runs is None else runs).items():
+        for name in names:
+            if name not in known:
+                raise unknown_name("fitted experiment", name, known, where=f"run '{run}'")
+        if not names:
+            raise StudyError("a run without experiments", where=f"run '{run}'", expected="at least one experiment")
+        parts[run] = problem.with_(experiments=[known[n] for n in names])
+    return parts
+
+
+def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | None) -> FitResult:
+    return fit(problem, starts=starts, seed=seed, optimiser=optimiser)
+
+
+def _row(free: Free, results: Mapping[str, FitResult]) -> dict[str, Any]:
+    """One parameter's estimates by run, and their spread."""
+    rows: dict[str, dict[str, Any]] = {}
+    for run, result in results.items():
+        e = result.estimates.get(free.name)
+        rows[run] = {"value": None if e is None else e.value, "std": None if e is None else e.std}
+        rows[run]["status"] = result.status
+    ended = [r for r in rows.values() if r["status"] in ("converged", "at-bound")]
+    inside = np.array([r["value"] for r in ended if r["std"] is not None], dtype=float)
+    on_bound = sum(r["value"] is not None and not free.min < r["value"] < free.max for r in ended)
+    return {"experiments": rows, "on_bound": on_bound, **spread(inside)}
 
 
 def spread(values: Array) -> dict[str, Any]:
-    """n, mean, std (n - 1), the 95 % interval of one more value and of the mean; None where n is too small."""
+    """n, mean, std (n - 1), variance, cv (std over |mean|), and two 95 % intervals; None where n is too small.
+
+    `ci95` = mean -+ t std sqrt(1 + 1/n) is where one more value falls; `ci95_of_mean` = mean -+ t std/sqrt(n) is an
+    interval of the mean over runs, which shrinks with their number: neither is an interval of the parameter.
+    """
+    n = values.size
+    names = ("mean", "std", "variance", "cv", "ci95", "ci95_of_mean")
+    table: dict[str, Any] = {"n": n, **dict.fromkeys(names)}
+    if n:
+        table["mean"] = float(values.mean())
+    if n < 2:
+        return table
+    mean, std = table["mean"], float(values.std(ddof=1))
+    one = half_width(std, n) * math.sqrt(n + 1.0)
+    return table | {
+        "std": std,
+        "variance": std**2,
+        "cv": std / abs(mean) if mean else None,
+        "ci95": [mean - one, mean + one],
+        "ci95_of_mean": [mean - half_width(std, n), mean + half_width(std, n)],
+    }
+
+
+def half_width(std: float, n: int) -> float:
+    """t std/sqrt(n): half the 95 % interval of the mean of n values with that standard deviation, in its unit."""
     from scipy.stats import t
 
-    n = values.size
-    empty = {"n": n, "mean": float(values.mean()) if n else None, "std": None, "ci95": None, "ci95_of_mean": None}
-    if n < 2:
-        return empty
-    mean, std = float(values.mean()), float(values.std(ddof=1))
-    half = float(t.ppf(0.975, n - 1)) * std
-    one, centre = half * math.sqrt(1.0 + 1.0 / n), half / math.sqrt(n)
-    return {**empty, "std": std, "ci95": [mean - one, mean + one], "ci95_of_mean": [mean - centre, mean + centre]}
+    return float(t.ppf(0.975, n - 1)) * std / math.sqrt(n)
