@@ -91,6 +91,7 @@ class Campaign:
     source: a shipped model. effects: hidden in it, as in a study file. kinds: set-points moved. count: experiments of
     each, every other a ramp. holdout: how many of these, the last ones, are not for the fit. sample, event, end: s.
     outputs: recorded, by the name of the model's output. seed: of everything random. name: of the study.
+    at_rest: every experiment begins at the source's own set-points, not at an operating point of its own.
     """
 
     source: str = "vsc-hvdc-avm"
@@ -105,6 +106,7 @@ class Campaign:
     noise: Noise = field(default_factory=Noise)
     seed: int = 0
     name: str = "waveforms"
+    at_rest: bool = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.holdout < self.count and 0 < self.sample < self.event < self.end - RAMPS[1]):
@@ -173,9 +175,12 @@ def _driven(campaign: Campaign, kind: Kind, number: int) -> Experiment:
     name = f"{kind.lower()}-{number + 1:02d}-{shape}"
     random = _random(campaign, name, 0)
     before = round(float(random.uniform(*moved.levels)), 4)
+    if campaign.at_rest:
+        before = float(load_model(campaign.source).inputs[moved.setpoint].value)
     size = round(float(random.uniform(*moved.sizes)), 4) * float(random.choice([-1.0, 1.0]))
     after = round(before + (size if abs(before + size) <= moved.most else -size), 4)
     values = {} if moved.power is None else {"Pref2": round(float(random.uniform(*moved.power)), 3)}
+    values = {} if campaign.at_rest else values
     rows = round(float(np.exp(random.uniform(*np.log(RAMPS)))) / campaign.sample)
     duration = 0.0 if shape == "step" else rows * campaign.sample
     signal = InputSignal.ramp(campaign.event, before, campaign.event + duration, after)

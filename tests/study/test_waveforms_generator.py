@@ -28,6 +28,16 @@ def test_thirty_of_each_differ_in_size_slope_sign_and_operating_point():
         assert max(np.abs(s.values).max() for s in signals) <= moved.most
 
 
+def test_at_rest_every_experiment_begins_at_the_links_own_set_points():
+    anywhere, rest = experiments(Campaign()), experiments(Campaign(at_rest=True))
+    start = {"Pref2": 0.4, "Qref1": 0.0, "Vdcref1": 1.0}
+    for a, r in zip(anywhere, rest, strict=True):
+        ((name, signal),) = r.inputs.items()
+        assert signal.values[0] == start[name] and not r.values
+        assert np.ptp(signal.values) == pytest.approx(np.ptp(a.inputs[name].values)) and r.name == a.name
+        assert abs(signal.values[-1]) <= MOVED[{"p": "P", "q": "Q", "v": "Vdc"}[r.name[0]]].most
+
+
 def test_a_seed_gives_the_same_recordings_whatever_else_is_recorded(tmp_path):
     one, two = (next(recorded(replace(SMALL, kinds=kinds))) for kinds in (("Q",), ("Q", "P")))
     np.testing.assert_array_equal(one.measured.values, two.measured.values)
