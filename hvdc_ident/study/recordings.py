@@ -16,6 +16,7 @@ from hvdc_ident.formats import read_waveforms
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study import schema
+from hvdc_ident.study.derived import raw_columns, with_phases
 from hvdc_ident.study.units import factor, same_unit
 from hvdc_ident.trajectory import Array, Trajectory
 from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor
@@ -81,7 +82,7 @@ def read_experiments(
             )
         seen.add(table.name.lower())
         _check_names(table, model, place)
-        columns = [column for _, column in _channels(table)]
+        columns = raw_columns(table.phases, [column for _, column in _channels(table)])
         wanted.setdefault(table.data, {})[table.name] = list(dict.fromkeys(columns))
     try:
         recordings.load(wanted)
@@ -150,6 +151,7 @@ def _experiment(
     table: schema.Experiment, model: Model, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
+    data = with_phases(table.phases, data, place)
     time = _time(table, data, place)
     scaled = {s: _scaled(table, model, s, c, data, place) for s, c in columns.items()}
     inputs = {s: _input(table, s, time, scaled[s], place) for s in (*table.inputs, *table.drive)}
@@ -214,6 +216,8 @@ def _scaled(table: schema.Experiment, model: Model, signal: str, column: str, da
                 "a scale of 0 leaves nothing", where=f"{place}.columns.{signal}", expected="a number that is not 0"
             )
         return data[column] * line.scale
+    if line.base is not None:
+        return data[column] / line.base
     unit = _unit(model, signal)
     if not recorded or not unit or same_unit(recorded, unit):
         return data[column]

@@ -83,6 +83,27 @@ class Column(Table):
     name: Name | None = None
     unit: Annotated[str, StringConstraints(max_length=50)] | None = None
     scale: FiniteFloat | None = None
+    base: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_factor(self) -> Column:
+        if self.scale is not None and self.base is not None:
+            raise ValueError("give either scale (model = scale x recorded) or base (model = recorded / base)")
+        return self
+
+
+class Phases(Table):
+    """One line of an experiment's `phases`: quantities made of three recorded phases.
+
+    gives: the quantity of each new column, to be named in inputs, outputs, drive or columns like a recorded one.
+    """
+
+    voltage: Annotated[list[Name], Field(min_length=3, max_length=3)]
+    current: Annotated[list[Name], Field(min_length=3, max_length=3)] | None = None
+    frequency: Positive
+    filter: Literal["mean", "lowpass", "none"] = "mean"
+    window: NotNegative | None = None
+    gives: Annotated[dict[Name, Name], Field(min_length=1)]
 
 
 class Instrument(Table):
@@ -109,6 +130,7 @@ class Experiment(Table):
     nuisance: list[Name] = []
     drive: Columns = {}
     instrument: dict[Name, Instrument] = {}
+    phases: list[Phases] = []
     interpolation: Annotated[
         Interpolation | dict[Name, Interpolation] | None, BeforeValidator(_known_interpolation)
     ] = None
