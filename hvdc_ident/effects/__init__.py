@@ -9,18 +9,37 @@ from functools import cache
 from typing import Any
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter, EffectUse, apply
+from hvdc_ident.effects.probing import Probe, SlotSignal, alone, clearance, probes, resistances, sources
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 
-__all__ = ["Additions", "Effect", "EffectParameter", "EffectUse", "apply_effects", "effects"]
+__all__ = [
+    "Additions",
+    "Effect",
+    "EffectParameter",
+    "EffectUse",
+    "Probe",
+    "SlotSignal",
+    "alone",
+    "apply_effects",
+    "clearance",
+    "effects",
+    "probes",
+    "resistances",
+    "sources",
+]
+
+_NO_EFFECT = ("base", "probing")
 
 
 @cache
 def effects() -> FrozenMap[Effect]:
     """Every effect by name."""
     modules = (
-        importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__) if m.name != "base"
+        importlib.import_module(f"{__name__}.{m.name}")
+        for m in pkgutil.iter_modules(__path__)
+        if m.name not in _NO_EFFECT
     )
     found = [m.EFFECT for m in modules]
     return FrozenMap({e.name: e for e in sorted(found, key=lambda e: e.name)})

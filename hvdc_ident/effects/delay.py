@@ -8,7 +8,7 @@ from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.frozen import FrozenMap
 
 
-def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """u as it was T ago."""
     return add.delay(u, p["T"])
 
@@ -17,9 +17,21 @@ EFFECT = Effect(
     name="delay",
     summary="pure delay, y = u(t - T)",
     parameters=FrozenMap(
-        {"T": EffectParameter(1e-3, neutral=0.0, unit="s", probes=(5e-4, 2e-3, 1e-2), description="delay")}
+        {
+            "T": EffectParameter(
+                1e-3, neutral=0.0, unit="s", description="delay", measure="time", probes=(0.0, 0.25, 0.5, 0.75)
+            )
+        }
     ),
     rewrite=rewrite,
     sentence="{at} arrives {T} late",
     excited_by="a step through the slot, recorded at several samples per delay",
+    states="the signal's history over T",
+    confusable=FrozenMap(
+        {
+            "lag": "excitation up to 1/T: the delay keeps the shape, the lag rounds it",
+            "sample-hold": "recordings finer than the sampling period: the held signal moves in steps",
+            "window-mean": "a step: the mean is a ramp over T, the delay a late step",
+        }
+    ),
 )

@@ -8,7 +8,7 @@ from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.frozen import FrozenMap
 
 
-def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """The state that follows u."""
     return add.state("y", lambda y: (u - y) / p["T"])
 
@@ -19,11 +19,22 @@ EFFECT = Effect(
     parameters=FrozenMap(
         {
             "T": EffectParameter(
-                1e-3, neutral=0.0, unit="s", probes=(5e-4, 2e-3, 1e-2, 5e-2), description="time constant"
+                1e-3, neutral=0.0, unit="s", description="time constant", measure="time", probes=(0.0, 0.25, 0.5, 0.75)
             )
         }
     ),
     rewrite=rewrite,
     sentence="{at} follows its order with a first-order lag of {T}",
     excited_by="a step or fast ramp through the slot, recorded at several samples per time constant",
+    states="y, one a slot",
+    confusable=FrozenMap(
+        {
+            "delay": "excitation up to 1/T: the delay keeps the shape, the lag rounds it",
+            "second-order": "excitation up to 1/T: the second order begins with no slope",
+            "window-mean": "excitation up to 1/T: the mean ends after T and is a straight line after a step",
+            "lead-lag": "a step: the lead jumps at once",
+            "rate-limit": "two steps of different size: the lag scales with them, the rate does not",
+            "inductance": "nothing from outside: on a current they are the same with T = L/R",
+        }
+    ),
 )

@@ -10,7 +10,7 @@ from hvdc_ident.expression.functions import clip
 from hvdc_ident.frozen import FrozenMap
 
 
-def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """u cut at both levels."""
     return clip(u, -p["level"], p["level"])
 
@@ -19,9 +19,24 @@ EFFECT = Effect(
     name="limit",
     summary="hard limit, clip(u, -level, level)",
     parameters=FrozenMap(
-        {"level": EffectParameter(1.0, neutral=math.inf, probes=(0.2, 0.5, 0.8, 1.0), description="largest magnitude")}
+        {
+            "level": EffectParameter(
+                1.0,
+                neutral=math.inf,
+                description="largest magnitude",
+                measure="excursion",
+                probes=(0.3, 0.5, 0.7, 0.85, 0.95),
+            )
+        }
     ),
     rewrite=rewrite,
     sentence="{at} cannot exceed {level} in magnitude",
     excited_by="a step large enough that the signal reaches the limit, held, then released",
+    confusable=FrozenMap(
+        {
+            "saturation": "steps to several levels: the soft one bends long before the hard one cuts",
+            "rate-limit": "two slopes: the level does not depend on how fast it is reached",
+            "gain": "two sizes: only the larger one is cut",
+        }
+    ),
 )

@@ -8,7 +8,7 @@ from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.frozen import FrozenMap
 
 
-def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """The held sample."""
     return add.sampled(u, p["Ts"], p["compute"])
 
@@ -19,12 +19,20 @@ EFFECT = Effect(
     parameters=FrozenMap(
         {
             "Ts": EffectParameter(
-                1e-4, neutral=0.0, unit="s", probes=(1e-4, 5e-4, 2e-3), description="sampling period"
+                1e-4, neutral=0.0, unit="s", description="sampling period", measure="time", probes=(0.1, 0.4, 0.7)
             ),
-            "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period"),
+            # At most one period: a bound that moves with Ts, so a refit leaves it.
+            "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period", held=True),
         }
     ),
     rewrite=rewrite,
     sentence="{at} is sampled every {Ts} and published {compute} later",
     excited_by="a step or ramp through the slot, recorded several times per sampling period",
+    states="one held value a slot",
+    confusable=FrozenMap(
+        {
+            "delay": "recordings finer than the sampling period: the held signal moves in steps (mean delay Ts/2 + compute)",
+            "quantisation": "two ramps of different slope: samples are even in time, levels even in size",
+        }
+    ),
 )

@@ -8,7 +8,7 @@ from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.frozen import FrozenMap
 
 
-def rewrite(u: sp.Expr, p: Mapping[str, sp.Symbol], add: Additions) -> sp.Expr:
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """The state y' = (u - u(t - T)) / T; at rest it is u, which the derivative alone would leave open."""
     before = add.delay(u, p["T"])
     return add.state("y", lambda y: (u - before) / p["T"], rest=u)
@@ -18,9 +18,20 @@ EFFECT = Effect(
     name="window-mean",
     summary="mean of u over the last T (a one-cycle measurement)",
     parameters=FrozenMap(
-        {"T": EffectParameter(0.02, neutral=0.0, unit="s", probes=(0.005, 0.01, 0.02), description="window")}
+        {
+            "T": EffectParameter(
+                0.02, neutral=0.0, unit="s", description="window", measure="time", probes=(0.1, 0.35, 0.6, 0.85)
+            )
+        }
     ),
     rewrite=rewrite,
     sentence="{at} is the mean over the last {T}",
     excited_by="a step through the slot, recorded at several samples per window",
+    states="y, one a slot, and the signal's history over T",
+    confusable=FrozenMap(
+        {
+            "lag": "excitation up to 1/T: the mean is a straight line after a step and ends after T",
+            "delay": "a step: the mean is a ramp over T, the delay a late step",
+        }
+    ),
 )

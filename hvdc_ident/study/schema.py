@@ -56,8 +56,9 @@ class Effect(Table):
 
     effect: Name
     at: Annotated[Names, BeforeValidator(lambda v: [v] if isinstance(v, str) else v)]
-    parameters: dict[Name, FiniteFloat] = {}
+    parameters: dict[Name, FiniteFloat | Name] = {}
     source: Name | None = Field(default=None, alias="from")
+    expression: Annotated[str, StringConstraints(max_length=2000)] | None = None
 
 
 class Model(Table):

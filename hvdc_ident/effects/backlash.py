@@ -1,0 +1,47 @@
+"""A play of full width: y follows when u leaves [y - width/2, y + width/2]."""
+
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
+from hvdc_ident.expression.functions import clip
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """The state that is pulled along by the part of u - y beyond the play, within 0.2 ms.
+
+    An ideal play would need u', which jumps where u does; pulled so, the right-hand side has corners but no jumps. At
+    rest u is taken to lie in the middle of the play.
+    """
+    half = p["width"] / 2
+    return add.state("y", lambda y: (u - y - clip(u - y, -half, half)) / FOLLOW, rest=u)
+
+
+EFFECT = Effect(
+    name="backlash",
+    summary="play of full width: y follows when u leaves [y - width/2, y + width/2]",
+    parameters=FrozenMap(
+        {
+            "width": EffectParameter(
+                0.01,
+                neutral=0.0,
+                description="full width of the play",
+                measure="range",
+                probes=(0.03, 0.1, 0.3),
+                search=(1e-4, 1.9),
+            )
+        }
+    ),
+    rewrite=rewrite,
+    sentence="{at} follows with a play of {width}",
+    excited_by="slow ramps both ways, with turns at several levels",
+    states="y, one a slot",
+    confusable=FrozenMap(
+        {
+            "deadband": "slow ramps both ways: the deadband is flat at 0 only",
+            "quantisation": "slow ramps both ways: the play is flat at turns only",
+        }
+    ),
+)

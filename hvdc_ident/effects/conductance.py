@@ -1,0 +1,44 @@
+"""A leak to another signal's side: u - g from."""
+
+import math
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """u less what leaks."""
+    return u - p["g"] * p["from"]
+
+
+EFFECT = Effect(
+    name="conductance",
+    summary="leak proportional to another signal, u - g from",
+    parameters=FrozenMap(
+        {
+            "g": EffectParameter(
+                0.0,
+                neutral=0.0,
+                min=-math.inf,
+                description="conductance",
+                measure="range/source",
+                probes=(0.05,),
+            )
+        }
+    ),
+    rewrite=rewrite,
+    sentence="{at} loses {g} times {from}",
+    excited_by="several levels of the other signal",
+    confusable=FrozenMap(
+        {
+            "coupling": "several start levels: the coupling counts from the start value",
+            "droop": "several start levels: the droop counts from the start value",
+            "loss": "both signs: the loss does not change sign",
+            "offset": "several levels of the other signal",
+        }
+    ),
+    needs_source=True,
+)

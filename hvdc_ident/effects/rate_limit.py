@@ -1,0 +1,44 @@
+"""A rate limit: y' = clip((u - y)/2e-4, -rate, rate)."""
+
+import math
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
+from hvdc_ident.expression.functions import clip
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """The state that follows u no faster than the rate."""
+    return add.state("y", lambda y: clip((u - y) / FOLLOW, -p["rate"], p["rate"]))
+
+
+EFFECT = Effect(
+    name="rate-limit",
+    summary="rate limit, y' = clip((u - y)/2e-4, -rate, rate)",
+    parameters=FrozenMap(
+        {
+            "rate": EffectParameter(
+                10.0,
+                neutral=math.inf,
+                unit="1/s",
+                min=1e-12,
+                description="largest rate",
+                measure="range/time",
+                probes=(0.9, 0.7, 0.5, 0.3),
+            )
+        }
+    ),
+    rewrite=rewrite,
+    sentence="{at} cannot change faster than {rate}",
+    excited_by="steps of two sizes through the slot, so that two slopes would be asked for",
+    states="y, one a slot",
+    confusable=FrozenMap(
+        {
+            "lag": "two steps of different size: the lag scales with them, the rate does not",
+            "limit": "two slopes: the level does not depend on how fast it is reached",
+        }
+    ),
+)

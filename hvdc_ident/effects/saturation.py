@@ -1,0 +1,42 @@
+"""A soft limiter: level tanh(u/level)."""
+
+import math
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """u bent towards the level."""
+    return p["level"] * sp.tanh(u / p["level"])
+
+
+EFFECT = Effect(
+    name="saturation",
+    summary="soft saturation, level tanh(u/level)",
+    parameters=FrozenMap(
+        {
+            "level": EffectParameter(
+                1.0,
+                neutral=math.inf,
+                min=1e-12,
+                description="magnitude it tends to",
+                measure="peak",
+                probes=(0.8, 1.5, 3.0, 6.0),
+            )
+        }
+    ),
+    rewrite=rewrite,
+    sentence="{at} saturates softly towards {level}",
+    excited_by="steps to several levels of both signs",
+    confusable=FrozenMap(
+        {
+            "limit": "steps to several levels: the soft one bends long before the hard one cuts",
+            "gain": "steps of several sizes: the gain is the same at each",
+            "loss": "several levels and both signs: the saturation is odd and of third order",
+        }
+    ),
+)
