@@ -96,6 +96,8 @@ class Experiment:
     noise: standard deviation of each measured output, in its unit. event: instant of the first disturbance, s.
     window: (from, to) in s of what is compared. role: "fit" or "holdout".
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
+    offsets: constants added to inputs all along, in their units. nuisance: what is unknown about this experiment alone
+    and is estimated with it: "time-shift", or the name of an input (its offset) or of a parameter (a value of its own).
     """
 
     name: str
@@ -110,6 +112,7 @@ class Experiment:
     drive: tuple[str, ...] = ()
     instrument: FrozenMap[FrozenMap[float]] = field(default_factory=FrozenMap)
     nuisance: tuple[str, ...] = ()
+    offsets: FrozenMap[float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
@@ -121,7 +124,7 @@ class Experiment:
             )
         time.setflags(write=False)
         object.__setattr__(self, "time", time)
-        for name in ("inputs", "values", "noise"):
+        for name in ("inputs", "values", "noise", "offsets"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
         if self.measured is not None and not np.array_equal(self.measured.time, time):

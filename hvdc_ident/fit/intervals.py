@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hvdc_ident.fit.nuisance import TIME_SHIFT
+from hvdc_ident.fit.nuisance import unit_of, unknown_of
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.result import Estimate
@@ -29,9 +29,12 @@ def estimates_of(
     bounds get none, for their limits are not independent.
     """
     r, jacobian = stacked(blocks)
-    gradient = jacobian.T @ r
+    gradient = jacobian.T @ problem.loss.psi(r)
+    prior, rows = problem.prior(theta)
+    gradient += rows.T @ prior
     bound = [u.name for u, v in zip(problem.unknowns, theta, strict=True) if not u.min < v < u.max]
     parameters = problem.simulator.parameters
+    nuisances = {unknown_of(e.name, n): n for e in problem.fitted_experiments for n in e.nuisance}
     found = {}
     for unknown, value, slope in zip(problem.unknowns, theta, gradient, strict=True):
         name = unknown.name
@@ -39,7 +42,7 @@ def estimates_of(
             estimate = _inside(unknown, float(value), inner)
         else:
             estimate = _on_bound(unknown, float(value), float(slope), everything, alone=len(bound) == 1)
-        unit = parameters[name].unit if name in parameters else ("s" if name.endswith(f":{TIME_SHIFT}") else "")
+        unit = unit_of(problem.simulator, nuisances[name]) if name in nuisances else parameters[name].unit
         found[name] = _with(estimate, unit, problem.conditional_on.get(name, ()))
     return found
 

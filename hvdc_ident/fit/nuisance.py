@@ -1,7 +1,9 @@
-"""What is unknown about one experiment alone and is estimated with it: for now the offset of its clock.
+"""What is unknown about one experiment alone and is estimated with it.
 
-A nuisance has a name in `Experiment.nuisance`, an unknown per experiment (`unknowns`) and a way to act on the run
-(`observe`). An input's offset, named by the input, has its place in the same two functions.
+A nuisance stands by name in `Experiment.nuisance` and has one unknown an experiment (`unknowns`):
+- "time-shift": the recorder's clock is late by so many s;
+- an input (or a driven slot): a constant is added to it all along, the steady start included;
+- a parameter: it has a value of its own in this experiment, as the free start of a state has.
 """
 
 from __future__ import annotations
@@ -16,9 +18,12 @@ from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.trajectory import Array
+from hvdc_ident.parameters import Input
+from hvdc_ident.trajectory import Array, Trajectory
 
 TIME_SHIFT = "time-shift"
+REACH = 0.2
+"""An offset may reach this share of its input's largest magnitude, or of 1 where that is 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,29 +39,60 @@ def unknown_of(experiment: str, nuisance: str) -> str:
     return f"{experiment}:{nuisance}"
 
 
-def unknowns(experiment: Experiment) -> tuple[Free, ...]:
-    """The unknowns of the experiment alone. A time shift starts at 0 s and may reach 2 % of the record, or two rows.
+def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[Free, ...]:
+    """The unknowns of the experiment alone, in the order it names them.
 
-    Raises StudyError for a nuisance that is not known here.
+    A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0. A parameter has the
+    start and the bounds that the simulator gives it. Raises StudyError for a nuisance that is not known here.
     """
-    return tuple(_free(experiment, name) for name in experiment.nuisance)
+    return tuple(_free(simulator, experiment, name) for name in experiment.nuisance)
 
 
-def _free(experiment: Experiment, nuisance: str) -> Free:
-    if nuisance != TIME_SHIFT:
-        raise StudyError(
-            f"nuisance '{nuisance}' cannot be estimated",
-            where=f"experiment '{experiment.name}'",
-            expected=f"'{TIME_SHIFT}'",
-            hint="hold the input's offset with `values`, or leave the nuisance out",
-        )
+def unit_of(simulator: Simulator, nuisance: str) -> str:
+    """The unit of a nuisance."""
+    if nuisance == TIME_SHIFT:
+        return "s"
+    known: Mapping[str, Input] = getattr(simulator, "inputs", {})
+    for names in (simulator.parameters, known):
+        if nuisance in names:
+            return names[nuisance].unit
+    return ""
+
+
+def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> Free:
+    name = unknown_of(experiment.name, nuisance)
+    if nuisance == TIME_SHIFT:
+        return _clock(experiment, name)
+    if nuisance in simulator.parameters:
+        return Free.of(name, simulator.parameters[nuisance])
+    known: Mapping[str, Input] = getattr(simulator, "inputs", {})
+    if nuisance in known or (known and nuisance in experiment.drive):
+        return _offset(experiment, nuisance, known, name)
+    names = ", ".join(map(repr, [TIME_SHIFT, *known, *(experiment.drive if known else ())]))
+    raise StudyError(
+        f"nuisance '{nuisance}' cannot be estimated",
+        where=f"experiment '{experiment.name}'",
+        expected=f"{names} or a parameter",
+        hint="hold the input's offset with `values`, or leave the nuisance out",
+    )
+
+
+def _clock(experiment: Experiment, name: str) -> Free:
     steps = np.diff(np.unique(experiment.time))
     if not steps.size:
         raise StudyError(
             "a time shift needs more than one instant", where=f"experiment '{experiment.name}'", got="one row"
         )
     reach = max(0.02 * float(np.ptp(experiment.time)), 2.0 * float(np.median(steps)))
-    return Free(unknown_of(experiment.name, nuisance), 0.0, -reach, reach, scale=reach)
+    return Free(name, 0.0, -reach, reach, scale=reach)
+
+
+def _offset(experiment: Experiment, nuisance: str, known: Mapping[str, Input], name: str) -> Free:
+    signal = experiment.inputs.get(nuisance)
+    level = known[nuisance].value if nuisance in known else 0.0
+    size = np.abs(signal.values).max() if signal is not None else abs(experiment.values.get(nuisance, level))
+    reach = REACH * (float(size) or 1.0)
+    return Free(name, 0.0, -reach, reach, scale=reach)
 
 
 def observe(
@@ -65,31 +101,40 @@ def observe(
     values: Mapping[str, float],
     sensitivities: Sequence[str] = (),
     nuisance: Mapping[str, float] | None = None,
+    *,
+    derivatives: bool = True,
 ) -> Observation:
     """The measured outputs as the model gives them, with derivatives by `sensitivities` and then by each nuisance.
 
     nuisance: value of each nuisance by its name in the experiment; "time-shift" tau in s: the recorder's clock is late
-    by tau, so a row at t shows y(t - tau); before the first row the outputs stand still.
+    by tau, so a row at t shows y(t - tau); before the first row the outputs stand still. derivatives: whether they are
+    wanted; without them the gradient has no column.
     Raises SimulationError where the run fails, has no steady start or returns a value that is not finite.
     """
     given = dict(nuisance or {})
     tau = given.get(TIME_SHIFT, 0.0)
     grid, rows = _shifted(experiment.time, tau)
-    asked = experiment if tau == 0.0 else experiment.with_(time=grid, measured=None)
+    asked = experiment if tau == 0.0 else _on(grid, experiment)
+    own = {n: v for n, v in given.items() if n in simulator.parameters}
+    offsets = {n: v for n, v in given.items() if n != TIME_SHIFT and n not in own}
+    if offsets:
+        asked = asked.with_(offsets=asked.offsets | {n: asked.offsets.get(n, 0.0) + v for n, v in offsets.items()})
+    wanted = (*sensitivities, *(n for n in given if n != TIME_SHIFT)) if derivatives else ()
     try:
-        run = simulator.simulate(asked, values, tuple(sensitivities))
+        run = simulator.simulate(asked, {**values, **own}, wanted)
     except SteadyStateError as error:
         raise SimulationError(f"no steady start: {error}") from error
+    before = experiment.time - tau < experiment.time[0]
+    place = len(sensitivities) + list(given).index(TIME_SHIFT) if TIME_SHIFT in given else -1
     outputs: dict[str, Array] = {}
     gradients: dict[str, Array] = {}
     for output in experiment.outputs:
         y = np.asarray(run.trajectory[output], dtype=float)
-        dy = np.asarray(run.gradient(output), dtype=float) if sensitivities else np.empty((y.size, 0))
-        if TIME_SHIFT in given:
-            dy = np.column_stack([dy, -_slope(grid, y, experiment)])
+        dy = np.asarray(run.gradient(output), dtype=float) if wanted else np.empty((y.size, 0))
         outputs[output], gradients[output] = y[rows], dy[rows]
-        if TIME_SHIFT in given:
-            gradients[output][experiment.time - tau < experiment.time[0], -1] = 0.0
+        if derivatives and place >= 0:
+            slope = np.where(before, 0.0, -_slope(grid, y, experiment)[rows])
+            gradients[output] = np.insert(gradients[output], place, slope, axis=1)
         if not (np.isfinite(outputs[output]).all() and np.isfinite(gradients[output]).all()):
             raise SimulationError(
                 f"output '{output}' or its sensitivity is not finite", where=f"experiment '{experiment.name}'"
@@ -106,6 +151,13 @@ def _shifted(time: Array, tau: float) -> tuple[Array, NDArray[np.intp]]:
     rows = np.zeros(time.size, dtype=np.intp)
     rows[later] = 1 + np.arange(int(later.sum()))
     return np.concatenate([time[:1], moved[later]]), rows
+
+
+def _on(grid: Array, experiment: Experiment) -> Experiment:
+    """The experiment over other instants; its outputs keep their names, for they decide what is computed."""
+    names = experiment.outputs
+    blank = Trajectory(grid, np.zeros((grid.size, len(names))), names) if names else None
+    return experiment.with_(time=grid, measured=blank)
 
 
 def _slope(time: Array, y: Array, experiment: Experiment) -> Array:

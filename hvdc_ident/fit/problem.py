@@ -11,11 +11,15 @@ import numpy as np
 
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.loss import LOSSES, Loss
 from hvdc_ident.fit.noise import sigmas
 from hvdc_ident.fit.nuisance import unknown_of, unknowns
-from hvdc_ident.fit.residual import Block, residual_blocks
+from hvdc_ident.fit.prior import Prior, prior_rows
+from hvdc_ident.fit.residual import Block, Treatment, residual_blocks
 from hvdc_ident.fit.simulator import Simulator
+from hvdc_ident.fit.spectrum import Band
 from hvdc_ident.fit.unknown import Coordinates, Free
+from hvdc_ident.fit.whitening import AR
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -28,8 +32,10 @@ class Problem:
     free: the parameters to estimate. held: values of parameters that stay, in their units; a parameter in neither keeps
     the simulator's own value. why: the reason for each held one. conditional_on: for a free parameter the held ones
     without which it could not be told.
-    rho: AR(1) coefficient by output, to whiten with. weights: standard deviation by output that replaces the
-    experiments' own noise, in the output's unit.
+    rho: the noise model to whiten with by output: an AR(1) coefficient or a tuple of AR coefficients.
+    weights: standard deviation by output that replaces the experiments' own noise, in the output's unit.
+    guard: rows this close to a break of an input are not compared, s. band: Hz; given, the residual is the misfit's
+    spectrum there. loss: what a residual costs. priors: by unknown ("EXPERIMENT:NUISANCE" for a nuisance).
     Theta, wherever it appears, holds the unknowns in the order of `unknowns`, each in its own unit.
     Raises StudyError or UnknownNameError where the parts do not fit.
     """
@@ -40,13 +46,17 @@ class Problem:
     held: FrozenMap[float] = field(default_factory=FrozenMap)
     why: FrozenMap[str] = field(default_factory=FrozenMap)
     conditional_on: FrozenMap[tuple[str, ...]] = field(default_factory=FrozenMap)
-    rho: FrozenMap[float] = field(default_factory=FrozenMap)
+    rho: FrozenMap[float | AR] = field(default_factory=FrozenMap)
     weights: FrozenMap[float] = field(default_factory=FrozenMap)
+    guard: float = 0.0
+    band: Band | None = None
+    loss: Loss = LOSSES["linear"]
+    priors: FrozenMap[Prior] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         for name in ("experiments", "free"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name in ("held", "why", "conditional_on", "rho", "weights"):
+        for name in ("held", "why", "conditional_on", "rho", "weights", "priors"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         self._check()
 
@@ -55,9 +65,18 @@ class Problem:
         for name in (*(f.name for f in self.free), *self.held):
             if name not in known:
                 raise unknown_name("parameter", name, known, where="the fit's parameters")
-        twice = [k for k, n in Counter([*(f.name for f in self.free), *self.held]).items() if n > 1]
+        own = {n for e in self.experiments for n in e.nuisance}
+        twice = [
+            k
+            for k, n in Counter([*(f.name for f in self.free), *self.held]).items()
+            if n > 1 or (k in own and k in known)
+        ]
         if twice:
-            raise StudyError("a parameter stands twice in a fit", got=", ".join(twice), expected="free or held, once")
+            raise StudyError(
+                "a parameter stands twice in a fit",
+                got=", ".join(twice),
+                expected="free, held or a nuisance of each experiment, once",
+            )
         names = Counter(e.name for e in self.experiments)
         if max(names.values(), default=0) > 1:
             raise StudyError("two experiments of one name", got=names.most_common(1)[0][0], expected="distinct names")
@@ -67,6 +86,9 @@ class Problem:
                 expected='a free parameter and an experiment of role "fit" with measured outputs',
                 got=f"{len(self.free)} free parameters, {len(self.fitted_experiments)} such experiments",
             )
+        for name in self.priors:
+            if name not in self.names and name not in known:
+                raise unknown_name("unknown", name, [*self.names, *known], where="the fit's priors")
 
     @cached_property
     def fitted_experiments(self) -> tuple[Experiment, ...]:
@@ -81,7 +103,7 @@ class Problem:
     @cached_property
     def unknowns(self) -> tuple[Free, ...]:
         """The free parameters, then the nuisances of each experiment."""
-        return (*self.free, *(u for e in self.fitted_experiments for u in unknowns(e)))
+        return (*self.free, *(u for e in self.fitted_experiments for u in unknowns(self.simulator, e)))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -108,45 +130,72 @@ class Problem:
         """The parameters' values that go to the simulator, held ones included."""
         return {**self.held, **{f.name: float(v) for f, v in zip(self.free, theta, strict=False)}}
 
-    def blocks(self, theta: Array, *, derivatives: bool = True) -> tuple[Block, ...]:
+    @cached_property
+    def treatment(self) -> Treatment:
+        """What is done to misfits before they are residuals."""
+        models = {o: (m,) if isinstance(m, float | int) else tuple(m) for o, m in self.rho.items()}
+        return Treatment(FrozenMap(models), self.guard, self.band)
+
+    def blocks(self, theta: Array, *, derivatives: bool = True, in_time: bool = False) -> tuple[Block, ...]:
         """The residuals of each output in each experiment; jacobians have a column for every unknown.
 
-        Without derivatives the columns are 0. Raises SimulationError where a run fails: theta is then inadmissible.
+        Neither the loss nor the priors are in them. Without derivatives the columns are 0. in_time: samples in time
+        even where the fit is of spectra. Raises SimulationError where a run fails: theta is then inadmissible.
         """
+        treatment = replace(self.treatment, band=None) if in_time else self.treatment
         names = self.names
         parts = []
         for e in self.fitted_experiments:
             local = [*(f.name for f in self.free), *(unknown_of(e.name, n) for n in e.nuisance)]
             columns = [names.index(n) for n in local]
-            for block in self._experiment(e, theta, derivatives):
+            for block in self._experiment(e, theta, derivatives, treatment):
                 jacobian = np.zeros((block.residual.size, len(names)))
                 if derivatives:
                     jacobian[:, columns] = block.jacobian
                 parts.append(replace(block, jacobian=jacobian))
         return tuple(parts)
 
-    def _experiment(self, e: Experiment, theta: Array, derivatives: bool) -> tuple[Block, ...]:
-        at = dict(zip(self.names, theta, strict=True))
+    def _experiment(self, e: Experiment, theta: Array, derivatives: bool, treatment: Treatment) -> tuple[Block, ...]:
         return residual_blocks(
             self.simulator,
             e,
             self.values(theta),
-            tuple(f.name for f in self.free) if derivatives else (),
+            tuple(f.name for f in self.free),
             self.sigma[e.name],
-            nuisance={n: float(at[unknown_of(e.name, n)]) for n in e.nuisance if e.role == "fit"},
-            rho=self.rho,
+            nuisance=self.nuisances(e, theta),
+            treatment=treatment,
+            derivatives=derivatives,
         )
 
-    def residual(self, theta: Array) -> tuple[Array, Array]:
-        """r, (N,), and dr/dtheta, (N, p), over all experiments; r = (measured - simulated)/sigma.
+    def nuisances(self, e: Experiment, theta: Array) -> dict[str, float]:
+        """The value of each nuisance of an experiment of the fit; a held-out one has none."""
+        at = dict(zip(self.names, theta, strict=True))
+        return {n: float(at[k]) for n in e.nuisance if (k := unknown_of(e.name, n)) in at}
 
+    def prior(self, theta: Array) -> tuple[Array, Array]:
+        """The residuals of the priors, (k,), and their derivatives, (k, p)."""
+        return prior_rows(self.priors, self.names, theta)
+
+    def residual(self, theta: Array) -> tuple[Array, Array]:
+        """r, (N,), and dr/dtheta, (N, p), over all experiments, the loss applied, and the priors.
+
+        With the linear loss r = (measured - simulated)/sigma. Half of r'r is the cost.
         Raises SimulationError where a run fails or gives a number that is not finite; it never becomes a residual.
         """
-        return stacked(self.blocks(theta))
+        r, jacobian = self.loss.applied(*stacked(self.blocks(theta)))
+        if not self.priors:
+            return r, jacobian
+        more, rows = self.prior(theta)
+        return np.concatenate([r, more]), np.vstack([jacobian, rows])
 
     def cost(self, theta: Array) -> float:
-        """Half the sum of squared residuals: the negative log-likelihood up to a constant. Raises SimulationError."""
-        return sum(0.5 * float(b.residual @ b.residual) for b in self.blocks(theta, derivatives=False))
+        """The sum of the losses: the negative log-likelihood up to a constant. Raises SimulationError."""
+        data = self.cost_of(self.blocks(theta, derivatives=False))
+        return data + 0.5 * float(np.sum(self.prior(theta)[0] ** 2))
+
+    def cost_of(self, blocks: Sequence[Block]) -> float:
+        """The sum of the losses of some blocks."""
+        return sum(float(np.sum(self.loss.rho(b.residual))) for b in blocks)
 
     def rmse(self, theta: Array) -> dict[str, dict[str, float | None]]:
         """Root mean square of measured - simulated by output and experiment, held-out ones too, in the output's unit.
@@ -154,9 +203,11 @@ class Problem:
         None where the run fails; a held-out experiment has no nuisance.
         """
         table: dict[str, dict[str, float | None]] = {}
+        plain = Treatment()
         for e in self.experiments:
+            seen = e if e.role == "fit" else e.with_(nuisance=())
             try:
-                errors: dict[str, float] = {b.output: b.rmse for b in self._experiment(e, theta, False)}
+                errors: dict[str, float] = {b.output: b.rmse for b in self._experiment(seen, theta, False, plain)}
             except SimulationError:
                 errors = {}
             for output in e.outputs:

@@ -1,9 +1,9 @@
-"""The residuals of one experiment, weighted and if asked whitened, with their derivatives."""
+"""The residuals of one experiment, weighted and if asked whitened or turned into a spectrum, with their derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +12,19 @@ from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.fit.simulator import Simulator
+from hvdc_ident.fit.spectrum import Band, transformed
+from hvdc_ident.fit.whitening import AR, segments, whitened
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """The residuals of one output in one experiment, over its m compared rows.
+    """The residuals of one output in one experiment, over its m compared rows; a spectrum has n values instead of m.
 
     misfit: (m,) measured - simulated, in the output's unit. sigma: standard deviation, in the same unit.
-    residual: (m,) misfit/sigma, whitened; positive where the measurement lies above the model. No unit.
-    jacobian: (m, p) d residual/d unknown, so minus the whitened sensitivity over sigma.
+    residual: (n,) misfit/sigma, treated; positive where the measurement lies above the model. No unit.
+    jacobian: (n, p) d residual/d unknown, so minus the treated sensitivity over sigma.
     rows: (m,) the experiment's rows that are compared.
     """
 
@@ -39,36 +42,46 @@ class Block:
         return float(np.sqrt(np.mean(self.misfit**2)))
 
 
-def compared_rows(experiment: Experiment, output: str) -> NDArray[np.intp]:
-    """The rows of an output that are compared: inside the window, with a finite measurement.
+def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> NDArray[np.intp]:
+    """The rows of an output that are compared: inside the window, with a finite measurement, off the guarded instants.
 
-    Raises StudyError where there are none.
+    guard: s on either side of every break of an input. Raises StudyError where there are none.
     """
     if experiment.measured is None:
         raise StudyError("nothing was measured", where=f"experiment '{experiment.name}'", expected="measured outputs")
-    rows = np.flatnonzero(experiment.compared & np.isfinite(experiment.measured[output]))
+    chosen = experiment.compared & np.isfinite(experiment.measured[output])
+    if guard > 0:
+        for b in {b for signal in experiment.inputs.values() for b in signal.breaks.tolist()}:
+            chosen &= np.abs(experiment.time - b) > guard
+    rows = np.flatnonzero(chosen)
     if not rows.size:
         raise StudyError(
             f"no row of '{output}' can be compared",
             where=f"experiment '{experiment.name}'",
-            expected="finite measurements inside the window",
-            got=f"window {experiment.window}",
+            expected="finite measurements inside the window, off the guarded instants",
+            got=f"window {experiment.window}, guard {guard:g} s",
         )
     return rows
 
 
-def whitened(signal: Array, rho: float) -> Array:
-    """The signal, (m,) or (m, p), as white noise of the same size if it was AR(1) with coefficient rho from row to row.
+@dataclass(frozen=True)
+class Treatment:
+    """What is done to misfits before they are residuals.
 
-    First row unchanged, then (s_k - rho s_{k-1})/sqrt(1 - rho^2): the exact likelihood of a stationary AR(1) noise.
+    whitening: the noise model by output. guard: rows this close to a break of an input are left out, s. band: Hz; given,
+    residuals are the misfit's spectrum within it; None, they are samples in time.
     """
-    if rho == 0.0:
-        return signal
-    if not -1.0 < rho < 1.0:
-        raise StudyError("an AR(1) coefficient is out of range", expected="-1 < rho < 1", got=f"{rho:g}")
-    white = signal.copy()
-    white[1:] = (signal[1:] - rho * signal[:-1]) / np.sqrt(1.0 - rho**2)
-    return white
+
+    whitening: FrozenMap[AR] = field(default_factory=FrozenMap)
+    guard: float = 0.0
+    band: Band | None = None
+
+    def applied(self, signal: Array, time: Array, output: str, where: str) -> Array:
+        """The signal over the compared instants, (m,) or (m, p), as a residual: (n,) or (n, p)."""
+        model = self.whitening.get(output, ())
+        if any(model):
+            signal = whitened(signal, model, segments(time, where))
+        return signal if self.band is None else transformed(signal, time, self.band, where)
 
 
 def residual_blocks(
@@ -79,22 +92,23 @@ def residual_blocks(
     sigma: Mapping[str, float],
     *,
     nuisance: Mapping[str, float] | None = None,
-    rho: Mapping[str, float] | None = None,
+    treatment: Treatment | None = None,
+    derivatives: bool = True,
 ) -> tuple[Block, ...]:
     """One block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
 
-    sigma: standard deviation by output, in its unit. rho: AR(1) coefficient by output; none means no whitening.
+    sigma: standard deviation by output, in its unit. derivatives: whether jacobians are wanted; else they have no column.
     Raises SimulationError where the run fails, StudyError where nothing can be compared.
     """
-    seen = observe(simulator, experiment, values, sensitivities, nuisance)
+    treatment = treatment or Treatment()
+    seen = observe(simulator, experiment, values, sensitivities, nuisance, derivatives=derivatives)
     blocks = []
     for output in experiment.outputs:
-        rows = compared_rows(experiment, output)
+        rows = compared_rows(experiment, output, treatment.guard)
         assert experiment.measured is not None
         misfit = experiment.measured[output][rows] - seen.values[output][rows]
-        coefficient = (rho or {}).get(output, 0.0)
-        weight = sigma[output]
-        residual = whitened(misfit / weight, coefficient)
-        jacobian = whitened(-seen.gradient[output][rows] / weight, coefficient)
+        weight, time, where = sigma[output], experiment.time[rows], f"experiment '{experiment.name}'"
+        residual = treatment.applied(misfit / weight, time, output, where)
+        jacobian = treatment.applied(-seen.gradient[output][rows] / weight, time, output, where)
         blocks.append(Block(experiment.name, output, rows, misfit, weight, residual, jacobian))
     return tuple(blocks)

@@ -304,10 +304,11 @@ def simulate(
     values: parameters (and constant inputs) that differ from the model's. outputs: names of outputs or signals (default:
     all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
     the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
+    The name of an input among the sensitivities asks for the derivative by a constant added to that input all along.
 
     Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
     """
-    from hvdc_ident.simulate.recording import with_recording
+    from hvdc_ident.simulate.recording import with_offsets, with_recording
 
     plant = with_recording(model, experiment)
     given = {**experiment.values, **(values or {})}
@@ -315,7 +316,13 @@ def simulate(
     for name in (*given, *experiment.inputs):
         if name not in plant.parameters and name not in plant.inputs:
             raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
-    code = engine(plant, sensitivities, outputs)
+    for name in experiment.offsets:
+        if name not in plant.inputs:
+            raise unknown_name("input", name, plant.inputs, where=f"experiment '{experiment.name}', offsets")
+    moved = [n for n in plant.inputs if n in experiment.offsets or n in sensitivities]
+    plant, constants = with_offsets(plant, moved)
+    given |= {constants[n]: v for n, v in experiment.offsets.items()}
+    code = engine(plant, [constants.get(n, n) for n in sensitivities], outputs)
     p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
     if not np.isfinite(p).all():
         bad = [n for n, v in zip(plant.parameters, p, strict=True) if not np.isfinite(v)]
@@ -331,10 +338,12 @@ def simulate(
         out, statistics = code.run(p, signals, experiment.time, tol, method, scale)
     except (SimulationError, SteadyStateError) as e:
         raise e.at(f"experiment '{experiment.name}'") from None
-    return _simulation(plant, code, experiment, out, statistics)
+    return _simulation(plant, code, experiment, out, statistics, tuple(sensitivities))
 
 
-def _simulation(model: Model, code: Engine, experiment: Experiment, out: Array, statistics: Statistics) -> Simulation:
+def _simulation(
+    model: Model, code: Engine, experiment: Experiment, out: Array, statistics: Statistics, asked: tuple[str, ...]
+) -> Simulation:
     s = code.structure.sizes
     names = code.structure.outputs
     units = tuple(model.outputs[n].unit if n in model.outputs else "" for n in names)
@@ -345,7 +354,7 @@ def _simulation(model: Model, code: Engine, experiment: Experiment, out: Array, 
     )
     return Simulation(
         Trajectory(experiment.time, out[:, : s.no], names, units),
-        code.structure.sensitivities,
+        asked,
         gradient,
         statistics,
         FrozenMap(),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.model.definition import Model
-from hvdc_ident.parameters import Parameter
+from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import simulate
 from hvdc_ident.simulate.result import Simulation
 
@@ -23,6 +23,11 @@ class ModelSimulator:
     def parameters(self) -> Mapping[str, Parameter]:
         """The model's parameters by name."""
         return self.model.parameters
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:
+        """The model's inputs by name; each may stand among the sensitivities, for a constant added to it."""
+        return self.model.inputs
 
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()

@@ -54,11 +54,11 @@ def with_zero(found, name, t):
 
 def test_whitening_makes_ar1_noise_white():
     noise = coloured(np.random.default_rng(3), 20000, 0.9)
-    white = whitened(noise, 0.9)
+    white = whitened(noise, (0.9,))
     assert white.std() == pytest.approx(1.0, abs=0.03)
     assert abs(white[1:] @ white[:-1] / (white @ white)) < 0.02
     with pytest.raises(StudyError, match="-1 < rho < 1"):
-        whitened(noise, 1.0)
+        whitened(noise, (1.0,))
 
 
 def test_rows_without_a_measurement_are_left_out():
