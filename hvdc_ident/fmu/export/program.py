@@ -1,0 +1,205 @@
+"""A model as C: `model.h` with sizes and names, `model.c` with its equations and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hvdc_ident.errors import SteadyStateError
+from hvdc_ident.fmu.export import text
+from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate import tableaus
+from hvdc_ident.simulate.elimination import Elimination
+from hvdc_ident.simulate.engine import engine
+from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.trajectory import Array
+
+TOLERANCE = 1e-8
+"""Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""
+
+# C function: the structure's function of the same content.
+_SAME = {
+    "model_f": "f",
+    "model_jac": "jac",
+    "model_ft": "ft",
+    "model_switches": "sw",
+    "model_modes": "modes",
+    "model_outputs": "out",
+    "model_sources": "src",
+    "model_source_rates": "srcd",
+    "model_timing": "const",
+    "model_rest": "rest",
+    "model_rest_jac": "rest_jac",
+}
+_TANGENTS = ("model_tangent", "model_rest_tangent")
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """The model's equations as C text, with the numbers that its files and its description share."""
+
+    model: Model
+
+    @cached_property
+    def structure(self) -> Structure:
+        """Graph, equations and order of the variables; its graph gains the tangents."""
+        return Structure(self.model)
+
+    @cached_property
+    def rest(self) -> Array:
+        """[states, unknowns, delays, sampled] at the steady start of the model's own values; the guesses where there is none."""
+        m = self.model
+        p = np.array([q.value for q in m.parameters.values()])
+        u = np.array([i.value for i in m.inputs.values()])
+        code = engine(m)
+        s = code.structure.sizes
+        try:
+            y, w = code.start(p, u)
+        except SteadyStateError:
+            return self.guesses
+        return np.concatenate([y[: s.nx + s.nz], w[1 + s.nu : 1 + s.nu + s.nd + s.nq]])
+
+    @cached_property
+    def guesses(self) -> Array:
+        """Where the search for the steady start begins where the start of the model's own values does not help."""
+        m, s = self.model, self.structure
+        states = [0.0 if q.guess is None else q.guess for q in m.states.values()]
+        unknowns = [m.algebraic[n].start for n in s.unknowns]
+        return np.array([*states, *unknowns, *(0.0 for _ in (*m.delays, *m.sampled))])
+
+    @cached_property
+    def nominals(self) -> Array:
+        """(states,) typical sizes: the value at the steady start, 1 where that is near 0."""
+        size = np.abs(self.rest[: len(self.model.states)])
+        return np.where(size >= 1e-3, size, 1.0)
+
+    @cached_property
+    def fixed(self) -> frozenset[str]:
+        """Parameters that decide delay times and sampling: they cannot change after initialisation."""
+        names = list(self.model.parameters)
+        return frozenset(names[i] for v in self.structure.timing for i in self.structure.partial(v, "p"))
+
+    def header(self, token: str) -> str:
+        """The text of model.h. token: what an importer has to name to get an instance."""
+        s = self.structure.sizes
+        sizes = {"NX": s.nx, "NZ": s.nz, "NU": s.nu, "ND": s.nd, "NQ": s.nq, "NS": s.ns, "NO": s.no}
+        sizes |= {"NP": len(self.model.parameters), "FACTORS": self._elimination.count if self._elimination else 0}
+        lines = [
+            f"/* {_comment(self.model.name)}: sizes, names and equations; generated. */",
+            "#ifndef HVDC_MODEL_H",
+            "#define HVDC_MODEL_H",
+            *(f"#define {n} {v}" for n, v in sizes.items()),
+            f"#define MODEL_TOKEN {text.string(token)}",
+            f"#define DEFAULT_TOLERANCE {text.number(TOLERANCE)}",
+            "typedef struct {",
+            "    const double *y, *yd, *w, *wd, *p, *dp, *m;",
+            "} Args;",
+            *(f"extern {declaration.split(' = ')[0]};" for declaration in self._tables),
+            *(f"void {n}(const Args *a, double *out);" for n in (*_SAME, *_TANGENTS)),
+        ]
+        if self._elimination:
+            lines += [
+                "void model_factorise(const double *jac, double shift, double *out);",
+                "void model_solve(const double *factors, double *x);",
+            ]
+        return "\n".join([*lines, "#endif", ""])
+
+    @property
+    def source(self) -> str:
+        """The text of model.c."""
+        head = f"/* {_comment(self.model.name)}; generated. */\n#include <math.h>\n#include <stddef.h>\n\n#include \"model.h\"\n"
+        return "\n".join([head, *self._tables, "", *self._functions()])
+
+    @property
+    def _tables(self) -> list[str]:
+        m, s = self.model, self.structure
+        names = [*s.states, *s.unknowns, *m.delays, *m.sampled]
+        fixed = self.fixed
+        return [
+            text.array("double", "model_parameter_values", (text.number(q.value) for q in m.parameters.values())),
+            text.array("double", "model_input_values", (text.number(q.value) for q in m.inputs.values())),
+            text.array("double", "model_rest_values", map(text.number, self.rest)),
+            text.array("double", "model_guesses", map(text.number, self.guesses)),
+            text.array("double", "model_nominals", map(text.number, self.nominals)),
+            text.array("int", "model_parameter_fixed", (str(int(n in fixed)) for n in m.parameters)),
+            text.array("int", "model_state_searched", (str(int(q.start is None)) for q in m.states.values())),
+            text.array("char *const", "model_rest_names", map(text.string, names)),
+            text.array("char *const", "model_memory_names", map(text.string, [*m.delays, *m.sampled])),
+        ]
+
+    def _functions(self) -> Iterator[str]:
+        s = self.structure
+        known = {f.name: f for f in s.functions}
+        for name, same in _SAME.items():
+            f = known[same]
+            yield text.function(s.graph, name, f.nodes, f.live)
+        roots = [*s.rhs, *s.observed, *s.graph.switches]
+        yield text.function(s.graph, "model_tangent", [(k, self._tangent(n)) for k, n in enumerate(roots)])
+        rest = [node for _, node in known["rest"].nodes]
+        yield text.function(s.graph, "model_rest_tangent", [(k, self._tangent(n)) for k, n in enumerate(rest)])
+        if self._elimination:
+            yield from _elimination_text(self._elimination)
+
+    def _tangent(self, node: int) -> int:
+        """The node's derivative along the directions that stand in yd, wd and dp."""
+        g = self.structure.graph
+        total = g.zero
+        for group, direction in (("y", "yd"), ("w", "wd"), ("p", "dp")):
+            for index, slope in sorted(self.structure.partial(node, group).items()):
+                total = g.add(total, g.mul(slope, g.leaf(direction, index)))
+        return total
+
+    @cached_property
+    def _elimination(self) -> Elimination | None:
+        return self.structure.elimination
+
+
+def tableau() -> str:
+    """The text of tableau.h: the coefficients of the integrator."""
+    tables = {
+        "RODAS_A": tableaus.RODAS_A,
+        "RODAS_C": tableaus.RODAS_C,
+        "RODAS_H": tableaus.RODAS_H,
+        "RODAS_TIME": tableaus.RODAS_TIME,
+        "RODAS_D": tableaus.RODAS_D,
+    }
+    lines = [
+        "/* RODAS5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the",
+        "   Julia Differential Equations package, BIT 63 (2023). */",
+        f"#define RODAS_GAMMA {text.number(tableaus.RODAS_GAMMA)}",
+    ]
+    for name, table in tables.items():
+        shape = "".join(f"[{k}]" for k in table.shape)
+        lines.append(f"static const double {name}{shape} = {_braces(table)};")
+    return "\n".join([*lines, ""])
+
+
+def _braces(table: Array) -> str:
+    items = (text.number(float(v)) if np.ndim(v) == 0 else _braces(v) for v in table)
+    return "{" + ", ".join(items) + "}"
+
+
+def _comment(name: str) -> str:
+    return "".join(c if c.isalnum() or c in " -_." else "_" for c in name)
+
+
+def _elimination_text(e: Elimination) -> Iterator[str]:
+    """Straight-line elimination of the integrator's matrix, and the solution with its factors."""
+    body = text.function(e.graph, "model_factorise", e.function.nodes)
+    signature = "void model_factorise(const double *jac, double shift, double *out) {\n    const double *y = jac, *w = &shift;"
+    # The elimination's graph names the Jacobian y and the shift w[0].
+    lines = [line for line in body.splitlines()[1:] if "= a->" not in line and "(void)a" not in line]
+    yield "\n".join([signature, "    (void)y, (void)w;", *lines, ""])
+    yield "\n".join(["void model_solve(const double *factors, double *x) {", *_solution(e), "}", ""])
+
+
+def _solution(e: Elimination) -> Sequence[str]:
+    lines = [f"    double x{k} = x[{k}];" for k in e.order]
+    lines += [f"    x{i} -= factors[{e.places[i, k]}] * x{k};" for k in e.order for i in e.lower[k]]
+    for k in reversed(e.order):
+        lines += [f"    x{k} -= factors[{e.places[k, j]}] * x{j};" for j in e.upper[k]]
+        lines.append(f"    x[{k}] = x{k} *= factors[{e.places[k, k]}];")
+    return lines
