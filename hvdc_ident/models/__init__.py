@@ -1,7 +1,8 @@
 """The shipped models, one file each, and the one way to load any model.
 
 A file gives `model()` and one line, SUMMARY, under its own name with hyphens; where it has structure options it may
-ship more of them: VARIANTS, {name: (one line, function that gives the model)}. Files that begin with _ are no models.
+ship more of them: VARIANTS, {name: (one line, function that gives the model)}, or a family of any size: `family(name)`,
+which gives the model a name asks for, or None. Files that begin with _ are no models.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 
-__all__ = ["load_model", "shipped_models", "summaries"]
+__all__ = ["is_shipped", "load_model", "shipped_models", "summaries"]
 
 
 @cache
@@ -34,6 +35,11 @@ def shipped_models() -> tuple[str, ...]:
     return tuple(_shipped_by_name())
 
 
+def is_shipped(name: str) -> bool:
+    """Whether a model of that name is shipped, be it one of a family."""
+    return name in _shipped_by_name() or _of_a_family(name) is not None
+
+
 def summaries() -> dict[str, str]:
     """One line on each shipped model."""
     return {name: summary for name, (summary, _) in _shipped_by_name().items()}
@@ -41,7 +47,21 @@ def summaries() -> dict[str, str]:
 
 @cache
 def _shipped(name: str) -> Model:
-    return _shipped_by_name()[name][1]()
+    known = _shipped_by_name()
+    found = known[name][1]() if name in known else _of_a_family(name)
+    assert found is not None  # is_shipped said so
+    return found
+
+
+@cache
+def _of_a_family(name: str) -> Model | None:
+    """The member of a family of models that goes by the name; None where none does."""
+    for module_name in (m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")):
+        module: Any = importlib.import_module(f"{__name__}.{module_name}")
+        found = module.family(name) if hasattr(module, "family") else None
+        if isinstance(found, Model):
+            return found
+    return None
 
 
 def load_model(source: str | Path, *, trust: bool = False) -> Model:
@@ -50,7 +70,7 @@ def load_model(source: str | Path, *, trust: bool = False) -> Model:
     Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
     """
     text = str(source)
-    if text in shipped_models():
+    if is_shipped(text):
         return _shipped(text)
     path = Path(text)
     suffix = path.suffix.lower()

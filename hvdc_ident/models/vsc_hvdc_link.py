@@ -10,6 +10,7 @@ from __future__ import annotations
 from hvdc_ident.expression import parse
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Algebraic, Model, Output, Parameterisation, Signal, State
+from hvdc_ident.models._phasor_station import control_p, control_q, control_vdc, grid_impedance, plant
 from hvdc_ident.parameters import Input, Parameter
 
 SUMMARY = "two-terminal VSC-HVDC link in phasors, 6 states (the model under calibration)"
@@ -107,57 +108,16 @@ def _plant() -> dict[str, Parameter]:
 
 
 def _signals() -> dict[str, str]:
-    common = {"R": "Zg / sqrt(1 + XR**2)", "X": "XR * R"}
     return (
-        common
-        | _station(1)
-        | _station(2)
-        | _control_vdc()
-        | _control_p()
-        | _control_q("1", "KPQ", "KIQ")
-        | _control_q("2", "KPQ2", "KIQ2")
+        grid_impedance()
+        | plant("1")
+        | plant("2")
+        | control_vdc("1")
+        | control_p("2")
+        | control_q("1", "KPQ", "KIQ")
+        | control_q("2", "KPQ2", "KIQ2")
         | _line()
     )
-
-
-def _station(i: int) -> dict[str, str]:
-    return {
-        f"Vac{i}": f"sqrt(E{i}**2 - (X*Ir{i} - R*Ii{i})**2) - (R*Ir{i} + X*Ii{i})",
-        f"P{i}": f"Vac{i} * Ir{i}",
-        f"Q{i}": f"Vac{i} * Ii{i}",
-        f"Pdc{i}": f"P{i}",
-    }
-
-
-def _control_vdc() -> dict[str, str]:
-    return {
-        "Vdc1_m": "Vdc1",
-        "ev": "Vdcref1 - Vdc1_m",
-        "yv_u": "KPVDC*ev + xv",
-        "yv": "clip(yv_u, -1.2, 1.2)",
-        "Irorder1": "clip(yv, -1.1, 1.1)",
-    }
-
-
-def _control_p() -> dict[str, str]:
-    return {
-        "P2_m": "P2",
-        "ep": "Pref2 - P2_m",
-        "yp_u": "KPP*ep + xp",
-        "yp": "clip(yp_u, -1.2, 1.2)",
-        "Irorder2": "clip(yp / clip(Vac2, 0.01, 2), -1.1, 1.1)",
-    }
-
-
-def _control_q(i: str, kp: str, ki: str) -> dict[str, str]:
-    return {
-        f"Q{i}_m": f"Q{i}",
-        f"eq{i}": f"Qref{i} - Q{i}_m",
-        f"yq{i}_u": f"{kp}*eq{i} + xq{i}",
-        f"yq{i}": f"clip(yq{i}_u, -0.5, 0.5)",
-        f"m{i}": f"min(0.5, sqrt(max(0, 1.1**2 - Irorder{i}**2)))",
-        f"Iiorder{i}": f"clip(yq{i} / clip(Vac{i}, 0.01, 2), -m{i}, m{i})",
-    }
 
 
 def _line() -> dict[str, str]:

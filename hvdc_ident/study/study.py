@@ -12,7 +12,7 @@ from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.models import load_model, shipped_models
+from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
@@ -98,7 +98,7 @@ def _model(table: schema.Model, file: Path, trust: bool) -> tuple[Model, dict[st
     """The model as the study wants it, and the hash of the file it comes from."""
     source: str | Path = table.source
     sources: dict[str, str] = {}
-    if table.source not in shipped_models() and _is_path(table.source):
+    if not is_shipped(table.source) and _is_path(table.source):
         source = file.parent / table.source
         if not source.is_file():
             raise StudyError(
