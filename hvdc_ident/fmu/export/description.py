@@ -28,7 +28,13 @@ _SI: Mapping[str, Mapping[str, int]] = {
 
 
 def description(
-    variables: Variables, token: str, version: str, identifier: str, kinds: Sequence[str], sources: Sequence[str], stop: float
+    variables: Variables,
+    token: str,
+    version: str,
+    identifier: str,
+    kinds: Sequence[str],
+    sources: Sequence[str],
+    stop: float,
 ) -> str:
     """The text of modelDescription.xml. version: "2.0" or "3.0"; kinds: keys of KINDS; stop: of the default experiment, s."""
     model = variables.program.model
@@ -53,7 +59,12 @@ def description(
         ET.SubElement(root, "LogCategories"), "Category", name="logStatusError", description="why a call failed"
     )
     ET.SubElement(
-        root, "DefaultExperiment", startTime="0", stopTime=repr(stop), tolerance=repr(TOLERANCE), stepSize=repr(stop / 500)
+        root,
+        "DefaultExperiment",
+        startTime="0",
+        stopTime=repr(stop),
+        tolerance=repr(TOLERANCE),
+        stepSize=repr(stop / 500),
     )
     _variables(ET.SubElement(root, "ModelVariables"), variables, version)
     structure = ET.SubElement(root, "ModelStructure")
@@ -180,6 +191,4 @@ def _structure_3(structure: ET.Element, variables: Variables) -> None:
         ET.SubElement(structure, "InitialUnknown", valueReference=str(v.reference))
     for k in range(variables.program.structure.sizes.ns):
         known = _dependent(variables.indicator_dependencies(k))
-        ET.SubElement(
-            structure, "EventIndicator", {"valueReference": str(variables.first["indicators"] + k), **known}
-        )
+        ET.SubElement(structure, "EventIndicator", {"valueReference": str(variables.first["indicators"] + k), **known})

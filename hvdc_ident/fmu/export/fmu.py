@@ -19,7 +19,7 @@ from hvdc_ident.fmu.export.program import Program, tableau
 from hvdc_ident.fmu.export.variables import Variables
 from hvdc_ident.model.definition import Model
 
-VERSIONS = ("2.0",)
+VERSIONS = ("2.0", "3.0")
 _SHARED = (
     "linear.c",
     "equations.c",
@@ -71,7 +71,10 @@ def export_fmu(
     command = None if binary is False else build.compiler()
     if binary and command is None:
         raise ModelError(
-            "there is no C compiler", where=str(path), expected="cc, gcc, clang or what CC names", hint="leave the binary out"
+            "there is no C compiler",
+            where=str(path),
+            expected="cc, gcc, clang or what CC names",
+            hint="leave the binary out",
         )
     identifier = identifier_of(model.name)
     content = _content(model, version, chosen, identifier, stop)

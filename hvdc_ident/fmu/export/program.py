@@ -110,7 +110,7 @@ class Program:
     @property
     def source(self) -> str:
         """The text of model.c."""
-        head = f"/* {_comment(self.model.name)}; generated. */\n#include <math.h>\n#include <stddef.h>\n\n#include \"model.h\"\n"
+        head = f'/* {_comment(self.model.name)}; generated. */\n#include <math.h>\n#include <stddef.h>\n\n#include "model.h"\n'
         return "\n".join([head, *self._tables, "", *self._functions()])
 
     @property
@@ -189,7 +189,9 @@ def _comment(name: str) -> str:
 def _elimination_text(e: Elimination) -> Iterator[str]:
     """Straight-line elimination of the integrator's matrix, and the solution with its factors."""
     body = text.function(e.graph, "model_factorise", e.function.nodes)
-    signature = "void model_factorise(const double *jac, double shift, double *out) {\n    const double *y = jac, *w = &shift;"
+    signature = (
+        "void model_factorise(const double *jac, double shift, double *out) {\n    const double *y = jac, *w = &shift;"
+    )
     # The elimination's graph names the Jacobian y and the shift w[0].
     lines = [line for line in body.splitlines()[1:] if "= a->" not in line and "(void)a" not in line]
     yield "\n".join([signature, "    (void)y, (void)w;", *lines, ""])
