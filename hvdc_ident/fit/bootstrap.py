@@ -5,32 +5,38 @@ Both hold with model error and with correlated samples, for they take whole expe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.errors import SimulationError, StudyError
-from hvdc_ident.fit.nuisance import unknown_of
-from hvdc_ident.fit.objective import LeastSquares, descend
+from hvdc_ident.fit.estimate import Executor
+from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.trajectory import Array
 
 FEWEST = 3
 """Fewer experiments have no scatter worth the name."""
+BATCHES = 8
+"""Parts that a bootstrap is cut into where there are other processes to run them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
     """Estimates from resampled experiments. values: (n, p), one row a sample, in the parameters' units.
 
-    names: p parameters. failed: samples whose fit failed and that are not in `values`.
+    names: p parameters. failed: samples whose fit failed and that are not in `values`. experiments: how many there are
+    to draw from.
     """
 
     names: tuple[str, ...]
     values: Array
     failed: int
+    experiments: int = 0
 
     def std(self) -> dict[str, float]:
         """The standard deviation of each parameter over the samples, in its unit."""
@@ -42,32 +48,72 @@ class Bootstrap:
         return {n: (float(a), float(b)) for n, a, b in zip(self.names, low, high, strict=True)}
 
 
-def bootstrap(problem: Problem, theta: Array, *, samples: int = 200, seed: int = 0) -> Bootstrap:
-    """Estimates from experiments drawn anew, with replacement, each sample fitted from the optimum theta, (p,).
+def bootstrap(
+    problem: Problem, theta: Array, *, samples: int = 200, seed: int = 0, executor: Executor | None = None
+) -> Bootstrap:
+    """Estimates from experiments drawn anew, with replacement, each sample fitted from near the optimum theta, (p,).
 
-    Every experiment brings its own nuisances. Raises StudyError with fewer than three experiments.
+    Every experiment brings its own nuisances. The samples do not depend on the executor. Raises StudyError with fewer
+    than three experiments, SimulationError where no sample can be fitted.
     """
     units = problem.fitted_experiments
     _need(len(units))
     random = np.random.default_rng(seed)
-    at = dict(zip(problem.names, theta, strict=True))
-    rows, failed = [], 0
-    for _ in range(samples):
-        drawn = [units[i] for i in random.integers(len(units), size=len(units))]
-        named = tuple(e.with_(name=f"{e.name}#{k}") for k, e in enumerate(drawn))
-        again = replace(problem, experiments=named)
-        begin = [at[f.name] for f in problem.free]
-        begin += [at[unknown_of(e.name, n)] for e in drawn for n in e.nuisance]
-        none = np.zeros(len(begin), dtype=bool)
+    drawn = [random.integers(len(units), size=len(units)) for _ in range(samples)]
+    counts = np.array([np.bincount(d, minlength=len(units)) for d in drawn])
+    parts = np.array_split(counts, BATCHES) if executor else [counts]
+    fits = partial(_refits, problem, np.asarray(theta, dtype=float))
+    rows = [row for part in (executor.map if executor else map)(fits, parts) for row in part]
+    good = [row for row in rows if row is not None]
+    if not good:
+        raise SimulationError("no sample of the bootstrap could be fitted", got=f"{len(rows)} failures")
+    names = tuple(f.name for f in problem.free)
+    return Bootstrap(names, np.array(good)[:, : len(names)], len(rows) - len(good), len(units))
+
+
+def _refits(problem: Problem, theta: Array, counts: NDArray[np.intp]) -> list[Array | None]:
+    """The estimates, (p,), with every experiment counted so many times, a row of counts a fit; None where it fails."""
+    blocks = problem.blocks(theta)
+    return [_refit(problem, theta, blocks, row) for row in counts]
+
+
+def _refit(problem: Problem, theta: Array, blocks: Sequence[Block], counts: NDArray[np.intp]) -> Array | None:
+    units = problem.fitted_experiments
+    times = {e.name: int(c) for e, c in zip(units, counts, strict=True) if c}
+    drawn = replace(problem, experiments=tuple(e for e in units if e.name in times))
+    places = [problem.names.index(n) for n in drawn.names]
+    known = [b for b in blocks if b.experiment in times]
+    begin = _one_step(drawn, theta[places], *_counted(known, times, places))
+
+    def residual(at: Array) -> tuple[Array, Array]:
+        return _counted(drawn.blocks(at), times, list(range(at.size)))
+
+    objective = LeastSquares(drawn.unknowns, residual)
+    none = np.zeros(len(places), dtype=bool)
+    for start in (begin, theta[places]):  # a step that leads out of what can be simulated is not taken
         try:
-            end = descend(LeastSquares.of(again), np.array(begin), none, enough=1e-4)
+            end = descend(objective, start, none, enough=1e-3)
         except SimulationError:
-            failed += 1
             continue
-        rows.append(end.theta[: len(problem.free)])
-    if not rows:
-        raise SimulationError("no sample of the bootstrap could be fitted", got=f"{failed} failures")
-    return Bootstrap(tuple(f.name for f in problem.free), np.array(rows), failed)
+        found = theta.copy()
+        found[places] = end.theta
+        return found
+    return None
+
+
+def _counted(blocks: Sequence[Block], times: Mapping[str, int], columns: Sequence[int]) -> tuple[Array, Array]:
+    """Residual and jacobian in which every experiment counts so many times."""
+    root = [np.sqrt(times[b.experiment]) for b in blocks]
+    r = np.concatenate([b.residual * k for b, k in zip(blocks, root, strict=True)])
+    return r, np.vstack([b.jacobian[:, columns] * k for b, k in zip(blocks, root, strict=True)])
+
+
+def _one_step(problem: Problem, theta: Array, r: Array, jacobian: Array) -> Array:
+    """Where a Gauss-Newton step within the bounds leads from theta."""
+    space = problem.coordinates
+    low, high = space.bounds
+    x, scaled = space.scaled(theta), jacobian * space.slope(theta)
+    return space.unscaled(x + bounded_step(scaled.T @ r, scaled.T @ scaled, 0.0, low - x, high - x))
 
 
 def cluster_sandwich(blocks: Sequence[Block]) -> tuple[Array, int]:
