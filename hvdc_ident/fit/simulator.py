@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.parameters import Parameter
+from hvdc_ident.parameters import Input, Parameter
+from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR
 from hvdc_ident.trajectory import Array, Trajectory
 
 
@@ -39,3 +40,39 @@ class Simulator(Protocol):
 
         Raises SimulationError where it fails, SteadyStateError where it cannot begin.
         """
+
+
+@runtime_checkable
+class WithInputs(Protocol):
+    """A simulator that says what its inputs are; one that does not is moved only where experiments moved it."""
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:
+        """The inputs by name, with start values and units."""
+
+
+@runtime_checkable
+class Approximate(Protocol):
+    """A simulator whose sensitivities are differences; those of one that does not say so are taken as exact."""
+
+    @property
+    def sensitivity_error(self) -> float:
+        """The relative error of a sensitivity column, by its own account: below it a rank cannot be told."""
+
+
+def sensitivity_error(simulator: Simulator) -> float:
+    """The relative error of the simulator's sensitivities; what the engine's own have where it does not say."""
+    own = float(simulator.sensitivity_error) if isinstance(simulator, Approximate) else 0.0
+    return max(own, SENSITIVITY_ERROR)
+
+
+def inputs_of(simulator: Simulator, experiments: Sequence[Experiment]) -> dict[str, Input]:
+    """The simulator's inputs; of one that does not name them, those of the experiments, as they began."""
+    if isinstance(simulator, WithInputs):
+        return dict(simulator.inputs)
+    found: dict[str, Input] = {}
+    for e in experiments:
+        for name, signal in e.inputs.items():
+            if name not in e.drive:
+                found.setdefault(name, Input(float(signal.values[0])))
+    return found

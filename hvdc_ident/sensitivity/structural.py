@@ -36,7 +36,8 @@ class StructuralResult:
     status: "decided" or "not decided"; then `reason` says why, and nothing is claimed: identifiable, unidentifiable and
     combinations are empty. method: "prime field" (exact up to a probability below 1e-6) or "numeric, local" (real points
     near the model's values, 120 decimals). rank: how many combinations of the parameters are seen. rows: (rank, parameters)
-    a basis of what is seen at one random point, reduced; modulo `prime` unless that is 0.
+    a basis of what is seen at one random point, reduced; modulo `prime` unless that is 0. out_of_reach: not decided because
+    the model has parts that no more time would help with (delays, sampling, functions without a series).
     """
 
     parameters: tuple[str, ...]
@@ -54,6 +55,7 @@ class StructuralResult:
     rows: tuple[tuple[float, ...], ...] = ()
     prime: int = 0
     seconds: float = 0.0
+    out_of_reach: bool = False
 
     def combination_of(self, parameter: str) -> Combination | None:
         """The combination a parameter is a member of, or None."""
@@ -120,7 +122,11 @@ def structural_identifiability(
     except OutOfTime:
         found = {"status": "not decided", "reason": f"the time limit of {time_limit:g} s was reached"}
     except NotRational as e:
-        found = {"status": "not decided", "reason": f"the method does not reach this model: {e}"}
+        found = {
+            "status": "not decided",
+            "reason": f"the method does not reach this model: {e}",
+            "out_of_reach": True,
+        }
     seconds = time.monotonic() - begun
     return StructuralResult(
         names, watched, FrozenMap(moved), FrozenMap(starts), tuple(ask.regime_words), seconds=seconds, **found
