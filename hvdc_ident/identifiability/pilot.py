@@ -16,6 +16,7 @@ from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.sensitivity.fisher import Information
@@ -33,6 +34,11 @@ class Optimum:
     def names(self) -> tuple[str, ...]:
         """The free parameters, without the nuisances."""
         return tuple(f.name for f in self.problem.free)
+
+    @property
+    def error(self) -> float:
+        """The relative error of the sensitivities."""
+        return sensitivity_error(self.problem.simulator)
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:

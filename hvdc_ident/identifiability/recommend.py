@@ -1,199 +1,241 @@
-"""What to measure next: the input, level and signal that would tell most about what is known least."""
+"""What to measure next: the experiment, its level and the signals that would tell most about what is known least."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.fit import Simulator
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.identifiability.advice import advice
+from hvdc_ident.identifiability.merit import Merit, half_widths, merit
 from hvdc_ident.identifiability.pilot import Optimum
-from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR
+from hvdc_ident.identifiability.trial import Move, Trial, double_trials, single_trials
+from hvdc_ident.parameters import Input
 from hvdc_ident.trajectory import Array
 
 NEW_SIGNAL = 1.1
 """Recording another signal is advised only where it raises the smallest eigenvalue by more than this factor."""
+EQUAL = 0.01
+"""Trials whose smallest eigenvalue is within this share of the best are equals: the larger determinant is taken."""
+ADDED = 0.1
+"""A second step that raises the logarithm of the determinant by less adds nothing."""
+BEGUN_WITH = 3
+"""So many of the best single steps are tried with a second step of every other input."""
+LISTED = 8
 
 
-@dataclass(frozen=True)
-class Recommendation:
-    """A step that was not made yet.
+@dataclass(frozen=True, eq=False)
+class Ranked:
+    """A trial with the signals to record, and what would be known of the candidates with it added.
 
-    input: moved from `before` to `after`, in its unit. record: the signals to record. smallest: eigenvalue of the
-    information in scaled coordinates (now, then). predicted: half-width of the 95 % interval by parameter, in its unit,
-    linear and only as good as the noise assumed; None where it stays open. text: the advice as a sentence.
+    then: how well they are determined together. gain: (p, p) the information it adds, in scaled coordinates.
     """
 
-    input: str
-    before: float
-    after: float
+    trial: Trial
     record: tuple[str, ...]
-    smallest: tuple[float, float]
-    determinant_gain: float
-    predicted: FrozenMap[float | None]
-    now: FrozenMap[float | None]
+    new: tuple[str, ...]
+    then: Merit
+    gain: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """The experiment that raises the smallest eigenvalue of the information most (E-optimal), of those tried.
+
+    best: the experiment. by_determinant: the one that raises the determinant most (D-optimal). now: how well the candidates
+    are determined without either. half_widths_now, half_widths: of the 95 % intervals by parameter, in its unit, to first
+    order, at the values found or held, only as good as the noise assumed; None where it stays open. values: the parameters'
+    values there. others: the best of each other kind and input, best first. tried: how many. failed: those that cannot be
+    simulated, with the reason. text: the advice in words.
+    """
+
+    best: Ranked
+    by_determinant: Ranked
+    now: Merit
+    half_widths_now: FrozenMap[float | None]
+    half_widths: FrozenMap[float | None]
+    values: FrozenMap[float]
+    others: tuple[Ranked, ...]
+    tried: int
+    failed: tuple[str, ...]
     text: str
-    others: tuple[FrozenMap[Any], ...] = ()
-    failed: tuple[str, ...] = ()
+
+    @property
+    def input(self) -> str:
+        """The input that moves first."""
+        return self.best.trial.moves[0].input
 
     def to_dict(self) -> dict[str, Any]:
         """The recommendation as JSON takes it."""
+        first = self.best.trial.moves[0]
+        intervals = {
+            n: None if h is None else [self.values[n] - h, self.values[n] + h] for n, h in self.half_widths.items()
+        }
         return {
-            "input": self.input,
-            "from": self.before,
-            "to": self.after,
-            "record": list(self.record),
-            "smallest_eigenvalue": {"now": self.smallest[0], "then": self.smallest[1]},
-            "determinant_gain": self.determinant_gain,
-            "predicted_half_width": dict(self.predicted),
-            "half_width_now": dict(self.now),
+            "input": first.input,
+            "from": first.before,
+            "to": first.after,
+            **self._line(self.best),
+            "criterion": "E-optimal: the largest smallest eigenvalue of the information in scaled coordinates",
+            "predicted_half_width": dict(self.half_widths),
+            "predicted_ci95": intervals,
+            "half_width_now": dict(self.half_widths_now),
             "text": self.text,
-            "others": [dict(o) for o in self.others],
+            "d_optimal": self._line(self.by_determinant),
+            "others": [self._line(r) for r in self.others],
+            "tried": self.tried,
             "failed": list(self.failed),
+        }
+
+    def _line(self, r: Ranked) -> dict[str, Any]:
+        return {
+            "kind": r.trial.kind,
+            "moves": [m.to_dict() for m in r.trial.moves],
+            "record": list(r.record),
+            "new_signals": list(r.new),
+            "smallest_eigenvalue": {"now": self.now.smallest, "then": r.then.smallest},
+            "directions_seen": {"now": self.now.seen, "then": r.then.seen},
+            "determinant_gain": r.then.determinant - self.now.determinant if r.then.seen == self.now.seen else None,
         }
 
 
 def recommend(
-    whole: Optimum, inputs: Mapping[str, float], units: Mapping[str, str], *, thresholds: Mapping[str, float]
+    whole: Optimum, inputs: Mapping[str, Input], units: Mapping[str, str], *, thresholds: Mapping[str, float]
 ) -> Recommendation | None:
-    """The step that raises the smallest eigenvalue most, over all inputs at three levels; None where none can be run.
+    """The best of the experiments that could be made; None where there is no input to move, or none can be run.
 
-    whole: all candidates free, at the values of the optimum. inputs: the model's inputs with their start values.
-    thresholds: the rise of the cost at the ends of a parameter's interval, which widens the predicted intervals too.
+    Tried are, for every input, steps at three levels, a ramp and a multisine; and the best steps followed by a step of
+    every other input; each with the signals recorded so far, and with one more. whole: all candidates free, at the
+    values of the optimum. inputs: the model's. units: of the parameters. thresholds: the rise of the cost at the ends of
+    a parameter's interval, which widens the predicted intervals too.
     """
-    names = whole.names
-    base = whole.information.matrix
     template = max(whole.problem.fitted_experiments, key=lambda e: float(np.ptp(e.time)))
-    recorded = tuple(whole.problem.outputs)
-    tried, failed = [], []
-    for name, before, after in _steps(whole.problem.fitted_experiments, inputs):
-        try:
-            gains = _information(whole, _experiment(template, name, before, after))
-        except SimulationError as error:
-            failed.append(f"{name} from {before:g} to {after:g}: {error.what}")
-            continue
-        together = sum((gains[o] for o in recorded if o in gains), np.zeros_like(base))
-        plain = _merit(base + together)
-        tried.append((plain, name, before, after, recorded, together))
-        for signal in gains:
-            more = _merit(base + together + gains[signal])
-            if signal not in recorded and more > (plain[0], plain[1] * NEW_SIGNAL):
-                tried.append((more, name, before, after, (*recorded, signal), together + gains[signal]))
-    if not tried:
+    values, of_inputs = {n: i.value for n, i in inputs.items()}, {n: i.unit for n, i in inputs.items()}
+    tried = _Trials(whole)
+    singles = list(single_trials(whole.problem.fitted_experiments, values, of_inputs, template))
+    ranked = list(tried.ranked(singles))
+    ranked += tried.ranked(double_trials(_best_steps(ranked), singles, template))
+    if not ranked:
         return None
-    tried.sort(key=lambda t: t[0], reverse=True)
-    best = tried[0]
+    base = whole.information.matrix
+    best = _e_optimal(ranked)
+    by_determinant = max(ranked, key=lambda r: (r.then.seen, r.then.determinant, -len(r.trial.moves)))
+    now, then = (half_widths(m, _reach(whole, thresholds), whole.names, whole.error) for m in (base, base + best.gain))
+    at = FrozenMap({n: whole.value(n) for n in whole.names})
+    text = advice(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked))
+    others = tuple(_others(ranked, best))
+    count = len({r.trial for r in ranked})
+    return Recommendation(best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text)
+
+
+class _Trials:
+    """Trials run and weighed, each with the signals recorded so far and with one more."""
+
+    def __init__(self, whole: Optimum) -> None:
+        self.whole = whole
+        self.base = whole.information.matrix
+        self.recorded = tuple(whole.problem.outputs)
+        self.now = merit(self.base, whole.error)
+        self.failed: list[str] = []
+
+    def ranked(self, trials: Iterable[Trial]) -> Iterator[Ranked]:
+        """Every way to record each trial that can be run."""
+        for trial in trials:
+            try:
+                gains = self._gains(trial)
+            except SimulationError as error:
+                self.failed.append(f"{trial.text({})}: {error.what}")
+                continue
+            plain = sum((gains[o] for o in self.recorded if o in gains), np.zeros_like(self.base))
+            first = merit(self.base + plain, self.whole.error)
+            yield Ranked(trial, self.recorded, (), first, plain)
+            for signal in gains:
+                if signal in self.recorded:
+                    continue
+                gain = plain + gains[signal]
+                more = merit(self.base + gain, self.whole.error)
+                if (more.seen, more.smallest) > (first.seen, first.smallest * NEW_SIGNAL):
+                    yield Ranked(trial, (*self.recorded, signal), (signal,), more, gain)
+
+    def _gains(self, trial: Trial) -> dict[str, Array]:
+        """The information of each output of the run, in scaled coordinates."""
+        problem, names = self.whole.problem, self.whole.names
+        template = max(problem.fitted_experiments, key=lambda e: float(np.ptp(e.time)))
+        run = problem.simulator.simulate(trial.experiment(template), problem.values(self.whole.theta), names)
+        found = {}
+        for output in run.trajectory.names:
+            gradient = run.gradient(output) * self.whole.slope[: len(names)]
+            if not np.isfinite(gradient).all():
+                raise SimulationError(f"the sensitivity of '{output}' is not finite")
+            gradient = gradient / self._sigma(output, run.trajectory[output], run.trajectory.unit(output))
+            found[output] = gradient.T @ gradient
+        return found
+
+    def _sigma(self, output: str, values: Array, unit: str) -> float:
+        """The noise expected on an output, in its unit: as recorded so far; of a new one, as on others of its unit, or
+        the same share of its largest value."""
+        problem = self.whole.problem
+        by_output = {o: s for table in problem.sigma.values() for o, s in table.items()}
+        if output in by_output:
+            return by_output[output]
+        typical = float(np.median(list(by_output.values())))
+        measured = [(e.measured, o) for e in problem.fitted_experiments for o in e.outputs if e.measured is not None]
+        if any(m.unit(o) == unit for m, o in measured):
+            return typical
+        size = float(np.median([np.nanmax(np.abs(m[o])) for m, o in measured]))
+        share = typical / size if size > 0 else 0.0
+        return share * float(np.abs(values).max()) or typical
+
+
+def _e_optimal(ranked: Sequence[Ranked]) -> Ranked:
+    """The one with most directions seen and the largest smallest eigenvalue; of equals the larger determinant."""
+    seen = max(r.then.seen for r in ranked)
+    most = [r for r in ranked if r.then.seen == seen]
+    largest = max(r.then.smallest for r in most)
+    equals = [r for r in most if r.then.smallest >= (1.0 - EQUAL) * largest]
+    return max(equals, key=lambda r: (r.then.determinant, -len(r.new), -len(r.trial.moves)))
+
+
+def _best_steps(ranked: Sequence[Ranked]) -> list[Trial]:
+    """The best single steps at the level of those made so far, each of another input."""
+    found: dict[str, Trial] = {}
+    for r in sorted(ranked, key=_order, reverse=True):
+        if r.trial.kind == "step":
+            found.setdefault(r.trial.inputs[0], r.trial)
+    return list(found.values())[:BEGUN_WITH]
+
+
+def _others(ranked: Sequence[Ranked], best: Ranked) -> Iterator[Ranked]:
+    """The best of each other kind and set of inputs, best first; pairs only where the second step adds something."""
+    shown = {(best.trial.kind, frozenset(best.trial.inputs))}
+    alone: dict[tuple[tuple[Move, ...], tuple[str, ...]], Ranked] = {
+        (r.trial.moves, r.record): r for r in ranked if len(r.trial.moves) == 1
+    }
+    for r in sorted(ranked, key=_order, reverse=True):
+        key = r.trial.kind, frozenset(r.trial.inputs)
+        single = alone.get((r.trial.moves[:1], r.record))
+        if key in shown or (len(r.trial.moves) > 1 and single is not None and not _adds(r, single)):
+            continue
+        shown.add(key)
+        yield r
+        if len(shown) > LISTED:
+            return
+
+
+def _adds(pair: Ranked, single: Ranked) -> bool:
+    return pair.then.seen > single.then.seen or pair.then.determinant > single.then.determinant + ADDED
+
+
+def _order(r: Ranked) -> tuple[int, float, float]:
+    """Directions seen, smallest eigenvalue to a hundredth, determinant: larger is better."""
+    return r.then.seen, round(float(np.log(max(r.then.smallest, 1e-300))), 2), r.then.determinant
+
+
+def _reach(whole: Optimum, thresholds: Mapping[str, float]) -> Array:
+    """(p,): what one standard deviation of a scaled coordinate is worth in the parameter's unit, times the quantile."""
     usual = float(np.median(list(thresholds.values()))) if thresholds else 1.92
-    unit = whole.slope[: len(names)] * np.sqrt([2.0 * thresholds.get(n, usual) for n in names])
-    now, then = _half_widths(base, unit, names), _half_widths(base + best[5], unit, names)
-    return Recommendation(
-        best[1],
-        best[2],
-        best[3],
-        best[4],
-        (_merit(base)[1], best[0][1]),
-        _determinant_gain(base, best[5]),
-        then,
-        now,
-        _text(best[1], best[2], best[3], [o for o in best[4] if o not in recorded], now, then, units),
-        tuple(
-            FrozenMap({"input": t[1], "from": t[2], "to": t[3], "record": list(t[4]), "smallest_eigenvalue": t[0][1]})
-            for t in tried[1:6]
-        ),
-        tuple(failed),
-    )
-
-
-def _steps(experiments: Sequence[Experiment], inputs: Mapping[str, float]) -> Iterator[tuple[str, float, float]]:
-    """Input, value before and after: for each input the largest move made so far, its opposite, and its double."""
-    for name, value in inputs.items():
-        signals = [e.inputs[name] for e in experiments if name in e.inputs and name not in e.drive]
-        moves = [s.values - s.values[0] for s in signals]
-        move = max((float(m[np.argmax(np.abs(m))]) for m in moves), key=abs, default=0.0)
-        move = move or 0.05 * (abs(value) or 1.0)
-        for factor in (1.0, -1.0, 2.0):
-            yield name, value, float(f"{value + factor * move:.12g}")
-
-
-def _experiment(template: Experiment, name: str, before: float, after: float) -> Experiment:
-    """A plain step where the template has its event, over the template's instants."""
-    time = template.time
-    event = template.event if template.event is not None else float(time[0] + 0.1 * np.ptp(time))
-    signal = InputSignal.step(event, before, after)
-    return Experiment(f"step of {name}", time, FrozenMap({name: signal}), event=event)
-
-
-def _information(whole: Optimum, experiment: Experiment) -> dict[str, Array]:
-    """The information of each output of the run, in scaled coordinates."""
-    simulator: Simulator = whole.problem.simulator
-    run = simulator.simulate(experiment, whole.problem.values(whole.theta), whole.names)
-    sigmas = [s for table in whole.problem.sigma.values() for s in table.values()]
-    typical = float(np.median(sigmas))
-    sizes = [np.abs(e.measured[o]).max() for e in whole.problem.fitted_experiments for o in e.outputs if e.measured]
-    unit = {run.trajectory.unit(o) for o in whole.problem.outputs if o in run.trajectory}
-    found = {}
-    for output in run.trajectory.names:
-        known = [t[output] for t in whole.problem.sigma.values() if output in t]
-        relative = typical / max(float(np.median(sizes)), 1e-300) * float(np.abs(run.trajectory[output]).max())
-        sigma = known[0] if known else typical if run.trajectory.unit(output) in unit else relative
-        gradient = run.gradient(output) * whole.slope[: len(whole.names)] / (sigma or typical)
-        if not np.isfinite(gradient).all():
-            raise SimulationError(f"the sensitivity of '{output}' is not finite")
-        found[output] = gradient.T @ gradient
-    return found
-
-
-def _merit(matrix: Array) -> tuple[int, float]:
-    """How many directions are seen, and the smallest eigenvalue."""
-    values = np.linalg.eigvalsh(matrix)
-    return int((values > SENSITIVITY_ERROR**2 * max(values[-1], 1e-300)).sum()), float(max(values[0], 0.0))
-
-
-def _determinant_gain(base: Array, more: Array) -> float:
-    """Log of the ratio of the determinants after and before; infinite where a new direction is seen."""
-    now, then = _merit(base), _merit(base + more)
-    if now[0] < base.shape[0]:
-        return float("inf") if then[0] > now[0] else 0.0
-    return float(np.linalg.slogdet(base + more)[1] - np.linalg.slogdet(base)[1])
-
-
-def _half_widths(matrix: Array, unit: Array, names: Sequence[str]) -> FrozenMap[float | None]:
-    """Half the linear 95 % interval by parameter; None where it is not determined, or wider than any range.
-
-    unit: (p,) what one standard deviation of a scaled coordinate is worth, times the interval's quantile.
-    """
-    values, vectors = np.linalg.eigh(matrix)
-    good = values > SENSITIVITY_ERROR**2 * max(values[-1], 1e-300)
-    lost = (vectors[:, ~good] ** 2).sum(axis=1) > 1e-6
-    variance = (vectors[:, good] ** 2 / values[good]).sum(axis=1)
-    half = np.sqrt(variance)
-    return FrozenMap({n: None if lost[i] or half[i] > 1e3 else float(half[i] * unit[i]) for i, n in enumerate(names)})
-
-
-def _text(
-    name: str,
-    before: float,
-    after: float,
-    new: Sequence[str],
-    now: Mapping[str, float | None],
-    then: Mapping[str, float | None],
-    units: Mapping[str, str],
-) -> str:
-    """The advice and what it would give for the parameter that gains most."""
-
-    def gain(n: str) -> float:
-        a, b = now[n], then[n]
-        return 0.0 if b is None else np.inf if a is None else a / b
-
-    most = max(then, key=gain)
-    record = f" and record {', '.join(new)} too" if new else ", recording the same signals"
-    text = f"Step {name} from {before:g} to {after:g} {units.get(name, '')}".rstrip() + record
-    if then[most] is None:
-        return f"{text}; no single step of an input makes every parameter visible."
-    was = "not at all" if now[most] is None else f"to ±{now[most]:.3g}"
-    return f"{text}: {most} would be known to ±{then[most]:.3g} {units.get(most, '')}".rstrip() + f" (now {was})."
+    return whole.slope[: len(whole.names)] * np.sqrt([2.0 * thresholds.get(n, usual) for n in whole.names])

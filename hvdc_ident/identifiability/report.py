@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from html import escape
 from typing import Any
 
 import numpy as np
 
+from hvdc_ident.errors import ComputationError, unknown_name
+from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import Profile
 from hvdc_ident.fit.profile_pair import PairProfile
 from hvdc_ident.fit.result import plain
@@ -32,7 +35,8 @@ class IdentifiabilityReport:
     parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
     reason of each other one. combinations: what is seen of those that cannot be told apart. collinear: subsets with
     their index, worst first within each size. shares: of each parameter's information, by experiment.
-    pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the search met.
+    pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
+    search met. bootstrap: the estimates of the set fitted, from experiments drawn anew, where there are enough.
     """
 
     parameters: FrozenMap[Verdict]
@@ -50,6 +54,7 @@ class IdentifiabilityReport:
     pilot: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     pair: PairProfile | None = None
+    bootstrap: Bootstrap | None = None
 
     @property
     def conditional_on(self) -> dict[str, tuple[str, ...]]:
@@ -93,10 +98,64 @@ class IdentifiabilityReport:
             "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
             "pair": self.pair,
+            "bootstrap": _bootstrap(self.bootstrap),
             "pilot": self.pilot,
             "notes": [*self.notes, CONDITIONS],
         }
         return {k: plain(v) for k, v in found.items()}
+
+    def plot(self, parameter: str | None = None, ax: Any = None) -> Any:
+        """Axes with one parameter's profile; without a name, with the interval and the verdict of every candidate.
+
+        Raises UnknownNameError for a name that is no candidate, ComputationError for one that has no profile.
+        """
+        import matplotlib.pyplot as plt
+
+        from hvdc_ident.identifiability.plots import draw_intervals, draw_profile
+
+        found = self.to_dict()
+        if parameter is not None and parameter not in found["parameters"]:
+            raise unknown_name("candidate", parameter, found["parameters"])
+        if parameter is not None and parameter not in found["profiles"]:
+            reason = found["parameters"][parameter]["reason"]
+            raise ComputationError(f"{parameter} has no profile", got=reason, hint="plot() shows every verdict")
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        if parameter is None:
+            draw_intervals(axes, found["parameters"])
+        else:
+            draw_profile(axes, parameter, found["profiles"][parameter], found["parameters"][parameter])
+        return axes
+
+    def __str__(self) -> str:
+        width = max(map(len, self.parameters), default=0)
+        lines = [f"{n:{width}}  {v.verdict}: {v.reason}" for n, v in self.parameters.items()]
+        if self.misspecification.flag:
+            lines.append(f"The model does not explain these data: {'; '.join(self.misspecification.signs)}.")
+        if self.recommended is not None:
+            lines.append(f"Measure next: {self.recommended.text}")
+        return "\n".join([*lines, *self.notes, CONDITIONS])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{escape(n)}</td><td>{v.verdict}</td><td>{v.value:.6g} {escape(v.unit)}</td>"
+            f"<td style='text-align:left'>{escape(v.reason)}</td></tr>"
+            for n, v in self.parameters.items()
+        )
+        rest = escape(str(self)).split("\n")[len(self.parameters) :]
+        head = "<tr><th>parameter</th><th>verdict</th><th>value</th><th>why</th></tr>"
+        return f"<table>{head}{rows}</table>" + "".join(f"<p>{line}</p>" for line in rest)
+
+
+def _bootstrap(b: Bootstrap | None) -> dict[str, Any] | None:
+    if b is None:
+        return None
+    return {
+        "samples": len(b.values),
+        "failed": b.failed,
+        "experiments": b.experiments,
+        "ci95": {n: list(interval) for n, interval in b.ci95().items()},
+        "std": b.std(),
+    }
 
 
 def _verdict(v: Verdict) -> dict[str, Any]:
@@ -105,7 +164,9 @@ def _verdict(v: Verdict) -> dict[str, Any]:
         "reason": v.reason,
         "value": v.value,
         "unit": v.unit,
+        "scale": v.scale,
         "ci95": v.ci95,
+        "ci95_experiments": v.ci95_experiments,
         "std": v.std,
         "relative_std": v.relative_std,
         "sensitivity_norm": v.sensitivity_norm,

@@ -8,17 +8,15 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.errors import SimulationError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Problem
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.identifiability.combinations import Combination, combinations_of
+from hvdc_ident.identifiability.combinations import Combination
+from hvdc_ident.identifiability.local_rank import METHOD, local_rank
 from hvdc_ident.model.definition import Model
-from hvdc_ident.sensitivity.fisher import independent, null_directions
+from hvdc_ident.sensitivity.rank.combination import Combination as Found
 from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
-from hvdc_ident.trajectory import Array
 
-POINTS = 5
 SECONDS = 5.0
 """How long the symbolic test may take."""
 
@@ -41,6 +39,11 @@ class Structure:
     unmoved: tuple[str, ...] = ()
 
     @property
+    def local(self) -> bool:
+        """Whether that was found from numbers at some points, so that other points might show more."""
+        return self.method.endswith("local")
+
+    @property
     def unidentifiable(self) -> tuple[str, ...]:
         """Members of any combination."""
         return tuple(dict.fromkeys(n for c in self.combinations for n in c.members))
@@ -49,6 +52,8 @@ class Structure:
 def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure:
     """The structure from the model's equations where there are any and the test comes to an end, else from numbers.
 
+    Numbers decide, locally, where there are no equations, or the equations have parts that the test does not reach
+    (delays, sampling, recordings played in, instruments); where it ran out of time they stand in, undecided.
     Where the equations lose a combination that the numbers, with all experiments together, tell apart, the numbers are
     right: several operating points show more than one does. A parameter of which nothing at all is seen with the inputs
     that were moved is structural only where no other input would show it; else it is left to the data's verdict.
@@ -59,9 +64,11 @@ def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure
     names = tuple(f.name for f in problem.free)
     outputs = problem.outputs
     if any(e.drive or e.instrument for e in problem.fitted_experiments):
-        return _undecided(numbers, "slots are driven by recordings, or outputs seen through instruments")
+        return _by_numbers(numbers, "slots are driven by recordings, or outputs seen through instruments")
     moved = moves(problem.fitted_experiments)
     result = structural_identifiability(model, names, outputs, inputs=moved, seed=seed, time_limit=SECONDS)
+    if result.out_of_reach:
+        return _by_numbers(numbers, result.reason)
     if result.status != "decided":
         return _undecided(numbers, result.reason)
     alone = [c.members[0] for c in result.combinations if len(c.members) == 1]
@@ -99,69 +106,32 @@ def _hidden(model: Model, alone: Sequence[str], names: Sequence[str], outputs: S
     return {n for n in alone if any(c.members == (n,) for c in wide.combinations)}
 
 
-def _combination(c: object) -> Combination:
-    members, seen = tuple(c.members), tuple(c.seen)  # type: ignore[attr-defined]
-    rows = c.directions  # type: ignore[attr-defined]
-    direction = FrozenMap(zip(members, map(float, rows[0]), strict=True)) if rows else FrozenMap()
-    return Combination(members, seen, "structural", direction, text="" if seen else c.words)  # type: ignore[attr-defined]
+def _combination(c: Found) -> Combination:
+    direction: FrozenMap[float] = (
+        FrozenMap(zip(c.members, c.directions[0], strict=True)) if c.directions else FrozenMap()
+    )
+    return Combination(c.members, c.seen, "structural", direction, text="" if c.seen else c.words)
+
+
+def _by_numbers(numbers: Structure, why: str) -> Structure:
+    """The structure from numbers, with the remark why not from the equations."""
+    return replace(
+        numbers,
+        note="; ".join(
+            [f"from the sensitivities at random points, because {why}", *([numbers.note] if numbers.note else [])]
+        ),
+    )
 
 
 def _undecided(numbers: Structure, why: str) -> Structure:
-    note = f"the equations did not decide ({why}); the sensitivities at {POINTS} random points stand in for them"
+    note = f"the equations did not decide ({why}); the sensitivities at random points stand in for them"
     return replace(numbers, status="not decided", note=note)
 
 
 def numerical_structure(problem: Problem, seed: int = 0) -> Structure:
-    """The structure from the rank of the sensitivities at five random points: what is lost at all of them.
-
-    Local, and for the inputs of these experiments. A parameter that is not seen at all is left to the data's verdict.
-    Points that cannot be simulated are passed over; with none left the structure is not decided.
-    """
+    """The structure from the rank of the sensitivities at random points, for anything that can be simulated: local."""
+    found = local_rank(problem, seed)
     names = tuple(f.name for f in problem.free)
-    k, stacked, space = len(names), [], None
-    for theta in _points(problem, seed):
-        try:
-            _, jacobian = problem.residual(theta)
-        except SimulationError:
-            continue
-        space = _slope(problem, theta) if space is None else space
-        stacked.append(jacobian * _slope(problem, theta))
-    if not stacked or space is None:
-        return Structure("not decided", "numerical, local", names, note="no random point could be simulated")
-    ranks = [null_directions(j).shape[0] for j in stacked]
-    if min(ranks) == 0:
-        return Structure("decided", "numerical, local", names)
-    scaled = np.vstack([j / np.maximum(np.linalg.norm(j), 1e-300) for j in stacked])
-    null = null_directions(scaled)
-    null = null[:, :k][(np.abs(null[:, :k]) > 0).any(axis=1)]
-    if not null.size:  # the direction turns from place to place: take it where the least is lost
-        null = null_directions(stacked[int(np.argmin(ranks))])[:, :k]
-        null = null[(np.abs(null) > 0).any(axis=1)]
-    if not null.size:
-        return Structure("decided", "numerical, local", names)
-    logs = [f.min > 0 for f in problem.free]
-    combos = combinations_of(null, names, logs, [f.start for f in problem.free], "structural")
-    involved = [i for i, n in enumerate(names) if any(n in c.members for c in combos)]
-    matrix = scaled[:, :k].T @ scaled[:, :k]
-    free = [i for i in range(k) if i not in involved]
-    kept = {*free, *(involved[i] for i in independent(matrix[np.ix_(involved, involved)]))}
-    return Structure("decided", "numerical, local", tuple(names[i] for i in sorted(kept)), combos)
-
-
-def _points(problem: Problem, seed: int) -> Sequence[Array]:
-    random = np.random.default_rng(seed)
-    rows = []
-    for _ in range(POINTS):
-        rows.append(
-            np.array(
-                [
-                    u.draw(float(s))
-                    for u, s in zip(problem.unknowns, random.uniform(0.2, 0.8, len(problem.unknowns)), strict=True)
-                ]
-            )
-        )
-    return rows
-
-
-def _slope(problem: Problem, theta: Array) -> Array:
-    return np.array([v if u.min > 0 else u.span for u, v in zip(problem.unknowns, theta, strict=True)])
+    if not found.points:
+        return Structure("not decided", METHOD, names, note="no random point could be simulated")
+    return Structure("decided", METHOD, found.independent, found.combinations, found.note)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from math import log10
 from typing import Literal
 
+from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import Profile
 from hvdc_ident.fit.unknown import Free
 
@@ -15,6 +16,8 @@ VerdictName = Literal[
 ]
 WIDE = 0.5
 """A half-width of more than this share of the value (of the range where 0 is admissible) makes a parameter weak."""
+WIDER = 1.5
+"""A bootstrap's interval that is so many times wider than the profile's is worth a remark."""
 COLLINEAR = 20.0
 """A standard deviation that the other parameters make so many times larger makes it weak; half of that is worded."""
 
@@ -26,7 +29,8 @@ class Verdict:
     value: at the optimum; of a held one, what it is held at. ci95: from the profile; an end that is None is not known.
     std, relative_std: only of identifiable ones. sensitivity_norm: of its whitened, scaled column. collinearity: by how
     much the others widen its standard deviation. partner: the one most collinear with it. conditional_on: parameters
-    held without which it could not be told. profile: the evidence.
+    held without which it could not be told. profile: the evidence. ci95_experiments: from experiments drawn anew.
+    scale: what widths are compared with, the value or, where 0 is admissible, the range.
     """
 
     name: str
@@ -42,10 +46,22 @@ class Verdict:
     partner: str = ""
     conditional_on: tuple[str, ...] = ()
     profile: Profile | None = None
+    ci95_experiments: tuple[float, float] | None = None
+    scale: float | None = None
 
     def noted(self, *notes: str) -> Verdict:
         """The verdict with remarks added to its reason."""
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
+
+    def scattered(self, interval: tuple[float, float], over: Bootstrap) -> Verdict:
+        """The verdict with the interval from experiments drawn anew, and a remark where that is much the wider."""
+        found = replace(self, ci95_experiments=interval)
+        low, high = self.ci95 or (None, None)
+        if low is None or high is None or interval[1] - interval[0] < WIDER * (high - low):
+            return found
+        half = 0.5 * (interval[1] - interval[0])
+        span = f"{_digits(interval[0], half)} … {_digits(interval[1], half)} {self.unit}".rstrip()
+        return found.noted(f"Drawn anew, the {over.experiments} experiments scatter it wider: {span}.")
 
 
 def structural(
@@ -117,28 +133,19 @@ def closed(
     assert low is not None and high is not None
     half = 0.5 * (high - low)
     share, of = (half / abs(profile.value), "of its value") if free.min > 0 else (half / free.span, "of its range")
-    common = {"collinearity": collinearity, "partner": partner, "profile": profile}
+    judged = Verdict(profile.name, "weak", "", profile.value, unit, (low, high), profile=profile)
+    judged = replace(judged, collinearity=collinearity, partner=partner)
     span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
     if share > WIDE or collinearity > COLLINEAR:
         told = f"It is known only to lie in {span}, ±{100 * share:.3g} % {of}"
         if collinearity > COLLINEAR:
             told += f", and {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
-        return Verdict(profile.name, "weak", f"{told}.", profile.value, unit, (low, high), **common)  # type: ignore[arg-type]
+        return replace(judged, reason=f"{told}.")
     text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
     if collinearity > 0.5 * COLLINEAR:
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
     relative = std / abs(profile.value) if profile.value else None
-    return Verdict(
-        profile.name,
-        "identifiable",
-        f"{text}.",
-        profile.value,
-        unit,
-        (low, high),
-        std,
-        relative,
-        **common,  # type: ignore[arg-type]
-    )
+    return replace(judged, verdict="identifiable", reason=f"{text}.", std=std, relative_std=relative)
 
 
 def _digits(value: float, half: float) -> str:

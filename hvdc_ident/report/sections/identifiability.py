@@ -6,7 +6,7 @@ from typing import Any
 
 from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.profiles import pair_map, profiles
+from hvdc_ident.report.profiles import intervals, pair_map, profiles
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
@@ -34,24 +34,30 @@ def _lead(found: dict[str, Any]) -> str:
 
 
 def _verdicts(parameters: dict[str, Any]) -> str:
+    drawn_anew = any(v.get("ci95_experiments") for v in parameters.values())
     rows = []
     for name, v in parameters.items():
-        low, high = v.get("ci95") or (None, None)
-        interval = f"{number(low)} … {number(high)}" if v.get("ci95") else "–"
-        rows.append(
-            [
-                f"<strong>{text(name)}</strong>",
-                text(v.get("verdict", "")),
-                number(v.get("value")),
-                interval,
-                text(v.get("unit", "")),
-                number(v.get("collinearity"), 3),
-                text(v.get("partner") or "–"),
-                text(v.get("reason", "")),
-            ]
-        )
-    header = ["parameter", "verdict", "value", "95 % interval", "unit", "collinearity", "with", "why"]
-    return table(header, rows, words=(0, 1, 4, 6, 7))
+        cells = {
+            "parameter": f"<strong>{text(name)}</strong>",
+            "verdict": text(v.get("verdict", "")),
+            "value": number(v.get("value")),
+            "95 % interval": _interval(v.get("ci95")),
+            "experiments drawn anew": _interval(v.get("ci95_experiments")),
+            "unit": text(v.get("unit", "")),
+            "collinearity": number(v.get("collinearity"), 3),
+            "with": text(v.get("partner") or "–"),
+            "why": text(v.get("reason", "")),
+        }
+        if not drawn_anew:
+            del cells["experiments drawn anew"]
+        rows.append(cells)
+    header = list(rows[0])
+    words = [i for i, h in enumerate(header) if h in ("parameter", "verdict", "unit", "with", "why")]
+    return table(header, [list(r.values()) for r in rows], words=words)
+
+
+def _interval(ends: list[float | None] | None) -> str:
+    return f"{number(ends[0], 5)} … {number(ends[1], 5)}" if ends else "–"
 
 
 def _model(found: dict[str, Any]) -> str:
@@ -68,8 +74,10 @@ def _pictures(found: dict[str, Any]) -> str:
         return ""
     both = found.get("pair")
     more = svg(pair_map(both, found.get("parameters") or {}), "common profile of two parameters") if both else ""
-    picture = svg(profiles(drawn, found.get("parameters") or {}), "profiles of the cost by parameter")
-    return f"<h3>Profiles</h3><figure>{picture}{more}</figure>"
+    parameters = found.get("parameters") or {}
+    picture = svg(profiles(drawn, parameters), "profiles of the cost by parameter")
+    summed = svg(intervals(parameters), "intervals of the parameters")
+    return f"<h3>Profiles</h3><figure>{summed}</figure><figure>{picture}{more}</figure>"
 
 
 def _experiments(found: dict[str, Any]) -> str:
@@ -86,7 +94,40 @@ def _experiments(found: dict[str, Any]) -> str:
 
 def _next(found: dict[str, Any]) -> str:
     advice = found.get("recommended_experiment") or {}
-    return f"<p><strong>What to measure next.</strong> {text(advice['text'])}</p>" if advice.get("text") else ""
+    if not advice.get("text"):
+        return ""
+    lead = f"<h3>What to measure next</h3><p>{text(advice['text'])}</p>"
+    failed = advice.get("failed") or []
+    if failed:
+        lead += (
+            f"<p class='small'>Could not be simulated: {text('; '.join(failed[:3]))}{' …' if failed[3:] else ''}.</p>"
+        )
+    lines = [advice, *(advice.get("others") or [])]
+    if not advice.get("moves") or len(lines) < 2:
+        return lead
+    rows = [
+        [
+            text("; then ".join(_move(m) for m in line["moves"])),
+            text(", ".join(line["new_signals"]) or "–"),
+            number(_times(line["smallest_eigenvalue"]), 3),
+            number(line["determinant_gain"], 3),
+        ]
+        for line in lines
+    ]
+    header = ["experiment", "also record", "smallest eigenvalue, times", "gain of ln determinant"]
+    note = (
+        "<p class='small'>Best first, the best of each kind and input. To first order, with noise as in the recordings; of a "
+        "signal not recorded so far, as on others of its unit.</p>"
+    )
+    return lead + table(header, rows, words=(0, 1)) + note
+
+
+def _move(m: dict[str, Any]) -> str:
+    return f"{m['shape']} of {m['input']}, {m['from']:g} to {m['to']:g}"
+
+
+def _times(eigenvalue: dict[str, Any]) -> float | None:
+    return eigenvalue["then"] / eigenvalue["now"] if eigenvalue.get("now") and eigenvalue.get("then") else None
 
 
 def _capital(words: str) -> str:

@@ -1,0 +1,57 @@
+"""What an assessment has found so far: verdicts, what is held and why, combinations, remarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit.estimate import Progress
+from hvdc_ident.fit.profile import Walk
+from hvdc_ident.identifiability.combinations import Combination
+from hvdc_ident.identifiability.pilot import Optimum
+from hvdc_ident.identifiability.verdicts import Verdict
+
+
+@dataclass
+class Findings:
+    """One assessment's findings; it grows while the assessment runs.
+
+    problem: all candidates free. found: the first verdict on each. held: reason by parameter. remark: said of every
+    parameter. quiet: whether no input moves. unmoved: parameters that show only where an input is moved that was not.
+    """
+
+    problem: Problem
+    seed: int = 0
+    walk: Walk = field(default_factory=Walk)
+    progress: Progress | None = None
+    found: dict[str, Verdict] = field(default_factory=dict)
+    held: dict[str, str] = field(default_factory=dict)
+    combinations: list[Combination] = field(default_factory=list)
+    thresholds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    remark: str = ""
+    quiet: bool = False
+    unmoved: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.free: dict[str, Free] = {f.name: f for f in self.problem.free}
+        self.units = {n: self.problem.simulator.parameters[n].unit for n in self.free}
+
+    def tell(self, text: str) -> None:
+        """Says what is being done, to whoever watches."""
+        if self.progress:
+            self.progress(0, 1, text)
+
+    def judge(self, verdict: Verdict) -> None:
+        """Notes the verdict, unless there is one on that parameter already."""
+        self.found.setdefault(verdict.name, verdict)
+
+    def without(self, optimum: Optimum, out: Mapping[str, str]) -> Optimum | None:
+        """The optimum with those held at their start values, with their reasons; None where nothing is left."""
+        if not out:
+            return optimum
+        self.held |= out
+        if len(out) == len(optimum.names):
+            return None
+        return optimum.held(out, {n: self.free[n].start for n in out})

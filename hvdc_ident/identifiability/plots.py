@@ -1,0 +1,81 @@
+"""Drawings of a report's own numbers, as its JSON has them, on axes that are given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.trajectory import Array
+
+LINE, MARK, HELD = "#1f5fa8", "#999999", "#b0b0b0"
+FINEST = 1e-4
+"""%: below this the axis of the intervals is linear."""
+
+
+def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapping[str, Any]) -> None:
+    """The rise of the cost over one parameter, in units of the 95 % level, with the interval's ends."""
+    x, y = np.array(profile["values"], dtype=float), np.array(profile["rises"], dtype=float) / profile["threshold"]
+    axes.plot(*_joined(x, y), color=LINE, linewidth=1.2)
+    axes.plot(x, y, color=LINE, linewidth=0, marker="o", markersize=2.5)
+    axes.axhline(1.0, color=MARK, linewidth=0.8, linestyle="--")
+    for end in ("lower", "upper"):
+        if profile[end]["limit"] is not None:
+            axes.axvline(profile[end]["limit"], color=MARK, linewidth=0.7, linestyle=":")
+    axes.set_xlabel(_labelled(name, verdict), fontsize=8)
+    axes.set_ylabel("rise of the cost / 95 % level", fontsize=8)
+    axes.set_title(str(verdict.get("verdict", "")), fontsize=8)
+    axes.set_ylim(-0.05, min(max(1.6, float(np.nanmax(y, initial=0.0)) * 1.05), 4.0))
+    axes.ticklabel_format(axis="x", useOffset=False)
+    _plain(axes)
+
+
+def _joined(x: Array, y: Array) -> tuple[Array, Array]:
+    """The points joined by pieces of parabolas: straight lines in the signed root of the rise."""
+    root = np.sqrt(np.clip(y, 0.0, None)) * np.where(x < x[int(np.argmin(y))], -1.0, 1.0)
+    dense = np.unique(np.concatenate([x, np.linspace(x[0], x[-1], 200)]))
+    return dense, np.interp(dense, x, root) ** 2
+
+
+def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> None:
+    """One line a candidate: its 95 % interval about the value, in % of its scale, open ends as arrows; the verdict."""
+    names = list(parameters)
+    ends = {n: _relative(parameters[n]) for n in names}
+    known = [abs(e) for pair in ends.values() if pair is not None for e in pair if e is not None and e != 0]
+    smallest, reach = max(min(known, default=1.0), FINEST), 3.0 * max([*known, 1.0])
+    for row, name in enumerate(names):
+        pair = ends[name]
+        if pair is None:
+            axes.plot([0.0], [row], marker="x", color=HELD)
+            continue
+        low, high = (edge if e is None else e for e, edge in zip(pair, (-reach, reach), strict=True))
+        axes.plot([low, high], [row, row], color=LINE, linewidth=2)
+        axes.plot([0.0], [row], marker="o", color=LINE, markersize=4)
+        for end, at, arrow in ((pair[0], low, "<"), (pair[1], high, ">")):
+            axes.plot([at], [row], marker="|" if end is not None else arrow, color=LINE, markersize=8)
+    axes.set_xscale("symlog", linthresh=smallest)
+    axes.set_xlim(-1.5 * reach, 1.5 * reach)
+    axes.set_yticks(range(len(names)), [f"{n}\n{parameters[n]['verdict']}" for n in names], fontsize=7)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlabel("95 % interval, % of the value (of the range where 0 is admissible); x: held", fontsize=8)
+    _plain(axes)
+
+
+def _relative(verdict: Mapping[str, Any]) -> tuple[float | None, float | None] | None:
+    """The interval's ends about the value, in %; None where there is no interval."""
+    if not verdict.get("ci95") or verdict["value"] is None:
+        return None
+    value, scale = float(verdict["value"]), float(verdict.get("scale") or 1.0)
+    low, high = (None if e is None else 100.0 * (float(e) - value) / scale for e in verdict["ci95"])
+    return low, high
+
+
+def _labelled(name: str, verdict: Mapping[str, Any]) -> str:
+    return f"{name}, {verdict['unit']}" if verdict.get("unit") else name
+
+
+def _plain(axes: Any) -> None:
+    axes.tick_params(labelsize=7)
+    axes.grid(True, color="#e4e4e4", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)

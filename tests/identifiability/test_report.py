@@ -1,0 +1,107 @@
+"""The report as an object: drawings, words, JSON; the bootstrap over experiments beside the profile."""
+
+from __future__ import annotations
+
+import json
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import ComputationError, UnknownNameError
+from hvdc_ident.fit import Free
+from hvdc_ident.identifiability import identifiability
+from tests.fit.simulators import line
+from tests.identifiability.cases import closed, line_and_nothing, measured
+
+mpl.use("Agg")
+LINE = closed(line, a=0.0, b=0.0)
+FREE = (Free("a", 0, -50, 50), Free("b", 0, -50, 50))
+
+
+def runs(slopes, noise=0.05):
+    return [measured(LINE, {"a": 1, "b": b}, noise, k, f"e{k}") for k, b in enumerate(slopes)]
+
+
+@pytest.fixture(scope="module")
+def report():
+    plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
+    free = [Free("a", 0.5, 0.1, 5), Free("b", 0, -5, 5), Free("c", 1.0, -100, 100)]
+    return identifiability(plant, [measured(plant, {"a": 1, "b": 2}, 0.01)], free, starts=1)
+
+
+def test_plot_draws_on_the_axes_it_is_given_and_returns_them(report) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, given = plt.subplots()
+    assert report.plot(ax=given) is given
+    labels = [t.get_text() for t in given.get_yticklabels()]
+    assert labels == ["a\nidentifiable", "b\nidentifiable", "c\ninsensitive"]
+    assert "% of the value" in given.get_xlabel()
+    alone = report.plot("a")
+    assert alone.get_xlabel() == "a" and alone.figure is not figure
+    ends = {round(float(v), 9) for x in alone.lines for v in np.asarray(x.get_xdata(), dtype=float)}
+    assert {round(v, 9) for v in report.parameters["a"].ci95} <= ends
+    with pytest.raises(UnknownNameError, match="no candidate 'd'"):
+        report.plot("d")
+    with pytest.raises(ComputationError, match="c has no profile"):
+        report.plot("c")
+    plt.close("all")
+
+
+def test_intervals_are_drawn_in_shares_of_what_they_are_judged_by(report) -> None:
+    import matplotlib.pyplot as plt
+
+    axes = report.plot()
+    low, high = report.parameters["b"].ci95
+    drawn = [np.asarray(x.get_xdata(), dtype=float) for x in axes.lines if list(x.get_ydata()) == [1, 1]]
+    assert drawn[0] == pytest.approx([100 * (e - report.parameters["b"].value) / 10 for e in (low, high)])
+    assert report.parameters["b"].scale == 10 and report.parameters["a"].scale == report.parameters["a"].value
+    plt.close("all")
+
+
+def test_words_and_notebook_show_every_verdict(report) -> None:
+    said, shown = str(report), report._repr_html_()
+    for n, v in report.parameters.items():
+        assert v.reason in said and f"<td>{n}</td><td>{v.verdict}</td>" in shown
+    assert shown.startswith("<table>") and "Every verdict holds for these outputs" in shown
+
+
+def test_enough_experiments_are_drawn_anew() -> None:
+    scattered = identifiability(LINE, runs(2 + 0.3 * np.random.default_rng(3).normal(size=8)), FREE, starts=1)
+    b = scattered.parameters["b"]
+    low, high = b.ci95_experiments
+    assert low < b.value < high and scattered.bootstrap.experiments == 8 and len(scattered.bootstrap.values) == 200
+    found = scattered.to_dict()
+    assert found["parameters"]["b"]["ci95_experiments"] == found["bootstrap"]["ci95"]["b"] == [low, high]
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    agreeing = identifiability(LINE, runs([2.0] * 8), FREE, starts=1).parameters["b"]
+    width, profile = np.ptp(agreeing.ci95_experiments), np.ptp(agreeing.ci95)
+    assert 0.4 < width / profile < 1.5 and "Drawn anew" not in agreeing.reason
+    assert width < 0.5 * (high - low)
+
+
+def test_too_few_experiments_are_not_drawn_anew() -> None:
+    report = identifiability(LINE, runs([2.0] * 4), FREE, starts=1)
+    assert report.bootstrap is None and report.to_dict()["bootstrap"] is None
+    assert report.parameters["b"].ci95_experiments is None
+
+
+def test_a_parameter_that_few_experiments_tell_of_is_not_drawn_anew() -> None:
+    """b shows in one of six records alone: samples without that one would know nothing of it."""
+    early = np.linspace(0, 1e-3, 50)
+    data = [measured(LINE, {"a": 1, "b": 2}, 0.01, k, f"e{k}", t=early) for k in range(5)]
+    report = identifiability(LINE, [*data, measured(LINE, {"a": 1, "b": 2}, 0.01, 9, "long", t=early * 1e3)], FREE)
+    assert report.bootstrap.names == ("a",) and report.parameters["b"].ci95_experiments is None
+    assert any("b stay" in n for n in report.notes)
+    alone = identifiability(LINE, [*data], (FREE[1],), held={"a": 1.0}, starts=1)
+    assert alone.bootstrap is None or alone.bootstrap.names == ("b",)
+
+
+def test_a_wider_scatter_is_remarked() -> None:
+    """With noise taken from the misfit the profile does not see that it is the experiments that differ."""
+    slopes = 2 + 0.15 * np.random.default_rng(1).normal(size=9)
+    data = [e.with_(noise={}) for e in runs(slopes, 0.05)]
+    b = identifiability(LINE, data, FREE, starts=1).parameters["b"]
+    assert np.ptp(b.ci95_experiments) > 1.5 * np.ptp(b.ci95)
+    assert "the 9 experiments scatter it wider" in b.reason
