@@ -25,12 +25,17 @@ def with_recording(model: Model, experiment: Experiment) -> Model:
 
 @lru_cache(maxsize=32)
 def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[FrozenMap[float]]) -> Model:
+    return model.driven(drive).with_effects(chains_of(instrument))
+
+
+def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
+    """The recording chains as effects at the outputs: what the instrument does to the signal, in its order."""
     chains = []
     for output, chain in instrument.items():
         for name in ("window-mean", "delay"):
             if chain.get(name):
                 chains.append(EffectUse(name, (f"outputs.{output}",), FrozenMap({"T": chain[name]})))
-    return model.driven(drive).with_effects(chains)
+    return chains
 
 
 def with_offsets(model: Model, inputs: Sequence[str]) -> tuple[Model, FrozenMap[str]]:
