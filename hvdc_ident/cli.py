@@ -38,6 +38,12 @@ Out = Annotated[
     typer.Option("--out", metavar="DIR", help="Folder for results; default STUDY-results.", show_default=False),
 ]
 Workers = Annotated[int, typer.Option("--workers", metavar="N", min=1, max=4096, help="Processes to work with.")]
+Where = Annotated[
+    str,
+    typer.Option(
+        "--executor", metavar="WHERE", help="local, or dask://HOST:PORT: where the work is done.", show_default=False
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, max=2**31 - 1, help="Seed of every random number.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
@@ -119,6 +125,7 @@ def demo(
         Path, typer.Option("--out", metavar="DIR", help="Folder for study, data, results and report.")
     ] = Path("hvdc-ident-demo"),
     workers: Workers = 1,
+    executor: Where = "",
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -130,7 +137,7 @@ def demo(
 
     with progress(quiet or json) as told:
         study = load_study(write_demo(out, seed=seed, progress=told))
-        done = _run_all(study, out, Options(workers, seed, told))
+        done = _run_all(study, out, Options(workers, seed, told, executor=executor))
     _tell_run(study, out, done, json=json, quiet=quiet)
 
 
@@ -173,6 +180,7 @@ def run_(
     study: StudyFile,
     out: Out = None,
     workers: Workers = 1,
+    executor: Where = "",
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -188,7 +196,7 @@ def run_(
     loaded = load_study(study, trust)
     folder = out or loaded.folder
     with progress(quiet or json) as told:
-        done = _run_all(loaded, folder, Options(workers, seed, told))
+        done = _run_all(loaded, folder, Options(workers, seed, told, executor=executor))
     _tell_run(loaded, folder, done, json=json, quiet=quiet)
 
 
@@ -236,6 +244,8 @@ def _run_one(
         done = run_stage(loaded, stage.name, folder, replace(options, progress=told))
     if json:
         _print_json(done.data)
+    for line in () if done.failed else stage.tell(done.data):
+        _say(line, json=json, quiet=quiet)
     _say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}", json=json, quiet=quiet)
     if done.failed:
         raise _Failed(f"{stage.name}: {done.failed}")
@@ -248,24 +258,26 @@ def _add_stage(stage: Stage) -> None:
         study: StudyFile,
         out: Out = None,
         workers: Workers = 1,
+        executor: Where = "",
         seed: Seed = 0,
         json: Json = False,
         quiet: Quiet = False,
         trust: Trust = False,
     ) -> None:
-        _run_one(stage, study, out, Options(workers, seed), json=json, quiet=quiet, trust=trust)
+        _run_one(stage, study, out, Options(workers, seed, executor=executor), json=json, quiet=quiet, trust=trust)
 
     def forcing(
         study: StudyFile,
         force: Force = None,
         out: Out = None,
         workers: Workers = 1,
+        executor: Where = "",
         seed: Seed = 0,
         json: Json = False,
         quiet: Quiet = False,
         trust: Trust = False,
     ) -> None:
-        options = Options(workers, seed, force=tuple(dict.fromkeys(force or ())))
+        options = Options(workers, seed, force=tuple(dict.fromkeys(force or ())), executor=executor)
         _run_one(stage, study, out, options, json=json, quiet=quiet, trust=trust)
 
     made = forcing if "force" in stage.takes else command
@@ -338,7 +350,8 @@ def convert(
         Path, typer.Argument(metavar="DATA", help="A file of waveforms in any known format.", show_default=False)
     ],
     to: Annotated[
-        Path | None, typer.Option("--to", metavar="FILE.csv", help="The CSV or Parquet file to write.", show_default=False)
+        Path | None,
+        typer.Option("--to", metavar="FILE.csv", help="The CSV or Parquet file to write.", show_default=False),
     ] = None,
     signal: Annotated[
         list[str] | None, typer.Option("--signal", metavar="NAME", help="A signal wanted; default all.")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ class Options:
     """How stages run. workers: processes; seed: of every random number; progress: who is told.
 
     force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
-    None: nothing is kept.
+    None: nothing is kept. executor: where the work is done, "" for this machine.
     """
 
     workers: int = 1
@@ -40,6 +40,7 @@ class Options:
     progress: Progress = silent
     force: tuple[str, ...] = ()
     folder: Path | None = None
+    executor: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,11 @@ class Outcome:
     failed: str = ""
 
 
+def no_lines(data: Mapping[str, Any]) -> Sequence[str]:
+    """Nothing: a result that is told by where it stands."""
+    return ()
+
+
 @dataclass(frozen=True)
 class Stage:
     """One stage.
@@ -61,7 +67,8 @@ class Stage:
     name: its command. file: its JSON in DIR. run: the work, given the study, the options and the data of the stages it
     builds on, by name; what the study lacks for it is a StudyError. wanted: whether `run STUDY` includes it.
     after: the stages it builds on; they run first. order: place among the stages of a run.
-    takes: names of `Options` that only some stages have and that decide its result.
+    takes: names of `Options` that only some stages have and that decide its result. tell: the result in lines for people,
+    from its JSON.
     """
 
     name: str
@@ -72,6 +79,7 @@ class Stage:
     order: int
     after: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
+    tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
 
 
 @cache

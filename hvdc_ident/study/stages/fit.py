@@ -72,9 +72,9 @@ def _fitted(study: Study, options: Options, problem: Problem) -> FitResult:
     from hvdc_ident.study.schema import Fit
 
     asked = study.settings.fit or Fit()
-    from hvdc_ident.study.executor import processes
+    from hvdc_ident.study.at_work import executor_of
 
-    with processes(options.workers) as executor:
+    with executor_of(study, options, "fit") as executor:
         common: dict[str, Any] = {
             "starts": asked.starts,
             "seed": options.seed,

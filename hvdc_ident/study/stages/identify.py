@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stage import Options, Outcome, Stage
@@ -17,7 +17,7 @@ FEWEST_STARTS = 4
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """A verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
     from hvdc_ident.identifiability import identifiability
-    from hvdc_ident.study.executor import processes
+    from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
 
     need_experiments(study, "identify", role="fit")
@@ -25,7 +25,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     need_start(study)
     starts = max(study.settings.fit.starts, FEWEST_STARTS) if study.settings.fit else 8
     pair = study.settings.identifiability.pair if study.settings.identifiability else None
-    with processes(options.workers) as executor:
+    with executor_of(study, options, "identify") as executor:
         report = identifiability(
             study.model,
             study.experiments,
@@ -40,6 +40,20 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     return Outcome({**report.to_dict(), "candidates": bounds})
 
 
+def told(data: Mapping[str, Any]) -> Sequence[str]:
+    """Every verdict in a line, the remarks, and what to measure next."""
+    width = max(map(len, data["parameters"]), default=0)
+    lines = [f"{n:{width}}  {v['verdict']}: {v['reason']}" for n, v in data["parameters"].items()]
+    if data["misspecified"]:
+        signs = data["misspecification"]
+        lines.append(
+            f"The model does not explain these data: {'; '.join(signs['signs'])}. {signs['next'].capitalize()}."
+        )
+    lines += data["notes"]
+    advice = data["recommended_experiment"]
+    return [*lines, f"Measure next: {advice['text']}"] if advice else lines
+
+
 STAGE = Stage(
     name="identify",
     file="identifiability.json",
@@ -47,4 +61,5 @@ STAGE = Stage(
     run=run,
     wanted=lambda study: study.settings.identifiability is not None or study.settings.fit is not None,
     order=30,
+    tell=told,
 )

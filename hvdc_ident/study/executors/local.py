@@ -21,21 +21,13 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from hvdc_ident.errors import ComputationError, InputError
+from hvdc_ident.study.executors.ended import Ended, in_order
 
 BATCH = 0.2  # s of work sent to a worker at a time
 REPORT = 0.05  # s between two reports of a worker
 START = 180.0  # s a worker may take to begin
 DEATHS = 2  # of workers at the same item before it is given up
 IDLE = -1
-
-
-@dataclass(frozen=True)
-class Ended:
-    """What became of one item: its place among the items, its value, and why it has none (empty where it has)."""
-
-    index: int
-    value: Any = None
-    failure: str = ""
 
 
 @dataclass(eq=False)
@@ -72,33 +64,56 @@ class LocalPool:
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Any]:
         """The function's results in the items' order. Raises ComputationError where an item has none."""
-        waiting: dict[int, Any] = {}
-        place = 0
-        for end in self.run(function, items):
-            if end.failure:
-                raise ComputationError(f"item {end.index + 1} failed", where="the pool of workers", got=end.failure)
-            waiting[end.index] = end.value
-            while place in waiting:
-                yield waiting.pop(place)
-                place += 1
+        return in_order(self.run(function, items))
 
     def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Ended]:
         """What became of each item, as it ends. The function and the items must be picklable.
 
         Raises ComputationError where workers cannot be started at all.
         """
-        session = _Session(self, pickle.dumps(function), iter(enumerate(items)))
+        with self.open() as pool:
+            yield from pool.run(function, items)
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[OpenPool]:
+        """The pool with workers that stay from one run to the next, until the context ends."""
+        pool = OpenPool(self)
+        try:
+            yield pool
+        finally:
+            pool.close()
+
+
+class OpenPool:
+    """A pool whose workers wait for the next run: starting one takes a second or two."""
+
+    def __init__(self, settings: LocalPool) -> None:
+        self._settings = settings
+        self._idle: list[_Worker] = []
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Any]:
+        """The function's results in the items' order. Raises ComputationError where an item has none."""
+        return in_order(self.run(function, items))
+
+    def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Ended]:
+        """What became of each item, as it ends."""
+        session = _Session(self._settings, pickle.dumps(function), iter(enumerate(items)), self._idle)
         try:
             yield from session.ends()
         finally:
             session.close()
 
+    def close(self) -> None:
+        """Nothing; the workers have ended."""
+        while self._idle:
+            _end(self._idle.pop())
+
 
 class _Session:
     """One run of a pool."""
 
-    def __init__(self, pool: LocalPool, function: bytes, items: Iterator[tuple[int, Any]]) -> None:
-        self.pool, self.function, self.items = pool, function, items
+    def __init__(self, pool: LocalPool, function: bytes, items: Iterator[tuple[int, Any]], idle: list[_Worker]) -> None:
+        self.pool, self.function, self.items, self.idle = pool, function, items, idle
         self.workers: list[_Worker] = []
         self.again: deque[tuple[int, Any]] = deque()
         self.deaths: dict[int, int] = {}
@@ -126,7 +141,7 @@ class _Session:
         for worker in [w for w in self.workers if w.ready and not w.pending]:
             batch = self._batch()
             if not batch:
-                self._end(worker)
+                self._retire(worker)
                 continue
             worker.pending, worker.since = dict(batch), time.monotonic()
             with contextlib.suppress(OSError):  # it has just died: noticed when it is heard
@@ -167,14 +182,12 @@ class _Session:
         return batch
 
     def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        current = context.RawValue("q", IDLE)
-        here, there = context.Pipe()
-        arguments = (there, self.function, current, self.pool.memory, os.getpid())
-        process = context.Process(target=_serve, args=arguments, daemon=True)
-        process.start()
-        there.close()
-        self.workers.append(_Worker(process, here, current, time.monotonic()))
+        """A worker joins the run: one that waits, or a new one. It is ready when it has loaded the function."""
+        worker = self.idle.pop() if self.idle else _started(self.pool.memory)
+        worker.ready, worker.since = False, time.monotonic()
+        with contextlib.suppress(OSError):  # it has just died: noticed when it is heard
+            worker.connection.send_bytes(self.function)
+        self.workers.append(worker)
 
     # --- work in ---
 
@@ -230,21 +243,40 @@ class _Session:
                     continue
             self.again.appendleft((index, item))
 
+    def _retire(self, worker: _Worker) -> None:
+        """A worker with nothing left to do waits for the next run."""
+        self.workers.remove(worker)
+        self.idle.append(worker)
+
     def _end(self, worker: _Worker) -> None:
         if worker in self.workers:
             self.workers.remove(worker)
-        worker.connection.close()
-        if worker.pending or not worker.ready:
-            worker.process.kill()
-        worker.process.join(5.0)
-        if worker.process.exitcode is None:
-            worker.process.kill()
-            worker.process.join()
-        worker.process.close()
+        _end(worker)
 
     def close(self) -> None:
         for worker in list(self.workers):
             self._end(worker)
+
+
+def _started(memory: int | None) -> _Worker:
+    context = multiprocessing.get_context("spawn")
+    current = context.RawValue("q", IDLE)
+    here, there = context.Pipe()
+    process = context.Process(target=_serve, args=(there, current, memory, os.getpid()), daemon=True)
+    process.start()
+    there.close()
+    return _Worker(process, here, current, time.monotonic())
+
+
+def _end(worker: _Worker) -> None:
+    worker.connection.close()
+    if worker.pending or not worker.ready:
+        worker.process.kill()
+    worker.process.join(5.0)
+    if worker.process.exitcode is None:
+        worker.process.kill()
+        worker.process.join()
+    worker.process.close()
 
 
 def _exit(code: int | None) -> str:
@@ -260,8 +292,8 @@ def _exit(code: int | None) -> str:
 # --- inside a worker ---
 
 
-def _serve(connection: Connection, function: bytes, current: Any, memory: int | None, parent: int) -> None:
-    """Nothing; runs batches until the parent closes the connection or ends."""
+def _serve(connection: Connection, current: Any, memory: int | None, parent: int) -> None:
+    """Nothing; loads each function sent and runs batches with it until the parent closes the connection or ends."""
     _end_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if memory is not None:
@@ -269,11 +301,17 @@ def _serve(connection: Connection, function: bytes, current: Any, memory: int | 
             import resource
 
             resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    work = pickle.loads(function)
+    work: Callable[[Any], Any] | None = None
     with contextlib.suppress(OSError, EOFError):
-        connection.send((0.0, []))
         while True:
-            _run_batch(connection, work, connection.recv(), current)
+            message = connection.recv_bytes()
+            content = pickle.loads(message)
+            if isinstance(content, list):
+                assert work is not None  # the function comes before its items
+                _run_batch(connection, work, content, current)
+            else:
+                work = content
+                connection.send((0.0, []))
 
 
 def _run_batch(connection: Connection, work: Callable[[Any], Any], batch: list[tuple[int, Any]], current: Any) -> None:
