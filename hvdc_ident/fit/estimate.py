@@ -9,21 +9,27 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.intervals import estimates_of
-from hvdc_ident.fit.noise import GIVEN, MISFIT, floor_of, source_of
+from hvdc_ident.fit.noise import GIVEN, floor_of, source_of
 from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
+from hvdc_ident.fit.optimisers import catalogue
+from hvdc_ident.fit.optimisers import optimiser as named
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.refined import Refined
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.residual_tests import residual_tests
-from hvdc_ident.fit.result import Estimate, FitResult, StartOutcome, Status
+from hvdc_ident.fit.result import Covariance, Estimate, FitResult, StartOutcome, Status
 from hvdc_ident.fit.starts import DISTINCT, Optimum, distinct, latin_hypercube
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
+from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
+STARTS = 8
+"""Runs of a multistart, where nothing else is said."""
 Progress = Callable[[int, int, str], None]
 """Called with runs done, runs in all, and a line of text."""
 
@@ -38,36 +44,47 @@ class Executor(Protocol):
 def fit(
     problem: Problem,
     *,
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
-    optimiser: Optimiser | None = None,
+    optimiser: Optimiser | str | None = None,
+    whiten: str = "no",
     executor: Executor | None = None,
     progress: Progress | None = None,
+    assess: bool = True,
 ) -> FitResult:
     """The best optimum of a multistart with its covariance, tests of its residuals and the outcome of every start.
 
-    starts: runs in all; the first from the given start, the others from a seeded Latin hypercube over the bounds.
+    starts: runs in all (default 8; 1 for an optimiser that searches the whole range by itself); the first from the
+    given start, the others from a seeded Latin hypercube over the bounds, nuisances from their own start.
+    optimiser: one of the catalogue, by name or with options; the ends of all but the default are refined by least squares.
+    whiten: "no", "pre-event" (AR model of the noise before the event) or "residual" (of the first fit's residuals).
+    assess: whether goodness and validation are wanted too.
     Standard deviations of outputs without noise, or with deterministic data, come from the misfit (`noise_source`).
     Status: converged; at-bound (an estimate lies on a bound); two-optima (another optimum within 1.92 of the best);
     not-converged; failed (no start could be simulated to an end). A run that fails raises nothing: it is in `starts`.
     """
-    method = optimiser if optimiser is not None else TrustRegion()
-    begins = [problem.start, *latin_hypercube(problem.unknowns, starts - 1, seed)]
-    runs = _run_all(problem, begins, method, executor, progress)
-    usable = [_optimum(r) for r in runs if r.status != "failed" and r.cost is not None]
+    method, count = _method(optimiser, starts, seed)
+    first = prepared(problem, whiten)
+    begins = [first.start, *latin_hypercube(first.free, first.unknowns[len(first.free) :], count - 1, seed)]
+    runs = _run_all(first, begins, method, executor, progress)
+    usable = [Optimum(r.theta, r.cost) for r in runs if r.status != "failed" and r.cost is not None]
     if not usable:
-        return _failed(problem, begins, runs)
-    problem, best, rivals = _weighted(problem, usable, method)
+        return _failed(first, begins, runs)
+    local = TrustRegion()
+    problem, best, rivals = weighted(first, usable, local)
+    if whiten == "residual":
+        problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
     blocks = problem.blocks(best.theta)
     source = {o: source_of(problem.fitted_experiments, o) for o in problem.outputs}
     inner, all_unknowns = _uncertainties(problem, best.theta, blocks, source)
     samples = sum(b.residual.size for b in blocks)
     worth = min(1.0, sum(inner.effective.values()) / samples)
     optima = [best] if inner.singular else distinct(problem, [best, *rivals], worth)
-    outcomes = _outcomes(problem, begins, runs)
+    outcomes = _outcomes(problem, begins, runs, weigh=problem is not first)
     status, message = _status(problem, best, optima, runs, outcomes, worth)
     found = estimates_of(problem, best.theta, blocks, inner, all_unknowns)
-    return FitResult(
+    squares = sum(float(b.residual @ b.residual) for b in blocks)
+    result = FitResult(
         status=status,
         message=message,
         fitted=tuple(f.name for f in problem.free),
@@ -76,7 +93,7 @@ def fit(
         estimates=FrozenMap({f.name: found[f.name] for f in problem.free}),
         nuisance=_nuisance(problem, found),
         cost=best.cost,
-        chi2_per_dof=2.0 * best.cost / (samples - best.theta.size) if samples > best.theta.size else None,
+        chi2_per_dof=squares / (samples - best.theta.size) if samples > best.theta.size else None,
         rmse=problem.rmse(best.theta),
         rmse_start=problem.rmse(problem.start),
         noise_source=FrozenMap({o: _noise_text(problem, o, source[o]) for o in problem.outputs}),
@@ -84,9 +101,22 @@ def fit(
         rho=inner.rho,
         effective_samples=inner.effective,
         correlation=inner.correlation(),
-        residual_tests=residual_tests(blocks, problem.fitted_experiments),
+        residual_tests=residual_tests(_in_time(problem, best.theta, blocks), problem.fitted_experiments),
         starts=outcomes,
+        loss=problem.loss.name,
+        whitening={o: m for o, m in problem.treatment.whitening.items() if any(m)},
+        dof=float(inner.dof) if np.isfinite(inner.dof) else None,
+        covariance=Covariance(inner.names, inner.corrected, inner.dof),
     )
+    return assessed(problem, result) if assess else result
+
+
+def _method(optimiser: Optimiser | str | None, starts: int | None, seed: int) -> tuple[Optimiser, int]:
+    """The optimiser as it is run, and how many starts it gets."""
+    chosen = named(optimiser, seed) if isinstance(optimiser, str) else optimiser or TrustRegion()
+    whole = any(isinstance(chosen, m.OPTIMISER) and getattr(m, "GLOBAL", False) for m in catalogue().values())
+    count = starts if starts is not None else (1 if whole else STARTS)
+    return chosen if isinstance(chosen, TrustRegion) else Refined(chosen), count
 
 
 def _run_all(
@@ -103,64 +133,9 @@ def _run_all(
     return runs
 
 
-def _optimum(run: OptimiserResult) -> Optimum:
-    assert run.cost is not None
-    return Optimum(run.theta, run.cost)
-
-
-def _weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tuple[Problem, Optimum, list[Optimum]]:
-    """The problem with the misfit's weights where noise is not given, its best optimum and the other candidates.
-
-    One output: the optimum does not depend on its weight. Several: fitted again until the weights stand (1 %).
-    """
-    ends = sorted(ends, key=lambda o: o.cost)
-    open_outputs = [o for o in problem.outputs if source_of(problem.fitted_experiments, o) == MISFIT]
-    if not open_outputs:
-        return problem, ends[0], list(ends[1:])
-    best = ends[0]
-    rivals = distinct(problem, ends)[1:4]
-    for _ in range(20):
-        weights = _misfit_weights(problem, best.theta, open_outputs)
-        settled = all(abs(weights[o] / problem.weights.get(o, np.inf) - 1.0) < 0.01 for o in open_outputs)
-        problem = problem.with_(weights={**problem.weights, **weights})
-        if len(problem.outputs) == 1 or settled:
-            break
-        again = method.run(problem, best.theta)
-        if again.status == "failed":
-            break
-        best = _optimum(again)
-    candidates = [best.theta, *(r.theta for r in rivals)]
-    if len(problem.outputs) > 1:
-        moved = [method.run(problem, r.theta) for r in rivals]
-        candidates = [best.theta, *(m.theta for m in moved if m.status != "failed")]
-    again_at = [Optimum(t, c) for t in candidates if (c := _cost(problem, t)) is not None]
-    best, *rivals = sorted(again_at, key=lambda o: o.cost)
-    return problem, best, rivals
-
-
-def _cost(problem: Problem, theta: Array) -> float | None:
-    """The cost as the optimiser saw it, from runs with sensitivities; None where a run fails."""
-    try:
-        r, _ = problem.residual(theta)
-    except SimulationError:
-        return None
-    return 0.5 * float(r @ r)
-
-
-def _misfit_weights(problem: Problem, theta: Array, outputs: Sequence[str]) -> dict[str, float]:
-    """The RMSE of each output over all its records, freed of the fitted unknowns' share, in its unit.
-
-    For a whitened problem it is the standard deviation of the whitened residual that becomes 1.
-    """
-    blocks = problem.blocks(theta)
-    total = sum(b.residual.size for b in blocks)
-    share = total / max(total - theta.size, 1)
-    weights = {}
-    for output in outputs:
-        squares = np.concatenate([(b.residual * b.sigma) ** 2 for b in blocks if b.output == output])
-        floor = floor_of(problem.fitted_experiments, output)
-        weights[output] = max(float(np.sqrt(squares.mean() * share)), floor)
-    return weights
+def _in_time(problem: Problem, theta: Array, blocks: Sequence[Block]) -> Sequence[Block]:
+    """The blocks as samples in time, which tests of residuals need."""
+    return blocks if problem.band is None else problem.blocks(theta, derivatives=False, in_time=True)
 
 
 def _uncertainties(
@@ -170,11 +145,28 @@ def _uncertainties(
     names = problem.names
     spans = np.array([u.span for u in problem.unknowns])
     inside = [i for i, (u, v) in enumerate(zip(problem.unknowns, theta, strict=True)) if u.min < v < u.max]
-    everything = uncertainty(blocks, names, spans, source)
+    blocks = _informative(problem, blocks)
+    _, prior = problem.prior(theta)
+    everything = uncertainty(blocks, names, spans, source, prior)
     if len(inside) == len(names):
         return everything, everything
     fewer = [replace(b, jacobian=b.jacobian[:, inside]) for b in blocks]
-    return uncertainty(fewer, [names[i] for i in inside], spans[inside], source), everything
+    inner = uncertainty(fewer, [names[i] for i in inside], spans[inside], source, prior[:, inside])
+    return inner, everything
+
+
+def _informative(problem: Problem, blocks: Sequence[Block]) -> list[Block]:
+    """The blocks with the information their samples have under a robust loss."""
+    if problem.loss.linear:
+        return list(blocks)
+    share = {
+        o: problem.loss.efficiency(np.concatenate([b.residual for b in blocks if b.output == o]))
+        for o in problem.outputs
+    }
+    return [
+        replace(b, residual=problem.loss.psi(b.residual), jacobian=b.jacobian * np.sqrt(share[b.output]))
+        for b in blocks
+    ]
 
 
 def _outcomes(
@@ -184,8 +176,8 @@ def _outcomes(
     rows = []
     for begin, run in zip(begins, runs, strict=True):
         cost = run.cost
-        if weigh and problem.weights and cost is not None:
-            cost = _cost(problem, run.theta)
+        if weigh and cost is not None:
+            cost = cost_of(problem, run.theta)
         names = problem.names
         at = FrozenMap(dict(zip(names, map(float, begin), strict=True)))
         end = FrozenMap(dict(zip(names, map(float, run.theta), strict=True)))

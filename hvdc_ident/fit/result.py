@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
 
 Status = Literal["converged", "at-bound", "two-optima", "not-converged", "failed"]
 
@@ -49,6 +50,15 @@ class StartOutcome:
 
 
 @dataclass(frozen=True, eq=False)
+class Covariance:
+    """How the unknowns scatter together. names: p unknowns; matrix: (p, p), in their units; dof: of Student's t."""
+
+    names: tuple[str, ...]
+    matrix: Array
+    dof: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
 class FitResult:
     """The outcome of a fit; `to_dict` is the JSON.
 
@@ -60,6 +70,10 @@ class FitResult:
     rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
     correlation: between the estimates. residual_tests: by output and experiment. starts: outcomes of the multistart.
     per_experiment: statistics over fits to single experiments, where they were made.
+    loss, whitening: what residuals cost, and the AR coefficients they were whitened with, by output.
+    dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
+    the F quantile of one parameter). goodness, validation, windowed_errors: see `goodness`, `validation` and `windowed`.
+    covariance: of the unknowns that have one; not in the JSON, which has std and correlation.
     """
 
     status: Status
@@ -81,10 +95,17 @@ class FitResult:
     residual_tests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
     per_experiment: Mapping[str, Any] = field(default_factory=dict)
+    loss: str = "linear"
+    whitening: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    dof: float | None = None
+    goodness: Mapping[str, Any] = field(default_factory=dict)
+    validation: Mapping[str, Any] = field(default_factory=dict)
+    windowed_errors: Mapping[str, Any] = field(default_factory=dict)
+    covariance: Covariance | None = field(default=None, metadata={"json": False})
 
     def to_dict(self) -> dict[str, Any]:
         """The result as JSON takes it: full precision, None for what is not finite."""
-        return {f.name: plain(getattr(self, f.name)) for f in fields(self)}
+        return {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.metadata.get("json", True)}
 
     def to_toml_values(self) -> str:
         """The text of a [model.values] table: fitted and held parameters, full precision, with units as comments."""

@@ -24,14 +24,18 @@ class Optimum:
     cost: float
 
 
-def latin_hypercube(unknowns: Sequence[Free], count: int, seed: int) -> list[Array]:
-    """`count` starts, (p,) each, spread over the bounds (even in the logarithm where an unknown is scaled so)."""
+def latin_hypercube(spread: Sequence[Free], rest: Sequence[Free], count: int, seed: int) -> list[Array]:
+    """`count` starts, (p,) each: `spread` over the bounds (even in the logarithm where scaled so), `rest` at their own.
+
+    Nuisances are the rest: they are small by nature, and far off they only lead a run astray.
+    """
     if count < 1:
         return []
     from scipy.stats import qmc
 
-    shares = qmc.LatinHypercube(d=len(unknowns), seed=np.random.default_rng(seed)).random(count)
-    return [np.array([u.draw(float(s)) for u, s in zip(unknowns, row, strict=True)]) for row in shares]
+    own = [u.start for u in rest]
+    shares = qmc.LatinHypercube(d=len(spread), seed=np.random.default_rng(seed)).random(count)
+    return [np.array([*(u.draw(float(s)) for u, s in zip(spread, row, strict=True)), *own]) for row in shares]
 
 
 def distinct(problem: Problem, ends: Sequence[Optimum], worth: float = 1.0) -> list[Optimum]:

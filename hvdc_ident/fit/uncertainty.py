@@ -71,21 +71,32 @@ def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
     return float(min(rho + (unknowns + (unknowns + 2.0) * rho) / n, 1.0 - 2.0 / n))
 
 
-def uncertainty(blocks: Sequence[Block], names: Sequence[str], spans: Array, source: Mapping[str, str]) -> Uncertainty:
-    """What the blocks say about the unknowns whose columns they have.
+def uncertainty(
+    blocks: Sequence[Block],
+    names: Sequence[str],
+    spans: Array,
+    source: Mapping[str, str],
+    prior: Array | None = None,
+) -> Uncertainty:
+    """What the blocks say about the unknowns whose columns they have, and the priors beside them.
 
+    prior: (k, p) derivatives of the priors' residuals, which are independent and of standard deviation 1.
     spans: (p,) the range of each unknown. source: "given" or "misfit" by output: where sigma comes from.
     The correction is the sandwich (J'J)^-1 J'RJ (J'J)^-1 with R the AR(1) correlation within a record: (1+rho)/(1-rho)
     where the sensitivities are slow against the noise. It is never below the uncorrected variance.
     """
     _, jacobian = stacked(blocks)
     count, p = jacobian.shape
+    if prior is not None and prior.size:
+        jacobian = np.vstack([jacobian, prior])
     norms = np.linalg.norm(jacobian, axis=0)
     unseen = norms * spans <= UNSEEN
     norms = np.where(unseen, 1.0, norms)
     inverse, null = _inverse(jacobian / norms, ~unseen)
     rho, effective = _samples(blocks, p)
     meat = sum((score_covariance(b.jacobian / norms, rho[b.output]) for b in blocks), np.zeros((p, p)))
+    if prior is not None and prior.size:
+        meat = meat + (prior / norms).T @ (prior / norms)
     sandwich = inverse @ meat @ inverse
     from_misfit = any(source[b.output] == MISFIT for b in blocks)
     if from_misfit and count > p:

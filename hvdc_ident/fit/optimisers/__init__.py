@@ -1,9 +1,13 @@
-"""The optimisers, one file each; a file supplies NAME, SUMMARY (one line) and OPTIMISER (the options class)."""
+"""The optimisers, one file each; a file supplies NAME, SUMMARY (one line) and OPTIMISER (the options class).
+
+GLOBAL = True in a file: its method searches the whole range by itself, so that one start is enough.
+"""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from dataclasses import fields
 from typing import Any
 
 from hvdc_ident.errors import unknown_name
@@ -17,10 +21,23 @@ def catalogue() -> dict[str, Any]:
     return {m.NAME: m for m in modules}
 
 
-def optimiser(name: str) -> Optimiser:
-    """The named optimiser with its default options. Raises UnknownNameError."""
+def optimiser(name: str, seed: int = 0) -> Optimiser:
+    """The named optimiser with its default options; seed: of its random numbers, if it has any.
+
+    Raises UnknownNameError.
+    """
     known = catalogue()
     if name not in known:
         raise unknown_name("optimiser", name, known)
-    found: Optimiser = known[name].OPTIMISER()
+    options = known[name].OPTIMISER
+    seeded = any(f.name == "seed" for f in fields(options))
+    found: Optimiser = options(seed=seed) if seeded else options()
     return found
+
+
+def is_global(name: str) -> bool:
+    """Whether the named optimiser searches the whole range by itself. Raises UnknownNameError."""
+    known = catalogue()
+    if name not in known:
+        raise unknown_name("optimiser", name, known)
+    return bool(getattr(known[name], "GLOBAL", False))

@@ -1,0 +1,215 @@
+"""How good a fit is: goodness by output and experiment, held-out experiments, bands of the prediction.
+
+Everything here takes a problem in its final weights and the result of its fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.noise import GIVEN
+from hvdc_ident.fit.nuisance import observe, unknown_of
+from hvdc_ident.fit.objective import LeastSquares, descend
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.residual import compared_rows
+from hvdc_ident.fit.residual_tests import ljung_box
+from hvdc_ident.fit.result import FitResult
+from hvdc_ident.trajectory import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One output of one experiment at the estimates, at all n rows.
+
+    model, measured: (n,) in the output's unit. rows: those compared. sigma: standard deviation of the noise.
+    std: (n,) standard deviation of the model's curve from that of the estimates; band: half the width of the 95 % band
+    within which a recorded sample is expected. Both None where no estimate has a standard deviation.
+    """
+
+    model: Array
+    measured: Array
+    rows: NDArray[np.intp]
+    sigma: float
+    std: Array | None
+    band: Array | None
+
+    @property
+    def misfit(self) -> Array:
+        """Measured - model over the compared rows."""
+        return self.measured[self.rows] - self.model[self.rows]
+
+
+def assessed(problem: Problem, result: FitResult) -> FitResult:
+    """The result with `goodness` and `validation`; errors of held-out experiments are taken with their own nuisances."""
+    nuisances = held_out_nuisances(problem, result)
+    found = curves(problem, result, nuisances)
+    rmse = {o: dict(line) for o, line in result.rmse.items()}
+    for e in problem.experiments:
+        if nuisances.get(e.name):
+            for output, c in found.get(e.name, {}).items():
+                rmse[output][e.name] = float(np.sqrt(np.mean(c.misfit**2)))
+    result = replace(result, rmse=rmse)
+    held_out = {e.name for e in problem.experiments if e.role == "holdout"}
+    return replace(
+        result,
+        goodness=goodness(result, {n: c for n, c in found.items() if n not in held_out}),
+        validation=validation(problem, result, {n: found.get(n) for n in sorted(held_out)}, nuisances),
+    )
+
+
+def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[str, float] | None]:
+    """By held-out experiment its nuisances, estimated from its own record with the parameters at their estimates.
+
+    None where they cannot be estimated, for the run fails.
+    """
+    found: dict[str, dict[str, float] | None] = {}
+    for e in problem.experiments:
+        if e.role != "holdout" or not e.nuisance or not e.outputs:
+            continue
+        alone = replace(
+            problem,
+            experiments=(e.with_(role="fit"),),
+            rho=FrozenMap(),
+            band=None,
+            priors=FrozenMap(),
+            weights=_weights(result),
+        )
+        theta = alone.start
+        known = len(alone.free)
+        theta[:known] = [result.values[f.name] for f in alone.free]
+        fixed = np.arange(theta.size) < known
+        try:
+            end = descend(LeastSquares.of(alone), theta, fixed, enough=1e-6)
+        except SimulationError:
+            found[e.name] = None
+            continue
+        found[e.name] = {n: float(v) for n, v in zip(e.nuisance, end.theta[known:], strict=True)}
+    return found
+
+
+def _weights(result: FitResult) -> dict[str, float]:
+    """The standard deviations that came from the misfit, by output."""
+    return {
+        o: next(s[o] for s in result.sigma.values() if o in s) for o, w in result.noise_source.items() if w != GIVEN
+    }
+
+
+def curves(
+    problem: Problem, result: FitResult, held_out: Mapping[str, Mapping[str, float] | None] | None = None
+) -> dict[str, dict[str, Curve]]:
+    """Every output of every experiment at the estimates, by experiment and output; those that fail are left out.
+
+    held_out: nuisances of held-out experiments, None where they could not be estimated.
+    """
+    from scipy.stats import t
+
+    table: dict[str, dict[str, Curve]] = {}
+    known = result.covariance
+    quantile = float(t.ppf(0.975, known.dof)) if known is not None else np.nan
+    for e in problem.experiments:
+        if not e.outputs or e.measured is None:
+            continue
+        own = {n: v.value for n, v in result.nuisance.get(e.name, {}).items()}
+        if held_out and e.name in held_out:
+            estimated = held_out[e.name]
+            if estimated is None:
+                continue
+            own = dict(estimated)
+        names = [f.name for f in problem.free]
+        columns = [*names, *(unknown_of(e.name, n) for n in own)]
+        try:
+            seen = observe(problem.simulator, e, result.values, names, own)
+        except SimulationError:
+            continue
+        table[e.name] = {}
+        for o in e.outputs:
+            sigma, std, band = problem.sigma[e.name][o], None, None
+            if known is not None and known.names:
+                pick = [k for k, n in enumerate(columns) if n in known.names]
+                place = [known.names.index(columns[k]) for k in pick]
+                g = seen.gradient[o][:, pick]
+                variance = np.einsum("ni,ij,nj->n", g, known.matrix[np.ix_(place, place)], g)
+                std = np.sqrt(np.clip(variance, 0.0, None))
+                band = quantile * np.sqrt(std**2 + sigma**2)
+            table[e.name][o] = Curve(seen.values[o], e.measured[o], compared_rows(e, o), sigma, std, band)
+    return table
+
+
+def goodness(result: FitResult, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
+    """How well the fitted experiments are met.
+
+    chi2, dof, p: of all residuals together, against the given noise, with the independent samples that correlated
+    residuals are worth; None, with the reason, where the noise came from the misfit. outputs: see `_quality`.
+    """
+    from scipy.stats import chi2
+
+    table: dict[str, dict[str, Any]] = {}
+    for experiment, line in found.items():
+        for output, c in line.items():
+            table.setdefault(output, {})[experiment] = _quality(c)
+    samples = sum(q["n"] for line in table.values() for q in line.values())
+    effective = sum(result.effective_samples.values())
+    given = bool(result.noise_source) and all(s == GIVEN for s in result.noise_source.values())
+    overall: dict[str, Any] = {"chi2": None, "dof": None, "p": None, "reason": ""}
+    if not given:
+        overall["reason"] = "the noise is taken from the misfit, which then says nothing about the fit"
+    elif result.chi2_per_dof is None or not samples:
+        overall["reason"] = "no more rows than unknowns"
+    else:
+        dof = max(effective - len(result.fitted), 1.0)
+        value = result.chi2_per_dof * dof
+        overall |= {"chi2": value, "dof": dof, "p": float(chi2.sf(value, dof))}
+    return {**overall, "outputs": table}
+
+
+def _quality(c: Curve) -> dict[str, Any]:
+    """n: rows; rmse, in the unit; rmse_per_sigma; r2: share of the variance explained; fit_percent: 100 (1 - |e|/|y -
+    mean|), None where the record stands still; in_band: share of rows in the 95 % band."""
+    e, y = c.misfit, c.measured[c.rows]
+    moved = float(np.sum((y - y.mean()) ** 2))
+    left = float(e @ e)
+    rmse = float(np.sqrt(left / e.size))
+    return {
+        "n": int(e.size),
+        "rmse": rmse,
+        "rmse_per_sigma": rmse / c.sigma,
+        "r2": 1.0 - left / moved if moved > 0 else None,
+        "fit_percent": 100.0 * (1.0 - np.sqrt(left / moved)) if moved > 0 else None,
+        "in_band": float(np.mean(np.abs(e) <= c.band[c.rows])) if c.band is not None else None,
+    }
+
+
+def validation(
+    problem: Problem,
+    result: FitResult,
+    found: Mapping[str, Mapping[str, Curve] | None],
+    nuisances: Mapping[str, Mapping[str, float] | None],
+) -> dict[str, Any]:
+    """The held-out experiments by name: {status, nuisance, outputs {output: quality and comparison with the fit}}.
+
+    of_fit: RMSE over that of the fitted experiments of this output; near 1 the estimates hold there too. ljung_box:
+    whiteness of the residual. An experiment that cannot be simulated has status "failed".
+    """
+    fitted = {e.name for e in problem.experiments if e.role == "fit"}
+    table: dict[str, Any] = {}
+    for name, line in found.items():
+        outputs = {}
+        for output, c in (line or {}).items():
+            errors = [v for e, v in result.rmse.get(output, {}).items() if e in fitted and v is not None]
+            typical = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
+            quality = _quality(c)
+            outputs[output] = {
+                **quality,
+                "rmse_start": result.rmse_start.get(output, {}).get(name),
+                "of_fit": quality["rmse"] / typical if typical else None,
+                "ljung_box": ljung_box(c.misfit / c.sigma),
+            }
+        status = "done" if line else "failed"
+        table[name] = {"status": status, "nuisance": dict(nuisances.get(name) or {}), "outputs": outputs}
+    return table

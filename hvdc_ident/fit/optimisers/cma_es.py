@@ -1,0 +1,73 @@
+"""CMA-ES: evolution strategy with an adapted covariance matrix, by Hansen's package `cma` (extra `optimisers`).
+
+Hansen and Ostermeier 2001, doi 10.1162/106365601750190398.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.search import BudgetSpentError, Search, generator, missing
+from hvdc_ident.trajectory import Array
+
+NAME = "cma-es"
+SUMMARY = "evolution strategy with covariance adaptation (package cma, an extra), without derivatives"
+GLOBAL = True
+OPTIMA = ("tolfun", "tolx", "tolfunhist", "tolflatfitness", "ftarget")
+"""The package's words for an end that is an optimum; others (stagnation, a flat cost) are not."""
+
+
+@dataclass(frozen=True)
+class CmaEs:
+    """Options. size: first standard deviation, as a share of the range. cost, step: absolute tolerances at the end."""
+
+    max_evaluations: int = 20000
+    size: float = 0.3
+    cost: float = 1e-10
+    step: float = 1e-9
+    seed: int = 0
+
+    def run(self, problem: Problem, start: Array) -> OptimiserResult:
+        """Where the run ended. Raises InputError where the package is not installed."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of optional parts of the package that are not installed
+                import cma
+        except ImportError:
+            raise missing("cma", NAME) from None
+        search = Search(problem, start, self.max_evaluations)
+        random = generator(self.seed, search.start)
+        p = search.start.size
+        middle = np.append(search.cube, 0.5) if p == 1 else search.cube  # one dimension is not supported there
+        options = {
+            "bounds": [0.0, 1.0],
+            "seed": np.nan,
+            "randn": lambda *shape: random.standard_normal(shape),
+            "verbose": -9,
+            "tolfun": self.cost,
+            "tolfunhist": self.cost,
+            "tolx": self.step,
+            "maxiter": self.max_evaluations,
+            "maxfevals": 10 * self.max_evaluations,
+        }
+        try:
+            search.value(search.start)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a start on a bound is moved inside: that is what is wanted
+                strategy = cma.CMAEvolutionStrategy(np.clip(middle, 1e-6, 1 - 1e-6), self.size, options)
+                while not strategy.stop():
+                    points = strategy.ask()
+                    strategy.tell(points, [search.at_cube(np.asarray(x)[:p]) for x in points])
+                reasons = strategy.stop()
+        except BudgetSpentError:
+            return search.spent()
+        words = ", ".join(f"{k} {v}" for k, v in reasons.items())
+        return search.ended(any(k in OPTIMA for k in reasons), f"ended by {words}")
+
+
+OPTIMISER = CmaEs

@@ -1,0 +1,84 @@
+"""SciPy's dual annealing: generalised simulated annealing with local descents on exact gradients.
+
+Xiang, Sun, Fan, Gong 1997, doi 10.1016/S0375-9601(97)00474-X.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.fit.objective import bounded_step
+from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.search import BudgetSpentError, Search, generator
+from hvdc_ident.trajectory import Array
+
+NAME = "dual-annealing"
+SUMMARY = "simulated annealing with local descents over the whole range (SciPy)"
+GLOBAL = True
+
+
+@dataclass(frozen=True)
+class DualAnnealing:
+    """Options. iterations: of the annealing, which has no end of its own.
+
+    stationary: the best point counts as an optimum where a Gauss-Newton step promises no larger share of the cost.
+    """
+
+    max_evaluations: int = 20000
+    iterations: int = 100
+    stationary: float = 1e-6
+    seed: int = 0
+
+    def run(self, problem: Problem, start: Array) -> OptimiserResult:
+        """Where the run ended."""
+        from scipy.optimize import dual_annealing
+
+        search = Search(problem, start, self.max_evaluations)
+        space = problem.coordinates
+        ends = np.array([u.drawn for u in problem.unknowns])
+        box = list(zip(space.scaled(ends[:, 0]), space.scaled(ends[:, 1]), strict=True))
+        local: dict[str, Any] = {
+            "method": "L-BFGS-B",
+            "jac": lambda x: search.value_and_gradient(x)[1],
+            "bounds": box,
+            "options": {"ftol": 1e-14, "gtol": 1e-10},
+        }
+        try:
+            dual_annealing(
+                lambda x: search.value_and_gradient(x)[0],
+                box,
+                x0=np.clip(search.x0, [b[0] for b in box], [b[1] for b in box]),
+                maxiter=self.iterations,
+                maxfun=10 * self.max_evaluations,
+                minimizer_kwargs=local,
+                rng=generator(self.seed, search.start),
+            )
+        except BudgetSpentError:
+            return search.spent()
+        if search.cost is None:
+            return search.ended(False, "")
+        left = _promised(problem, search.best)
+        good = left <= self.stationary * search.cost + 1e-9
+        stands = (
+            "the best point is an optimum" if good else f"the best point is no optimum: {left:.3g} is still to gain"
+        )
+        return search.ended(good, f"{self.iterations} iterations done; {stands}")
+
+
+def _promised(problem: Problem, theta: Array) -> float:
+    """How much lower the cost would be after a Gauss-Newton step within the bounds."""
+    space = problem.coordinates
+    r, jacobian = problem.residual(theta)
+    columns = jacobian * space.slope(theta)
+    low, high = space.bounds
+    x = space.scaled(theta)
+    g, h = columns.T @ r, columns.T @ columns
+    p = bounded_step(g, h, 0.0, low - x, high - x)
+    return -float(g @ p + 0.5 * p @ h @ p)
+
+
+OPTIMISER = DualAnnealing

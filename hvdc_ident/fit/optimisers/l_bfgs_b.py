@@ -1,0 +1,65 @@
+"""SciPy's L-BFGS-B: a quasi-Newton method with bounds, on exact gradients.
+
+Byrd, Lu, Nocedal, Zhu 1995, doi 10.1137/0916069.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.search import BudgetSpentError, Search
+from hvdc_ident.trajectory import Array
+
+NAME = "l-bfgs-b"
+SUMMARY = "quasi-Newton with bounds (SciPy), with exact gradients"
+
+
+@dataclass(frozen=True)
+class LBfgsB:
+    """Options. cost: relative reduction not worth a step; gradient: largest projected slope, of the cost at the start."""
+
+    max_evaluations: int = 2000
+    cost: float = 1e-14
+    gradient: float = 1e-12
+    memory: int = 20
+
+    def run(self, problem: Problem, start: Array) -> OptimiserResult:
+        """Where the run from `start` ended."""
+        from scipy.optimize import minimize
+
+        search = Search(problem, start, self.max_evaluations)
+        low, high = problem.coordinates.bounds
+        try:
+            first, _ = search.value_and_gradient(search.x0)
+            if search.cost is None:
+                return search.ended(False, "")
+            scale = 1.0 / max(first, 1e-300)  # the method's tolerances are absolute ones
+
+            def scaled(x: Array) -> tuple[float, Array]:
+                value, gradient = search.value_and_gradient(x)
+                return scale * value, scale * gradient
+
+            end = minimize(
+                scaled,
+                search.x0,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=list(zip(low, high, strict=True)),
+                options={
+                    "ftol": self.cost,
+                    "gtol": self.gradient,
+                    "maxcor": self.memory,
+                    "maxfun": 10 * self.max_evaluations,
+                    "maxiter": 10 * self.max_evaluations,
+                },
+            )
+        except BudgetSpentError:
+            return search.spent()
+        if not end.success:
+            return search.refused(str(end.message))
+        return search.ended(True, str(end.message))
+
+
+OPTIMISER = LBfgsB

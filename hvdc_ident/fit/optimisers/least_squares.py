@@ -1,0 +1,57 @@
+"""SciPy's bounded least squares (trust region reflective) on exact sensitivities.
+
+Branch, Coleman, Li 1999, doi 10.1137/S1064827595289108.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.search import BudgetSpentError, Search
+from hvdc_ident.trajectory import Array
+
+NAME = "least-squares"
+SUMMARY = "SciPy's trust region reflective least squares, with exact sensitivities"
+
+
+@dataclass(frozen=True)
+class LeastSquaresTrf:
+    """Options. cost, step, gradient: relative tolerances, without unit."""
+
+    max_evaluations: int = 200
+    cost: float = 1e-12
+    step: float = 1e-10
+    gradient: float = 1e-10
+
+    def run(self, problem: Problem, start: Array) -> OptimiserResult:
+        """Where the run from `start` ended."""
+        from scipy.optimize import least_squares
+
+        search = Search(problem, start, self.max_evaluations)
+        low, high = problem.coordinates.bounds
+        inside = np.clip(search.x0, low + 1e-9 * (1.0 + np.abs(low)), high - 1e-9 * (1.0 + np.abs(high)))
+        try:
+            search.value_and_gradient(inside)
+            if search.cost is None:
+                return search.ended(False, "")
+            end = least_squares(
+                search.residual,
+                inside,
+                search.jacobian,
+                (low, high),
+                method="trf",
+                x_scale="jac",
+                ftol=self.cost,
+                xtol=self.step,
+                gtol=self.gradient,
+            )
+        except BudgetSpentError:
+            return search.spent()
+        return search.ended(end.status > 0, end.message.replace("`", "").rstrip("."))
+
+
+OPTIMISER = LeastSquaresTrf

@@ -1,0 +1,75 @@
+"""SciPy's Nelder-Mead: a simplex that needs no derivatives.
+
+Nelder and Mead 1965, doi 10.1093/comjnl/7.4.308; parameters adapted to the dimension after Gao and Han 2012.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.search import BudgetSpentError, Search
+from hvdc_ident.trajectory import Array
+
+NAME = "nelder-mead"
+SUMMARY = "the simplex of Nelder and Mead (SciPy), without derivatives"
+
+
+@dataclass(frozen=True)
+class NelderMead:
+    """Options. size: of the first simplex, as a share of the range; cost, step: absolute tolerances at the end.
+
+    Begun again from its end (up to `restarts` times) with a fresh simplex, for a simplex may collapse off an optimum.
+    """
+
+    max_evaluations: int = 5000
+    size: float = 0.1
+    cost: float = 1e-10
+    step: float = 1e-10
+    restarts: int = 5
+
+    def run(self, problem: Problem, start: Array) -> OptimiserResult:
+        """Where the run from `start` ended."""
+        search = Search(problem, start, self.max_evaluations)
+        try:
+            search.value(search.start)
+            if search.cost is None:
+                return search.ended(False, "")
+            x = search.cube
+            for k in range(1 + self.restarts):
+                before = search.cost
+                x = self._descent(search, x, self.size * 0.5**k)
+                assert search.cost is not None
+                if k and before - search.cost <= 1e-9 * before + self.cost:
+                    return search.ended(True, f"the simplex collapsed, and so did a fresh one ({k + 1} in all)")
+        except BudgetSpentError:
+            return search.spent()
+        return search.ended(False, f"fresh simplexes still improve after {self.restarts} restarts")
+
+    def _descent(self, search: Search, x: Array, size: float) -> Array:
+        """Where a simplex from x ends, in the unit cube."""
+        from scipy.optimize import minimize
+
+        steps = np.where(x + size <= 1.0, size, -size)
+        simplex = np.vstack([x, x + np.diag(steps)])
+        end = minimize(
+            search.at_cube,
+            x,
+            method="Nelder-Mead",
+            bounds=[(0.0, 1.0)] * x.size,
+            options={
+                "initial_simplex": simplex,
+                "fatol": self.cost,
+                "xatol": self.step,
+                "maxfev": 10 * self.max_evaluations,
+                "maxiter": 10 * self.max_evaluations,
+                "adaptive": x.size > 2,
+            },
+        )
+        return np.asarray(end.x)
+
+
+OPTIMISER = NelderMead

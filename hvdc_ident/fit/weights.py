@@ -1,0 +1,115 @@
+"""What a fit learns about the noise on its way: weights from the misfit, a noise model from the residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from hvdc_ident.errors import SimulationError, unknown_name
+from hvdc_ident.fit.noise import MISFIT, floor_of, source_of
+from hvdc_ident.fit.optimiser import Optimiser
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.starts import Optimum, distinct
+from hvdc_ident.fit.whitening import autoregression, before_event
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+Whiten = Literal["no", "pre-event", "residual"]
+WHITEN = ("no", "pre-event", "residual")
+MAD = 1.482602218505602
+"""Standard deviation over median absolute deviation, of a normal distribution."""
+
+
+def prepared(problem: Problem, whiten: str) -> Problem:
+    """The problem with the noise model from before the event, where that is asked for.
+
+    Raises UnknownNameError for another word, StudyError where nothing before the event tells the noise.
+    """
+    if whiten not in WHITEN:
+        raise unknown_name("way of whitening", whiten, WHITEN)
+    if whiten != "pre-event":
+        return problem
+    return replace(problem, rho=FrozenMap(before_event(problem.fitted_experiments, problem.outputs)))
+
+
+def weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tuple[Problem, Optimum, list[Optimum]]:
+    """The problem with the misfit's weights where noise is not given, its best optimum and the other candidates.
+
+    One output: the optimum does not depend on its weight. Several: fitted again until the weights stand (1 %).
+    """
+    ends = sorted(ends, key=lambda o: o.cost)
+    open_outputs = [o for o in problem.outputs if source_of(problem.fitted_experiments, o) == MISFIT]
+    if not open_outputs:
+        return problem, ends[0], list(ends[1:])
+    best = ends[0]
+    rivals = distinct(problem, ends)[1:4]
+    once = len(problem.outputs) == 1 and problem.loss.linear and not problem.priors
+    for _ in range(20):
+        weights = _misfit_weights(problem, best.theta, open_outputs)
+        settled = all(abs(weights[o] / problem.weights.get(o, np.inf) - 1.0) < 0.01 for o in open_outputs)
+        problem = problem.with_(weights={**problem.weights, **weights})
+        if once or settled:
+            break
+        again = method.run(problem, best.theta)
+        if again.status == "failed" or again.cost is None:
+            break
+        best = Optimum(again.theta, again.cost)
+    return _again(problem, best, rivals, method, moved=not once)
+
+
+def whitened_by_residuals(
+    problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser
+) -> tuple[Problem, Optimum, list[Optimum]]:
+    """The problem whitened by the model of its own residuals, fitted again until that model stands (twice at most)."""
+    for _ in range(2):
+        blocks = replace(problem, rho=FrozenMap()).blocks(best.theta, derivatives=False, in_time=True)
+        models = {}
+        for output in problem.outputs:
+            records = [b.misfit - b.misfit.mean() for b in blocks if b.output == output]
+            models[output] = autoregression(records)
+        problem, best, rivals = _again(replace(problem, rho=FrozenMap(models)), best, rivals, method, moved=True)
+        problem, best, rivals = weighted(problem, [best, *rivals], method)
+    return problem, best, list(rivals)
+
+
+def _again(
+    problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser, *, moved: bool
+) -> tuple[Problem, Optimum, list[Optimum]]:
+    """The optima with their cost in the problem's weights, best first. moved: whether they have to be found again."""
+    candidates = [best.theta, *(r.theta for r in rivals)]
+    if moved:
+        runs = [method.run(problem, r.theta) for r in (best, *rivals)]
+        candidates = [best.theta, *(m.theta for m in runs if m.status != "failed")]
+    at = [Optimum(t, c) for t in candidates if (c := cost_of(problem, t)) is not None]
+    first, *rest = sorted(at, key=lambda o: o.cost)
+    return problem, first, rest
+
+
+def cost_of(problem: Problem, theta: Array) -> float | None:
+    """The cost as the optimiser saw it, from runs with sensitivities; None where a run fails."""
+    try:
+        r, _ = problem.residual(theta)
+    except SimulationError:
+        return None
+    return 0.5 * float(r @ r)
+
+
+def _misfit_weights(problem: Problem, theta: Array, outputs: Sequence[str]) -> dict[str, float]:
+    """The RMSE of each output over all its records, freed of the fitted unknowns' share, in its unit.
+
+    For a whitened problem it is the standard deviation of the whitened residual that becomes 1. With a robust loss the
+    median absolute residual stands for it, for outliers are not noise.
+    """
+    blocks = problem.blocks(theta)
+    total = sum(b.residual.size for b in blocks)
+    share = total / max(total - theta.size, 1)
+    weights = {}
+    for output in outputs:
+        misfit = np.concatenate([b.residual * b.sigma for b in blocks if b.output == output])
+        floor = floor_of(problem.fitted_experiments, output)
+        size = np.sqrt(np.mean(misfit**2)) if problem.loss.linear else MAD * np.median(np.abs(misfit))
+        weights[output] = max(float(size * np.sqrt(share)), floor)
+    return weights
