@@ -93,9 +93,11 @@ def _check(so_far: Findings) -> None:
 
 
 def _data_notes(so_far: Findings, optimum: Optimum, result: FitResult) -> None:
-    rows = sum(b.residual.size for b in optimum.blocks)
-    if rows <= optimum.theta.size:
-        so_far.notes.append(f"{rows} measured values cannot determine {optimum.theta.size} unknowns.")
+    rows, unknowns = sum(b.residual.size for b in optimum.blocks), len(so_far.problem.unknowns)
+    if rows < unknowns:
+        so_far.notes.append(f"{rows} measured values cannot determine {unknowns} unknowns.")
+    elif rows == unknowns:
+        so_far.notes.append(f"{rows} measured values for as many unknowns leave nothing to tell a wrong model by.")
     if optimum.deterministic:
         names = ", ".join(optimum.deterministic)
         so_far.notes.append(f"The records of {names} have no noise: standard deviations are those of the misfit.")

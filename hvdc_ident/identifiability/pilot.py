@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -134,11 +134,7 @@ def pilot(
     """
     result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress)
     if result.status == "failed":
-        raise SimulationError(
-            f"identifiability cannot be told: {result.message}",
-            where=", ".join(failing(problem)) or "pilot fit",
-            hint="other starts or bounds, or leave that experiment out",
-        )
+        raise _failure(problem, result.message)
     weights = {
         o: next(s[o] for s in result.sigma.values() if o in s)
         for o, source in result.noise_source.items()
@@ -151,15 +147,34 @@ def pilot(
     return Optimum(weighted, np.array(theta, dtype=float)), result
 
 
-def failing(problem: Problem) -> Sequence[str]:
-    """The experiments that cannot be simulated at the start values."""
-    found = []
+def failing(problem: Problem) -> dict[str, SimulationError]:
+    """The experiments that cannot be simulated at the start values, each with its error."""
+    found = {}
     for e in problem.fitted_experiments:
+        alone = problem.with_(experiments=[e])
         try:
-            problem.with_(experiments=[e]).cost(problem.with_(experiments=[e]).start)
-        except SimulationError:
-            found.append(f"experiment '{e.name}'")
+            alone.cost(alone.start)
+        except SimulationError as error:
+            found[e.name] = error
     return found
+
+
+def _failure(problem: Problem, message: str) -> SimulationError:
+    """The error that says which experiments cannot be simulated, and why the first cannot."""
+    bad = failing(problem)
+    if not bad:
+        return SimulationError("nothing can be told: the pilot fit failed", got=message, hint="other starts or bounds")
+    first = next(iter(bad.values()))
+    names = ", ".join(f"'{n}'" for n in bad)
+    return SimulationError(
+        f"nothing can be told: {first.what}",
+        where=f"experiment{'s' if len(bad) > 1 else ''} {names}, at the start values",
+        expected=first.expected,
+        got=", ".join(t for t in (first.where.removeprefix(f"experiment '{next(iter(bad))}': "), first.got) if t),
+        hint=f"other start values or bounds, or leave {'them' if len(bad) > 1 else 'it'} out; {first.hint}".rstrip(
+            "; "
+        ),
+    )
 
 
 __all__ = ["Optimum", "failing", "pilot", "unknown_of"]

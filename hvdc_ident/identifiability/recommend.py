@@ -127,6 +127,8 @@ def recommend(
     now, then = (half_widths(m, _reach(whole, thresholds), whole.names, whole.error) for m in (base, base + best.gain))
     at = FrozenMap({n: whole.value(n) for n in whole.names})
     text = advice(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked))
+    if whole.deterministic:
+        text += " The data have no noise: the misfit stands for it in these intervals."
     others = tuple(_others(ranked, best))
     count = len({r.trial for r in ranked})
     return Recommendation(best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text)

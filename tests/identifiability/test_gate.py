@@ -119,8 +119,11 @@ def call(*arguments):
 
 
 def test_the_commands(study) -> None:
-    result = call("identify", study, "--quiet")
+    result = call("identify", study)
     assert result.exit_code == 0, result.output
+    said = result.stdout.splitlines()
+    assert said[0].startswith("k     identifiable: It is known to ±") and said[1].startswith("flat  ")
+    assert any(line.startswith("Measure next: ") for line in said) and said[-1].startswith("identify: done")
     folder = study.parent / "study-results"
     report = json.loads((folder / "identifiability.json").read_text())
     assert {"schema", "study", "model", "software", "seed"} <= set(report)

@@ -181,13 +181,19 @@ def test_more_unknowns_than_rows() -> None:
     data = measured(plant, {"a": 1, "b": 2}, 0.1, t=np.array([0.5]))
     report = identifiability(plant, [data], [Free("a", 1, -50, 50), Free("b", 1, -50, 50)], starts=2)
     assert len(report.identifiable) == 1 and any("1 measured values cannot" in n for n in report.notes)
+    data = measured(plant, {"a": 1, "b": 2}, 0.1, t=np.array([0.0, 0.5]))
+    report = identifiability(plant, [data], [Free("a", 1, -50, 50), Free("b", 1, -50, 50)], starts=2)
+    assert any("2 measured values for as many unknowns" in n for n in report.notes)
 
 
 def test_an_experiment_that_fails_is_named() -> None:
     plant = closed(failing, a=1.0)
     good = closed(decay, a=1.0, k=1.0)
-    with pytest.raises(SimulationError, match="experiment 'e'"):
+    with pytest.raises(
+        SimulationError, match="experiment 'e', at the start values: nothing can be told: the run does"
+    ) as e:
         identifiability(plant, [measured(good, {}, 0.1)], [Free("a", 1, 0, 2)], starts=2)
+    assert "leave it out" in e.value.hint
 
 
 def test_nothing_measured_and_unknown_names_are_refused() -> None:
