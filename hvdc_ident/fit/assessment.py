@@ -20,6 +20,7 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import compared_rows
 from hvdc_ident.fit.residual_tests import ljung_box
 from hvdc_ident.fit.result import FitResult
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
 
@@ -78,7 +79,7 @@ def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[st
             rho=FrozenMap(),
             band=None,
             priors=FrozenMap(),
-            weights=_weights(result),
+            weights=FrozenMap(_weights(result)),
         )
         theta = alone.start
         known = len(alone.free)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.estimate import Executor, Progress, fit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual_tests import residual_tests
-from hvdc_ident.fit.result import FitResult, Status
+from hvdc_ident.fit.result import Covariance, FitResult, Status
 from hvdc_ident.frozen import FrozenMap
 
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
@@ -32,9 +33,10 @@ def fit_individually(
     problem: Problem,
     groups: Sequence[Group],
     *,
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
-    optimiser: Optimiser | None = None,
+    optimiser: Optimiser | str | None = None,
+    whiten: str = "no",
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FitResult:
@@ -50,12 +52,14 @@ def fit_individually(
     results = []
     for group in groups:
         result = fit(
-            _part(problem, group, current),
+            part_of(problem, group, current),
             starts=starts,
             seed=seed,
             optimiser=optimiser,
+            whiten=whiten,
             executor=executor,
             progress=progress,
+            assess=False,
         )
         current |= {n: result.values[n] for n in group.parameters if n in result.values and n in result.estimates}
         results.append(result)
@@ -85,7 +89,7 @@ def _check(problem: Problem, groups: Sequence[Group]) -> None:
                 raise unknown_name("measured output", name, problem.outputs, where="fit groups")
 
 
-def _part(problem: Problem, group: Group, current: dict[str, float]) -> Problem:
+def part_of(problem: Problem, group: Group, current: dict[str, float]) -> Problem:
     """The problem of one group alone."""
     mine = tuple(f for f in problem.free if f.name in group.parameters)
     others = {n: v for n, v in current.items() if n not in group.parameters}
@@ -97,6 +101,7 @@ def _part(problem: Problem, group: Group, current: dict[str, float]) -> Problem:
         held=problem.held | others,
         why=problem.why | why,
         conditional_on=FrozenMap({f.name: (*problem.conditional_on.get(f.name, ()), *others) for f in mine}),
+        rho=FrozenMap({o: m for o, m in problem.rho.items() if not group.outputs or o in group.outputs}),
     )
 
 
@@ -119,7 +124,13 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
         for output, source in r.noise_source.items():
             if source != "given":
                 weights[output] = next(s[output] for s in r.sigma.values() if output in s)
-    whole = problem.with_(weights={**problem.weights, **weights})
+    models = {o: m for r in results for o, m in r.whitening.items()}
+    whole = replace(
+        problem,
+        weights=problem.weights | weights,
+        rho=problem.rho | models,
+        experiments=tuple(_with_known(e, nuisance) for e in problem.experiments),
+    )
     shift = {f"{e}:{n}": v.value for e, group in nuisance.items() for n, v in group.items()}
     theta = np.array([current.get(u.name, shift.get(u.name, u.start)) for u in whole.unknowns])
     result = FitResult(
@@ -140,10 +151,40 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
         effective_samples=FrozenMap({k: v for r in results for k, v in r.effective_samples.items()}),
         correlation={k: v for r in results for k, v in r.correlation.items()},
         starts=tuple(replace(s, group=i) for i, r in enumerate(results) for s in r.starts),
+        loss=problem.loss.name,
+        whitening=models,
+        dof=min((r.dof for r in results if r.dof is not None), default=None),
+        covariance=_together(results),
     )
     try:
-        blocks = whole.blocks(theta, derivatives=False)
+        cost = whole.cost(theta)
+        blocks = whole.blocks(theta, derivatives=False, in_time=True)
     except SimulationError as error:
         return replace(result, status="failed", message=f"{message}; all estimates together: {error}")
-    cost = sum(0.5 * float(b.residual @ b.residual) for b in blocks)
-    return replace(result, cost=cost, residual_tests=residual_tests(blocks, whole.fitted_experiments))
+    squares = sum(float(b.residual @ b.residual) for b in blocks)
+    spare = sum(b.residual.size for b in blocks) - theta.size
+    tests = residual_tests(blocks, whole.fitted_experiments)
+    result = replace(result, cost=cost, chi2_per_dof=squares / spare if spare > 0 else None, residual_tests=tests)
+    return assessed(whole, result)
+
+
+def _with_known(experiment: Experiment, nuisance: Mapping[str, Mapping[str, object]]) -> Experiment:
+    """The experiment without nuisances that no group's fit has estimated."""
+    known = nuisance.get(experiment.name, {})
+    if experiment.role != "fit":
+        return experiment
+    return experiment.with_(nuisance=tuple(n for n in experiment.nuisance if n in known))
+
+
+def _together(results: Sequence[FitResult]) -> Covariance | None:
+    """The covariances side by side: groups fitted one after the other are taken as independent."""
+    parts = [r.covariance for r in results if r.covariance is not None]
+    names = tuple(n for c in parts for n in c.names)
+    if not parts or len(set(names)) < len(names):
+        return None  # a nuisance that two groups estimated
+    matrix = np.zeros((len(names), len(names)))
+    place = 0
+    for c in parts:
+        matrix[place : place + len(c.names), place : place + len(c.names)] = c.matrix
+        place += len(c.names)
+    return Covariance(names, matrix, min(c.dof for c in parts))

@@ -24,7 +24,8 @@ def fit_each(
     runs: Mapping[str, Sequence[str]] | None = None,
     starts: int = 1,
     seed: int = 0,
-    optimiser: Optimiser | None = None,
+    optimiser: Optimiser | str | None = None,
+    whiten: str = "no",
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -37,7 +38,7 @@ def fit_each(
     number is `on_bound`. Raises UnknownNameError for a run's experiment that is not fitted, StudyError for an empty run.
     """
     parts = _parts(problem, runs)
-    one = partial(_alone, starts=starts, seed=seed, optimiser=optimiser)
+    one = partial(_alone, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten)
     outcomes: Iterator[FitResult] = (executor.map if executor else map)(one, list(parts.values()))
     results: dict[str, FitResult] = {}
     for name, result in zip(parts, outcomes, strict=True):
@@ -61,8 +62,8 @@ def _parts(problem: Problem, runs: Mapping[str, Sequence[str]] | None) -> dict[s
     return parts
 
 
-def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | None) -> FitResult:
-    return fit(problem, starts=starts, seed=seed, optimiser=optimiser)
+def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | str | None, whiten: str) -> FitResult:
+    return fit(problem, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten, assess=False)
 
 
 def _row(free: Free, results: Mapping[str, FitResult]) -> dict[str, Any]:
