@@ -72,7 +72,7 @@ class DaskPool:
         [shared] = self._client.scatter([content], broadcast=True)
         batches = _batches(items)
         size = {}
-        running = as_completed(with_results=False, raise_errors=False)
+        running = as_completed(loop=self._client.loop, with_results=False, raise_errors=False)
 
         def send(batch: list[tuple[int, Any]]) -> None:
             future = self._client.submit(_do, name, shared, batch, pure=False, retries=0)
