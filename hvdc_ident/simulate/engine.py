@@ -15,6 +15,7 @@ from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unk
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.result import Simulation, Statistics
 from hvdc_ident.simulate.structure import NAMES, Structure
@@ -74,8 +75,8 @@ class Engine:
 
     # --- the start ---
 
-    def start(self, p: Array, u: Array) -> tuple[Array, Array]:
-        """The steady state and held values at parameters p and inputs u, as the flat vectors y and w with their rows.
+    def start(self, p: Array, u: Array, time: float = 0.0) -> tuple[Array, Array]:
+        """The steady state and held values at parameters p, inputs u and a time, as the flat vectors y and w with their rows.
 
         Raises SteadyStateError where Newton's method and its fallbacks find none.
         """
@@ -88,11 +89,11 @@ class Engine:
         m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
         for guess in self._guesses:
             y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width))
-            y[:n], w[1 : 1 + s.nu] = guess, u
+            y[:n], w[0], w[1 : 1 + s.nu] = guess, time, u
             jac = np.zeros((n + extra, n + extra))
             if rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst) == FOUND:
                 return y, w
-        return fallback(self.structure, self._address, p, u, self._guesses[0])
+        return fallback(self.structure, self._address, p, u, self._guesses[0], time)
 
     @cached_property
     def _guesses(self) -> list[Array]:
@@ -163,7 +164,7 @@ class Engine:
                 for i in inputs
             ]
         )
-        y, w = self.start(p, u)
+        y, w = self.start(p, u, begin)
         constants = self.constants(p)
         pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
         times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
@@ -289,7 +290,7 @@ def _constant(value: float) -> InputSignal:
 
 
 def simulate(
-    model: Model,
+    model: AnyModel,
     experiment: Experiment,
     values: Mapping[str, float] | None = None,
     sensitivities: Sequence[str] = (),
@@ -305,11 +306,17 @@ def simulate(
     all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
     the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
     The name of an input among the sensitivities asks for the derivative by a constant added to that input all along.
+    A model that is external (an FMU) runs itself, from its own start; `method` is then its own.
 
     Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
     """
     from hvdc_ident.simulate.recording import with_offsets, with_recording
 
+    if not isinstance(model, Model):
+        chosen = tuple(model.outputs) if outputs is None else outputs
+        tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
+        found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol)
+        return found
     plant = with_recording(model, experiment)
     given = {**experiment.values, **(values or {})}
     names = [*plant.parameters, *plant.inputs]

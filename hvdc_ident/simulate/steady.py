@@ -15,7 +15,9 @@ Equations = Callable[[Array], tuple[Array, Array]]
 ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
 
 
-def fallback(structure: Structure, address: NDArray[np.int64], p: Array, u: Array, guess: Array) -> tuple[Array, Array]:
+def fallback(
+    structure: Structure, address: NDArray[np.int64], p: Array, u: Array, guess: Array, time: float = 0.0
+) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
     from hvdc_ident.simulate.machine import evaluate
     from hvdc_ident.simulate.steps import MODES, REST, REST_JAC, REST_P
@@ -24,7 +26,7 @@ def fallback(structure: Structure, address: NDArray[np.int64], p: Array, u: Arra
     inner, extra = s.nx + s.nz, s.nd + s.nq
     n = inner + extra
     y, w, m = np.zeros(inner * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width)), np.zeros(max(s.ns, 1))
-    w[1 : 1 + s.nu] = u
+    w[0], w[1 : 1 + s.nu] = time, u
 
     def equations(v: Array) -> tuple[Array, Array]:
         y[:inner], w[1 + s.nu : 1 + s.nu + extra] = v[:inner], v[inner:]
