@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 
 import sympy as sp
 
-from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.errors import InputError, ModelError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.expression.parser import parse
 from hvdc_ident.frozen import FrozenMap
@@ -68,10 +68,13 @@ class EffectParameter:
 
 
 class Additions:
-    """What an effect adds to the model: states, delays, sampled values, signals, under names that are free."""
+    """What an effect adds to the model: states, delays, sampled values, signals, under names that are free.
 
-    def __init__(self, model: Model, prefix: str) -> None:
-        self.model, self._prefix = model, prefix
+    kind: of the slot, one of SLOT_KINDS. circular: whether the slot lies on an algebraic loop.
+    """
+
+    def __init__(self, model: Model, prefix: str, kind: str, circular: bool) -> None:
+        self.model, self._prefix, self.kind, self.circular = model, prefix, kind, circular
 
     def state(
         self, label: str, derivative: Callable[[sp.Symbol], sp.Expr], rest: sp.Expr | None = None, unit: str = ""
@@ -265,23 +268,39 @@ def _at_one(
     model: Model, place: str, use: EffectUse, effect: Effect, symbols: Mapping[str, sp.Expr], where: str
 ) -> Model:
     """The model with the effect at one of its slots."""
+    kind, name = slot(model, place)
+    circular = kind in ("signal", "algebraic") and _leads_back(model, name)
 
     def rewrite(m: Model, u: sp.Expr) -> tuple[Model, sp.Expr]:
         p = dict(symbols)
         # The slot's own name stands for what it was before the effect: after it, it would run in a circle.
-        own = {symbol(slot(m, place)[1]): u} if slot(m, place)[0] in ("signal", "algebraic") else {}
+        own = {symbol(name): u} if kind in ("signal", "algebraic") else {}
         if effect.needs_source:
             p["from"] = _source(m, use.source, where).xreplace(own)
         if effect.needs_expression:
             p["expression"] = _term(use, symbols, where).xreplace(own)
-        add = Additions(m, f"{use.label}_{place.replace('.', '_')}")
+        add = Additions(m, f"{use.label}_{place.replace('.', '_')}", kind, circular)
         y = effect.rewrite(u, p, add)
         return add.model, y
 
     try:
         return rewritten(model, place, use.label, rewrite)
-    except ModelError as e:
+    except InputError as e:
         raise e.at(where) from None
+
+
+def _leads_back(model: Model, name: str) -> bool:
+    """Whether a signal or unknown is computed from itself, through other signals and unknowns alone."""
+    equations = {n: s.value for n, s in model.signals.items()} | {n: a.equation for n, a in model.algebraic.items()}
+    seen: set[str] = set()
+    stack = [name]
+    while stack:
+        used = {s.name for s in equations[stack.pop()].free_symbols} & equations.keys()
+        if name in used:
+            return True
+        stack.extend(used - seen)
+        seen |= used
+    return False
 
 
 def _parameters(use: EffectUse, effect: Effect, where: str) -> Mapping[str, EffectParameter]:

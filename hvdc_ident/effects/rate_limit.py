@@ -11,8 +11,8 @@ from hvdc_ident.frozen import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The state that follows u no faster than the rate."""
-    return add.state("y", lambda y: clip((u - y) / FOLLOW, -p["rate"], p["rate"]))
+    """The state that follows u no faster than the rate; at rest it is u, which a clipped derivative hides from far off."""
+    return add.state("y", lambda y: clip((u - y) / FOLLOW, -p["rate"], p["rate"]), rest=u)
 
 
 EFFECT = Effect(

@@ -1,0 +1,79 @@
+"""A quantiser: u rounded to multiples of step."""
+
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
+from hvdc_ident.expression.functions import clip, where
+from hvdc_ident.frozen import FrozenMap
+
+BITS = 24
+"""Levels from -2^(BITS - 1) to 2^(BITS - 1) steps; beyond, the last one holds, as in a converter."""
+EDGE = 2e-3
+"""Of a step: over how much of u a level changes into the next inside the model (a recorded output jumps)."""
+BORDER = 0.3
+"""Of a step: where, between two edges, the count of levels moves on. No value that a signal is likely to rest at."""
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """The level that u is nearest to.
+
+    In a loop that comes to rest between two levels, an ideal quantiser never rests: the loop slides along the edge. An
+    edge of finite width has that sliding rest as its steady state (Filippov's solution, up to the width). Within an
+    algebraic loop a jump may leave no solution at all: there the level is taken on within 0.2 ms.
+    """
+    step = p["step"]
+    if add.kind == "output":
+        return step * _floor(add.signal("scaled", u / step + sp.Float(0.5)), add)
+    level = _floor(add.signal("scaled", u / step + sp.Float(BORDER)), add)
+    within = u / step - level - sp.Float(0.5)
+    rounded = step * (level + clip(within / EDGE + sp.Float(0.5), 0, 1))
+    if not add.circular:
+        return rounded
+    rounded = add.signal("rounded", rounded)
+    return add.state("y", lambda y: (rounded - y) / FOLLOW)
+
+
+def _floor(x: sp.Expr, add: Additions) -> sp.Expr:
+    """The largest integer not above x.
+
+    Found by folding, as a Gray-code converter does it: |x|, less half of the range, its magnitude, and so on. One switch
+    a bit finds any of 2^BITS levels, and at each border exactly one of them turns, with nothing else jumping for a moment.
+    """
+    folds = [x]
+    for bit in range(BITS - 2, -1, -1):
+        folds.append(add.signal(f"fold{bit}", sp.Abs(folds[-1]) - 2**bit))
+    level: sp.Expr = sp.Float(0.5)
+    for bit, fold in enumerate(reversed(folds)):
+        half = 2 ** (bit - 1) if bit else 0
+        level = add.signal(f"level{bit}", where(fold >= 0, 1, -1) * (level + half))
+    return level - sp.Float(0.5)
+
+
+EFFECT = Effect(
+    name="quantisation",
+    summary="u rounded to multiples of step",
+    parameters=FrozenMap(
+        {
+            "step": EffectParameter(
+                0.01,
+                neutral=0.0,
+                description="distance of two levels",
+                measure="range",
+                probes=(0.02, 0.07, 0.2),
+                search=(1e-3, 1.0),
+            )
+        }
+    ),
+    rewrite=rewrite,
+    sentence="{at} is rounded to multiples of {step}",
+    excited_by="slow ramps both ways over several levels",
+    confusable=FrozenMap(
+        {
+            "deadband": "slow ramps both ways: one flat piece at 0 against many",
+            "backlash": "slow ramps both ways: the play is flat at turns only",
+            "sample-hold": "two ramps of different slope: samples are even in time, levels even in size",
+        }
+    ),
+)

@@ -1,0 +1,293 @@
+"""What each effect does to a signal, against answers from elsewhere: closed forms, numpy, scipy's linear systems, play operators."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+from scipy import integrate, signal
+
+from hvdc_ident import load_study
+from hvdc_ident.effects import EffectUse, alone, effects
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize import find_operating_point, linearize
+from hvdc_ident.model import Model
+from hvdc_ident.simulate import simulate
+
+T = np.linspace(0.0, 1.0, 2001)
+# Corners at rows: nothing but ramps, a jump and rest, through 0 and both signs.
+U = InputSignal.corners([(0.1, 0.3), (0.25, 0.9), (0.3, 0.9), (0.3, 0.2), (0.45, -0.7), (0.6, -0.1), (0.8, 0.5)])
+SOURCE = InputSignal.corners([(0.2, 1.0), (0.5, 1.8), (0.7, -0.4)])
+u, s = U(T), SOURCE(T)
+AFTER_JUMP = T != 0.3
+
+
+def passed(name, values, source=False, expression="", time=T, **options):
+    """y of the effect on its own, driven by U (and SOURCE)."""
+    use = EffectUse(name, ("u",), FrozenMap(values), source="source" if source else "", expression=expression)
+    inputs = {"u": U} | ({"source": SOURCE} if source else {})
+    run = simulate(alone(use, source), experiment("bench", time, inputs), rtol=1e-10, **options)
+    return run["y"]
+
+
+def linear(numerator, denominator):
+    """scipy's response to U minus its start, with the start put back: every system here has gain 1."""
+    order = np.argsort(np.r_[T, 0.3], kind="stable")  # the jump as two rows
+    time = np.r_[T, 0.3][order]
+    values = np.r_[u, 0.9][order]
+    first = np.flatnonzero(time == 0.3)[0]
+    values[first : first + 2] = [0.9, 0.2]
+    y = []
+    state = None
+    for part in (slice(0, first + 1), slice(first + 1, None)):
+        t, v = time[part], values[part] - 0.3
+        system = signal.TransferFunction(numerator, denominator).to_ss()
+        _, out, states = signal.lsim(system, v, t - t[0], X0=state)
+        state = np.atleast_2d(states)[-1] if states.ndim > 1 else states[-1:]
+        y.append(np.squeeze(out) + 0.3)
+    return np.concatenate([y[0][:-1], y[1]])
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "numerator", "denominator"),
+    [
+        ("lag", {"T": 0.03}, [1.0], [0.03, 1.0]),
+        ("inductance", {"L": 0.02, "R": 0.5}, [1.0], [0.04, 1.0]),
+        ("second-order", {"wn": 60.0, "zeta": 0.3}, [60.0**2], [1.0, 36.0, 60.0**2]),
+        ("second-order", {"wn": 60.0, "zeta": 1.4}, [60.0**2], [1.0, 168.0, 60.0**2]),
+        ("lead-lag", {"T1": 0.05, "T2": 0.02}, [0.05, 1.0], [0.02, 1.0]),
+        ("lead-lag", {"T1": 0.005, "T2": 0.02}, [0.005, 1.0], [0.02, 1.0]),
+    ],
+)
+def test_linear_ones_are_scipys(name, values, numerator, denominator):
+    np.testing.assert_allclose(passed(name, values)[AFTER_JUMP], linear(numerator, denominator)[AFTER_JUMP], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("limit", {"level": 0.4}, np.maximum(-0.4, np.minimum(0.4, u))),
+        ("saturation", {"level": 0.5}, 0.5 * (1 - 2 / (np.exp(4 * u) + 1))),
+        ("deadband", {"width": 0.15}, np.sign(u) * np.maximum(np.abs(u) - 0.15, 0.0)),
+        ("gain", {"k": -1.3}, u * -1.3),
+        ("offset", {"c": -0.2}, u - 0.2),
+    ],
+)
+def test_curves(name, values, expected):
+    np.testing.assert_allclose(passed(name, values), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("loss", {"a": 0.01, "b": 0.2, "c": 0.05}, u - np.polyval([0.05, 0.2, 0.01], np.abs(s))),
+        ("loss", {"c": 0.05}, u - 0.05 * s * s),
+        ("conductance", {"g": 0.1}, u - 0.1 * s),
+        ("coupling", {"k": -0.3}, u - 0.3 * (s - 1.0)),
+        ("droop", {"k": 0.3}, u - 0.3 * (s - 1.0)),
+        ("droop", {"k": 0.3, "deadband": 0.25}, u - 0.3 * np.sign(s - 1) * np.maximum(np.abs(s - 1) - 0.25, 0.0)),
+    ],
+)
+def test_what_another_signal_brings(name, values, expected):
+    np.testing.assert_allclose(passed(name, values, source=True), expected, atol=1e-12)
+
+
+def test_delay_shifts():
+    late = passed("delay", {"T": 0.0375})
+    beside = np.abs(T - 0.3375) > 1e-9
+    np.testing.assert_allclose(late[beside], U(T - 0.0375)[beside], atol=1e-10)
+
+
+def test_window_mean_is_the_difference_of_integrals():
+    fine = np.linspace(-0.1, 1.0, 1_100_001)  # with every corner: the midpoint rule is exact
+    area = np.concatenate([[0.0], np.cumsum(U((fine[1:] + fine[:-1]) / 2) * np.diff(fine))])
+    expected = (np.interp(T, fine, area) - np.interp(T - 0.0375, fine, area)) / 0.0375
+    np.testing.assert_allclose(passed("window-mean", {"T": 0.0375}), expected, atol=1e-8)
+
+
+def test_rate_limit_follows_its_definition_and_the_ideal_one():
+    y = passed("rate-limit", {"rate": 5.0})
+    found = [np.array([0.3])]
+    for t0, t1 in ((0.0, 0.3), (0.3, 1.0)):  # one stretch on each side of the jump
+
+        def rate(t, y, end=t1):
+            return np.maximum(-5.0, np.minimum(5.0, (U(t if t < end else np.nextafter(end, 0)) - y) * 5000.0))
+
+        rows = T[(t0 < T) & (t1 >= T)]
+        run = integrate.solve_ivp(rate, (t0, t1), found[-1][-1:], "LSODA", rows, rtol=1e-9, atol=1e-11, max_step=1e-3)
+        found.append(run.y[0])
+    np.testing.assert_allclose(y, np.concatenate(found), atol=2e-6)
+    ideal = u.copy()
+    for k in range(1, T.size):
+        ideal[k] = ideal[k - 1] + np.clip(u[k] - ideal[k - 1], -5.0 * (T[k] - T[k - 1]), 5.0 * (T[k] - T[k - 1]))
+    np.testing.assert_allclose(y, ideal, atol=5.0 * (2e-4 + 5e-4))
+
+
+def test_backlash_is_the_play_operator():
+    fine = np.linspace(0.0, 1.0, 200_001)
+    v = U(fine)
+    y = np.empty_like(v)
+    y[0] = v[0]
+    for k in range(1, v.size):  # Krasnosel'skii: the least movement that keeps |u - y| within half of the play
+        y[k] = min(max(y[k - 1], v[k] - 0.1), v[k] + 0.1)
+    mine = passed("backlash", {"width": 0.2})
+    away = (T < 0.3) | (T > 0.302)  # the pull after the jump takes some 0.2 ms
+    np.testing.assert_allclose(mine[away], np.interp(T, fine, y)[away], atol=2e-4 * 6.0 * 1.05)
+
+
+def test_quantisation_rounds():
+    step = 0.037
+    expected = step * np.round(u / step)
+    edge = np.abs(u / step - np.floor(u / step) - 0.5) < 1.1e-3
+    assert edge.mean() < 0.01
+    mine = passed("quantisation", {"step": step})
+    np.testing.assert_allclose(mine[~edge], expected[~edge], atol=1e-12)
+    assert np.abs(mine - expected).max() <= step * (1 + 1e-9)
+    recorded = Model("r", inputs={"u": 0.0}, outputs={"y": "u"}).with_effects(
+        [{"effect": "quantisation", "at": "outputs.y", "parameters": {"step": step}}]
+    )
+    y = simulate(recorded, experiment("bench", T, {"u": U}))["y"]
+    tie = np.abs(u / step - np.floor(u / step) - 0.5) < 1e-9
+    np.testing.assert_allclose(y[~tie], expected[~tie], atol=1e-12)
+    assert np.unique(np.round(y / step)).size > 40
+
+
+def test_sample_hold_holds_what_it_took():
+    period, compute = 0.01371, 0.004
+    y = passed("sample-hold", {"Ts": period, "compute": compute})
+    taken = np.floor((T - compute) / period) * period
+    expected = np.where(taken < 0, 0.3, U(np.maximum(taken, 0.0)))
+    np.testing.assert_allclose(y, expected, atol=1e-9)
+
+
+def test_disturbance_is_a_sine_of_the_experiments_time():
+    y = passed("disturbance", {"amplitude": 0.2, "frequency": 7.0, "phase": 0.4})
+    np.testing.assert_allclose(y - u, 0.2 * np.imag(np.exp(1j * (14 * np.pi * T + 0.4))), atol=1e-10)
+
+
+def test_term_is_what_it_says():
+    y = passed("term", {"k": 0.3, "c": -0.1}, expression="k*u**3 + c*abs(u)")
+    np.testing.assert_allclose(y, u + 0.3 * u * u * u - 0.1 * np.abs(u), atol=1e-12)
+
+
+def test_a_delay_in_a_loop_is_the_method_of_steps():
+    """x' = -x(t - 1) from x = 1: polynomials, interval by interval."""
+    model = Model("m", states={"x": {"derivative": "-x", "start": 1.0}}, outputs={"seen": "x"})
+    late = model.with_effects([{"effect": "delay", "at": "x", "parameters": {"T": 1.0}}])
+    t = np.linspace(0.0, 3.0, 61)
+    expected = np.select(
+        [t <= 1, t <= 2, t <= 3],
+        [1 - t, 1 - t + (t - 1) ** 2 / 2, 1 - t + (t - 1) ** 2 / 2 - (t - 2) ** 3 / 6],
+    )
+    np.testing.assert_allclose(simulate(late, experiment("e", t), outputs=("x",), rtol=1e-10)["x"], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("lag", {"T": 0.02}, lambda s: 1 / (1 + 0.02 * s)),
+        ("inductance", {"L": 0.02, "R": 4.0}, lambda s: 1 / (1 + 0.005 * s)),
+        ("second-order", {"wn": 50.0, "zeta": 0.2}, lambda s: 2500 / (s * s + 20 * s + 2500)),
+        ("lead-lag", {"T1": 0.03, "T2": 0.01}, lambda s: (1 + 0.03 * s) / (1 + 0.01 * s)),
+        ("delay", {"T": 0.01}, lambda s: np.exp(-0.01 * s)),
+        ("window-mean", {"T": 0.01}, lambda s: (1 - np.exp(-0.01 * s)) / (0.01 * s)),
+        (
+            "sample-hold",
+            {"Ts": 0.01, "compute": 0.002},
+            lambda s: np.exp(-0.002 * s) * (1 - np.exp(-0.01 * s)) / (0.01 * s),
+        ),
+        ("rate-limit", {"rate": 3.0}, lambda s: 1 / (1 + 2e-4 * s)),
+        ("limit", {"level": 0.6}, lambda s: 1 + 0 * s),
+        ("limit", {"level": 0.4}, lambda s: 0 * s),
+        ("deadband", {"width": 0.1}, lambda s: 1 + 0 * s),
+        ("deadband", {"width": 0.6}, lambda s: 0 * s),
+        ("backlash", {"width": 0.1}, lambda s: 0 * s),
+        ("quantisation", {"step": 0.1}, lambda s: 0 * s),
+        ("saturation", {"level": 0.5}, lambda s: 1 / np.cosh(1.0) ** 2 + 0 * s),
+        ("gain", {"k": 1.2}, lambda s: 1.2 + 0 * s),
+        ("offset", {"c": 0.2}, lambda s: 1 + 0 * s),
+        ("disturbance", {"amplitude": 0.2}, lambda s: 1 + 0 * s),
+        ("term", {"k": 0.2}, lambda s: 1 + 0.2 * 3 * 0.25 + 0 * s),
+    ],
+)
+def test_it_linearises(name, values, expected):
+    use = EffectUse(name, ("u",), FrozenMap(values), expression="k*u**3" if name == "term" else "")
+    model = alone(use)
+    found = linearize(model, find_operating_point(model, {"u": 0.5}))
+    omega = np.array([3.0, 40.0, 200.0])
+    np.testing.assert_allclose(found.response(omega).ravel(), expected(1j * omega), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "gain"),
+    [
+        ("coupling", {"k": 0.3}, 0.3),
+        ("droop", {"k": 0.3}, -0.3),
+        ("droop", {"k": 0.3, "deadband": 0.1}, 0.0),
+        ("conductance", {"g": 0.3}, -0.3),
+        ("loss", {"b": 0.2, "c": 0.1}, -(0.2 + 2 * 0.1 * 2.0)),
+    ],
+)
+def test_those_with_another_signal_linearise(name, values, gain):
+    model = alone(EffectUse(name, ("u",), FrozenMap(values), source="source"), source=True)
+    found = linearize(model, find_operating_point(model, {"u": 0.5, "source": 2.0}))
+    np.testing.assert_allclose(found.response(np.array([40.0])).ravel(), [1.0, gain], atol=1e-12)
+
+
+STUDY = """
+schema = 1
+[model]
+source = "plant.toml"
+"""
+PLANT = """
+schema = 1
+name = "plant"
+[parameters]
+R = {value = 0.5, min = 0.0}
+[inputs]
+v = {value = 1.0}
+w = {value = 0.2}
+[states]
+x = {derivative = "i - x"}
+[signals]
+i = "v/R"
+[outputs]
+x = "x"
+"""
+
+
+def test_study_files_put_effects_on(tmp_path):
+    tables = [
+        {"effect": "lag", "at": ["v", "w"], "parameters": {"T": 0.0016}},
+        {"effect": "droop", "at": "v", "from": "x", "parameters": {"k": 0.1, "deadband": 0.01}},
+        {"effect": "inductance", "at": "i", "parameters": {"L": 0.1, "R": "R"}},
+        {"effect": "term", "at": "x", "expression": "k*x*abs(w)", "parameters": {"k": 0.02}},
+    ]
+    text = STUDY
+    for table in tables:
+        text += "[[model.effect]]\n"
+        for key, value in table.items():
+            inline = ", ".join(f"{k} = {v!r}" for k, v in value.items()) if isinstance(value, dict) else ""
+            text += f"{key} = {{{inline}}}\n" if inline else f"{key} = {value!r}\n"
+    assert tomllib.loads(text)["model"]["effect"] == tables
+    (tmp_path / "plant.toml").write_text(PLANT)
+    (tmp_path / "study.toml").write_text(text)
+    model = load_study(tmp_path / "study.toml").model
+    added = {"lag_v_T", "droop_v_k", "droop_v_deadband", "inductance_i_L", "term_x_k"}
+    assert set(model.parameters) == {"R"} | added
+    assert {effects()[t["effect"]].name for t in tables} == {"lag", "droop", "inductance", "term"}
+    steady = simulate(model, experiment("e", [0.0, 1.0]))
+    assert np.ptp(steady["x"]) < 1e-7
+
+
+def test_a_disturbance_is_at_rest_in_the_value_it_has_at_the_start():
+    model = Model("m", inputs={"u": 0.5}, states={"x": "u - x"}, outputs={"x": "x"})
+    shaken = model.with_effects(
+        [{"effect": "disturbance", "at": "u", "parameters": {"amplitude": 0.1, "frequency": 0.2, "phase": 0.3}}]
+    )
+    run = simulate(shaken, experiment("e", np.linspace(2.0, 3.0, 5)), sensitivities=["disturbance_u_amplitude"])
+    sine = np.sin(2 * np.pi * 0.2 * 2.0 + 0.3)
+    assert run["x"][0] == pytest.approx(0.5 + 0.1 * sine)
+    assert run.gradient("x")[0, 0] == pytest.approx(sine)
