@@ -1,4 +1,4 @@
-"""A sympy model as the thing a fit can run."""
+"""A model as the thing a fit can run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import simulate
 from hvdc_ident.simulate.result import Simulation
@@ -17,7 +17,7 @@ from hvdc_ident.simulate.result import Simulation
 class ModelSimulator:
     """The model with its engine: parameters, and runs with sensitivities. It travels to other processes."""
 
-    model: Model
+    model: AnyModel
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
