@@ -62,8 +62,9 @@ class Approximate(Protocol):
 
 def sensitivity_error(simulator: Simulator) -> float:
     """The relative error of the simulator's sensitivities; what the engine's own have where it does not say."""
-    own = float(simulator.sensitivity_error) if isinstance(simulator, Approximate) else 0.0
-    return max(own, SENSITIVITY_ERROR)
+    wrapped = (simulator, getattr(simulator, "model", None))  # a model that runs itself may say it for its simulator
+    own = [float(s.sensitivity_error) for s in wrapped if isinstance(s, Approximate)]
+    return max([*own, SENSITIVITY_ERROR])
 
 
 def inputs_of(simulator: Simulator, experiments: Sequence[Experiment]) -> dict[str, Input]:

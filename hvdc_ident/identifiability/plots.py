@@ -56,10 +56,21 @@ def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> No
             axes.plot([at], [row], marker="|" if end is not None else arrow, color=LINE, markersize=8)
     axes.set_xscale("symlog", linthresh=smallest)
     axes.set_xlim(-1.5 * reach, 1.5 * reach)
+    ticks = _decades(smallest, reach)
+    axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
+    axes.set_xticks([], minor=True)
     axes.set_yticks(range(len(names)), [f"{n}\n{parameters[n]['verdict']}" for n in names], fontsize=7)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlabel("95 % interval, % of the value (of the range where 0 is admissible); x: held", fontsize=8)
     _plain(axes)
+
+
+def _decades(low: float, high: float) -> list[float]:
+    """0 and powers of ten on both sides of it, at most about four a side, from above low up to high."""
+    first, last = int(np.floor(np.log10(low))) + 1, int(np.floor(np.log10(high)))
+    powers = range(last, first - 1, -max(1, (last - first + 4) // 4))
+    sides = [10.0**k for k in powers]
+    return sorted([-s for s in sides] + [0.0] + sides)
 
 
 def _relative(verdict: Mapping[str, Any]) -> tuple[float | None, float | None] | None:

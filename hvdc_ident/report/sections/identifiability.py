@@ -10,6 +10,9 @@ from hvdc_ident.report.profiles import intervals, pair_map, profiles
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
+SHOWN = 5e-4
+"""A smaller share of the information is none."""
+
 
 def _render(results: Results) -> str:
     found = results.get("identifiability")
@@ -85,11 +88,12 @@ def _experiments(found: dict[str, Any]) -> str:
     names: list[str] = [n for line in list(experiments.values())[:1] for n in line.get("information") or {}]
     if not names:
         return ""
-    rows = [
-        [text(e), *(f"{number(100.0 * line['information'].get(n, 0.0), 3)} %" for n in names)]
-        for e, line in experiments.items()
-    ]
+    rows = [[text(e), *(_percent(line["information"].get(n, 0.0)) for n in names)] for e, line in experiments.items()]
     return "<h3>Share of the information, by experiment</h3>" + table(["experiment", *map(text, names)], rows)
+
+
+def _percent(share: float) -> str:
+    return f"{number(100.0 * share, 3)} %" if share >= SHOWN else "–"
 
 
 def _next(found: dict[str, Any]) -> str:

@@ -81,9 +81,9 @@ class Ask:
 
     def _operating(self, source: Source) -> None:
         """Finds the operating point; that the machine code may have to be made first is not counted as time."""
-        begun = time.monotonic()
+        begun = time.thread_time()
         _ = source.point
-        self.deadline += time.monotonic() - begun
+        self.deadline += time.thread_time() - begun
 
     def _known_starts(self) -> dict[str, Start]:
         """A free start that is one of the parameters asked for is given by it."""
@@ -138,7 +138,7 @@ class Ask:
         if q.highest and len(found.pivots) < len(self.names):
             return True  # it is asked again at the full order
         self._operating(q.source)
-        now = time.monotonic()
+        now = time.thread_time()
         try:
             real = _Precise(RealPoints(q, Random(self.seed), now + CHECK * (self.deadline - now)))()
         except (OutOfTime, NotRational, ArithmeticError):

@@ -129,7 +129,7 @@ class FieldPoints:
     def __call__(self) -> Rows:
         """The rows at one more point."""
         for _ in range(TRIES):
-            if time.monotonic() > self.deadline:
+            if time.thread_time() > self.deadline:
                 raise OutOfTime
             try:
                 return rows(self.q, self.ring, self._base(), self._jump, self.random, self.deadline)
