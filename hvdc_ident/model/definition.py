@@ -165,6 +165,13 @@ class Model:
 
         return parameterised(self, name)
 
+    def tied(self, ties: Mapping[str, sp.Expr | str]) -> Model:
+        """The model in which some parameters are expressions of others, as {"KIQ2": "KIQ"}."""
+        from hvdc_ident.expression import parse
+        from hvdc_ident.model.transform import tied
+
+        return tied(self, {n: parse(e) if isinstance(e, str) else e for n, e in ties.items()})
+
     def __getitem__(self, name: str) -> sp.Symbol:
         """The symbol of one of the model's names, for use in expressions."""
         if name not in self.names:

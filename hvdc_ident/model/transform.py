@@ -156,3 +156,35 @@ def parameterised(model: Model, name: str) -> Model:
         signals=FrozenMap({**signals, **model.signals}),
         parameterisations=others,
     )
+
+
+def tied(model: Model, ties: Mapping[str, sp.Expr]) -> Model:
+    """The model in which some parameters are expressions of others; they become signals of their names.
+
+    Raises ModelError for an expression that uses anything but parameters that are not tied, UnknownNameError for a tie
+    of what is no parameter.
+    """
+    free = [n for n in model.parameters if n not in ties]
+    for name, expression in ties.items():
+        if name not in model.parameters:
+            raise unknown_name("parameter", name, model.parameters, where="ties")
+        wrong = sorted(s.name for s in expression.free_symbols if s.name not in free)
+        if wrong:
+            known = wrong[0] in model.parameters
+            raise ModelError(
+                f"the tie of '{name}' uses '{wrong[0]}', which is {'tied itself' if known else 'no parameter'}",
+                where=f"tie of '{name}'",
+                expected="an expression of parameters that are not tied",
+                got=str(expression),
+            )
+    signals = {
+        n: Signal(e, model.parameters[n].unit, model.parameters[n].description or f"tied to {e}")
+        for n, e in ties.items()
+    }
+    others = {k: v for k, v in model.parameterisations.items() if not set(v.replaces) & set(ties)}
+    return replace(
+        model,
+        parameters=model.parameters.without(*ties),
+        signals=FrozenMap({**signals, **model.signals}),
+        parameterisations=FrozenMap(others),
+    )
