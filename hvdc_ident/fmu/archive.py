@@ -1,0 +1,143 @@
+"""What an FMU's file may be before anything of it is unpacked, parsed or run.
+
+An FMU is a zip archive with machine code inside. The checks here and the process it runs in contain accidents: damaged
+archives, crashes, endless loops. They do not contain malice: load only FMUs you trust.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+import zipfile
+from collections import Counter
+from pathlib import Path, PurePosixPath
+from xml.parsers import expat
+
+from hvdc_ident.errors import ModelError
+
+MOST_ENTRIES = 10_000
+MOST_BYTES = 2**30
+MOST_RATIO = 200
+MOST_XML = 64 * 2**20  # bytes of a model description; a hundred thousand variables take half of it
+DESCRIPTION = "modelDescription.xml"
+PARSED = (DESCRIPTION, "sources/buildDescription.xml")
+"""Files that are read as XML."""
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+def check_archive(path: Path) -> tuple[str, ...]:
+    """The names in the archive, once it may be unpacked. Raises ModelError where it may not; nothing is written."""
+    with _opened(path) as archive:
+        entries = archive.infolist()
+        if len(entries) > MOST_ENTRIES:
+            raise _refused(path, "the FMU has too many files", f"at most {MOST_ENTRIES}", str(len(entries)))
+        for entry in entries:
+            _check_entry(path, entry)
+        total, packed = sum(e.file_size for e in entries), max(path.stat().st_size, 1)
+        if total > MOST_BYTES:
+            raise _refused(path, "the FMU unpacks to too much", f"at most {MOST_BYTES} bytes", f"{total} bytes")
+        if total > MOST_RATIO * packed:
+            raise _refused(
+                path,
+                "the FMU looks like a zip bomb",
+                f"at most {MOST_RATIO} times its size",
+                f"{total / packed:.0f} times",
+            )
+        names = [e.filename for e in entries]
+        twice = next((n for n, count in Counter(names).items() if count > 1), None)
+        if twice is not None:
+            raise _refused(path, "the FMU has two files of one name", "one of each", twice)
+        if DESCRIPTION not in names:
+            raise _refused(
+                path, "the archive is no FMU", f"a file {DESCRIPTION} in it", ", ".join(names[:5]) or "nothing"
+            )
+        for name in PARSED:
+            if name in names:
+                _check_xml(path, archive, name)
+    return tuple(names)
+
+
+def check_identifier(path: Path, identifier: str | None) -> str:
+    """The model identifier, once it can only be the name of a file in the folder of binaries. Raises ModelError."""
+    if identifier is None or not IDENTIFIER.fullmatch(identifier):
+        raise _refused(
+            path, "the model identifier is none", "letters, digits and _, the first no digit", repr(identifier)[:80]
+        )
+    return identifier
+
+
+def unpack(path: Path, folder: Path) -> None:
+    """Nothing; the archive's files are in the folder. It was checked before; a file that is damaged is a ModelError."""
+    with _opened(path) as archive:
+        for entry in archive.infolist():
+            target = folder.joinpath(*PurePosixPath(_plain(entry.filename)).parts)
+            if entry.is_dir():
+                target.mkdir(parents=True, exist_ok=True)
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with archive.open(entry) as source, target.open("wb") as sink:
+                    while block := source.read(1 << 20):
+                        sink.write(block)
+            except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as e:
+                raise ModelError(f"'{entry.filename}' in the FMU cannot be unpacked: {e}", where=str(path)) from None
+
+
+def _opened(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except FileNotFoundError:
+        raise ModelError("the model file is not there", where=str(path)) from None
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, ValueError, NotImplementedError) as e:
+        raise ModelError(f"the file is no zip archive: {e}", where=str(path), expected="an FMU") from None
+    except OSError as e:
+        raise ModelError(f"the file cannot be read: {(e.strerror or str(e)).lower()}", where=str(path)) from None
+
+
+def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
+    name = _plain(entry.filename)
+    parts = PurePosixPath(name).parts
+    if name.startswith("/") or re.match(r"[A-Za-z]:", name) or ".." in parts or not parts or "\0" in name:
+        raise _refused(
+            path, "a path in the FMU leads out of it", "paths below its top folder", repr(entry.filename)[:80]
+        )
+    kind = stat.S_IFMT(entry.external_attr >> 16)
+    if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        what = "a link" if kind == stat.S_IFLNK else "neither a file nor a folder"
+        raise _refused(path, f"'{entry.filename}' in the FMU is {what}", "plain files", "")
+    if entry.flag_bits & 1:
+        raise _refused(path, f"'{entry.filename}' in the FMU is encrypted", "plain files", "")
+
+
+def _plain(name: str) -> str:
+    """The name with the slashes of the zip standard; some tools write backslashes."""
+    return name.replace("\\", "/")
+
+
+def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
+    """Raises ModelError where the XML is too large, not well-formed, or has a DOCTYPE, where entities would come from."""
+    where = f"{path}, {name}"
+    size = archive.getinfo(name).file_size
+    if size > MOST_XML:
+        raise ModelError("the XML is too large", where=where, expected=f"at most {MOST_XML} bytes", got=f"{size} bytes")
+    parser = expat.ParserCreate()
+
+    def doctype(*_: object) -> None:
+        raise ModelError(
+            "the XML has a DOCTYPE", where=where, expected="none: no FMU needs one, and entity bombs come that way"
+        )
+
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        with archive.open(name) as source:
+            while block := source.read(1 << 16):
+                parser.Parse(block, False)
+            parser.Parse(b"", True)
+    except expat.ExpatError as e:
+        raise ModelError(f"the XML is not well-formed: {e}", where=where) from None
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, LookupError) as e:
+        raise ModelError(f"the XML cannot be read: {e}", where=where) from None
+
+
+def _refused(path: Path, what: str, expected: str, got: str) -> ModelError:
+    return ModelError(what, where=str(path), expected=expected, got=got)

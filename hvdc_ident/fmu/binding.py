@@ -1,0 +1,299 @@
+"""The two versions of FMI behind one set of calls, over FMPy's bindings. Runs in the worker alone.
+
+Vectors are numpy arrays whose address is taken once: what is called ten thousand times a run allocates nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from ctypes import POINTER, byref, c_double
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from fmpy.fmi1 import FMICallException
+
+from hvdc_ident.fmu.description import REAL, Description, Variable
+from hvdc_ident.trajectory import Array
+
+Failure = FMICallException
+"""What a call raises that returned discard, error or fatal; `.function`, `.status`."""
+DISCARD, ERROR, FATAL = 2, 3, 4
+KEPT = 30  # messages of the FMU that are kept
+
+
+@dataclass(frozen=True)
+class Update:
+    """What an event brought: another iteration wanted, the end, states or nominals changed, the next time event, s."""
+
+    again: bool
+    end: bool
+    states_changed: bool
+    next_time: float | None
+
+
+class Vector:
+    """A vector of doubles with its address."""
+
+    __slots__ = ("pointer", "size", "values")
+
+    def __init__(self, size: int) -> None:
+        self.values: Array = np.zeros(size)
+        self.size = size
+        self.pointer = self.values.ctypes.data_as(POINTER(c_double))
+
+
+class Block:
+    """Some variables of an FMU, to be read or set together: values in their order, whatever their types."""
+
+    def __init__(self, binding: Binding, variables: Sequence[Variable]) -> None:
+        self._binding = binding
+        self.variables = tuple(variables)
+        self.values: Array = np.zeros(len(self.variables))
+        self._fast = all(v.kind in ("Real", "Float64") for v in variables)
+        self._vector = Vector(len(self.variables))
+        self._references = binding.references([v.reference for v in variables])
+        groups: dict[str, list[int]] = {}
+        for i, v in enumerate(variables):
+            groups.setdefault(v.kind, []).append(i)
+        self._groups = groups
+
+    def get(self) -> Array:
+        """The values now, (n,); the array is used again by the next call."""
+        if self._fast:
+            if self._vector.size:
+                self._binding.get_reals(self._references, self._vector)
+            return self._vector.values
+        for kind, places in self._groups.items():
+            found = getattr(self._binding.fmu, f"get{_call_of(kind, self._binding.version)}")(
+                [self.variables[i].reference for i in places]
+            )
+            self.values[places] = [float(x) for x in found]
+        return self.values
+
+    def set(self, values: Array | Sequence[float]) -> None:
+        """Nothing; the FMU has the values."""
+        if self._fast:
+            if self._vector.size:
+                self._vector.values[:] = values
+                self._binding.set_reals(self._references, self._vector)
+            return
+        for kind, places in self._groups.items():
+            given = [float(values[i]) if kind in REAL else round(float(values[i])) for i in places]
+            exact = [bool(x) for x in given] if kind == "Boolean" else given
+            getattr(self._binding.fmu, f"set{_call_of(kind, self._binding.version)}")(
+                [self.variables[i].reference for i in places], exact
+            )
+
+
+def _call_of(kind: str, version: int) -> str:
+    """How FMPy names the type in its getters and setters: an enumeration has those of whole numbers."""
+    return ("Integer" if version == 2 else "Int64") if kind == "Enumeration" else kind
+
+
+class Binding:
+    """An FMU's library with at most one instance. Methods are the calls of FMI, without their prefixes."""
+
+    def __init__(self, description: Description, folder: str) -> None:
+        from fmpy.fmi2 import FMU2Model, FMU2Slave
+        from fmpy.fmi3 import FMU3Model, FMU3Slave
+
+        self.description, self.version = description, description.version
+        self.exchange = description.interface == "model-exchange"
+        kind: Any = {(2, True): FMU2Model, (2, False): FMU2Slave, (3, True): FMU3Model, (3, False): FMU3Slave}[
+            self.version, self.exchange
+        ]
+        self.messages: list[str] = []
+        self.fmu: Any = kind(
+            guid=description.token,
+            unzipDirectory=folder,
+            modelIdentifier=description.identifier,
+            instanceName="hvdc_ident",
+        )
+        self._callbacks = self._made_callbacks()
+        self.component: Any = None
+        self.nx = len(description.states)
+        self.states, self.slopes = Vector(self.nx), Vector(self.nx)
+        self.indicators = Vector(description.indicators)
+
+    def _made_callbacks(self) -> Any:
+        if self.version == 3:
+            return None
+        from fmpy import calloc, free
+        from fmpy.fmi2 import (
+            fmi2CallbackAllocateMemoryTYPE,
+            fmi2CallbackFreeMemoryTYPE,
+            fmi2CallbackFunctions,
+            fmi2CallbackLoggerTYPE,
+        )
+
+        made = fmi2CallbackFunctions()
+        made.logger = fmi2CallbackLoggerTYPE(lambda _env, _name, status, _category, text: self._heard(status, text))
+        made.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
+        made.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+        with contextlib.suppress(ImportError, OSError, AttributeError):  # only formats the FMU's messages
+            from fmpy.logging import addLoggerProxy
+
+            addLoggerProxy(byref(made))
+        return made
+
+    def _heard(self, status: int, text: bytes | None) -> None:
+        if status > 0 and text:
+            self.messages.append(" ".join(text.decode("utf-8", "replace").split())[:300])
+            del self.messages[:-KEPT]
+
+    # --- instances ---
+
+    def instantiate(self) -> None:
+        """Nothing; there is an instance. Raises RuntimeError where the FMU gives none."""
+        fmu = self.fmu
+        try:
+            if self.version == 2:
+                fmu.instantiate(callbacks=self._callbacks, loggingOn=False)
+            else:
+                fmu.instantiate(logMessage=lambda _env, status, _category, text: self._heard(status, text))
+        except FMICallException:
+            raise
+        except Exception as e:  # FMPy raises a bare Exception where the FMU returns no instance
+            raise RuntimeError(str(e)) from None
+        self.component = fmu.component
+
+    def free(self) -> None:
+        """Nothing; there is no instance."""
+        if self.component is not None:
+            (self.fmu.fmi2FreeInstance if self.version == 2 else self.fmu.fmi3FreeInstance)(self.component)
+            self.component = self.fmu.component = None
+
+    def reset(self) -> None:
+        self.fmu.reset()
+
+    def terminate(self) -> None:
+        self.fmu.terminate()
+
+    # --- initialisation ---
+
+    def enter_initialization(self, start: float, stop: float | None, tolerance: float | None) -> None:
+        if self.version == 2:
+            self.fmu.setupExperiment(tolerance=tolerance, startTime=start, stopTime=stop)
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.enterInitializationMode(tolerance=tolerance, startTime=start, stopTime=stop)
+
+    def exit_initialization(self) -> None:
+        self.fmu.exitInitializationMode()
+
+    # --- values ---
+
+    def references(self, numbers: Sequence[int]) -> Any:
+        """Value references as C takes them."""
+        from ctypes import c_uint
+
+        return (c_uint * len(numbers))(*numbers)
+
+    def get_reals(self, references: Any, into: Vector) -> None:
+        if self.version == 2:
+            self.fmu.fmi2GetReal(self.component, references, into.size, into.pointer)
+        else:
+            self.fmu.fmi3GetFloat64(self.component, references, into.size, into.pointer, into.size)
+
+    def set_reals(self, references: Any, values: Vector) -> None:
+        if self.version == 2:
+            self.fmu.fmi2SetReal(self.component, references, values.size, values.pointer)
+        else:
+            self.fmu.fmi3SetFloat64(self.component, references, values.size, values.pointer, values.size)
+
+    def directional(self, unknowns: Any, n: int, knowns: Any, m: int, seed: Vector, into: Vector) -> None:
+        """Nothing; `into` has the derivatives of the unknowns along the seed."""
+        if self.version == 2:
+            self.fmu.fmi2GetDirectionalDerivative(self.component, unknowns, n, knowns, m, seed.pointer, into.pointer)
+        else:
+            self.fmu.fmi3GetDirectionalDerivative(
+                self.component, unknowns, n, knowns, m, seed.pointer, m, into.pointer, n
+            )
+
+    # --- model exchange ---
+
+    def set_time(self, t: float) -> None:
+        if self.version == 2:
+            self.fmu.fmi2SetTime(self.component, t)
+        else:
+            self.fmu.fmi3SetTime(self.component, t)
+
+    def set_states(self, x: Array) -> None:
+        if self.nx:
+            self.states.values[:] = x
+            if self.version == 2:
+                self.fmu.fmi2SetContinuousStates(self.component, self.states.pointer, self.nx)
+            else:
+                self.fmu.fmi3SetContinuousStates(self.component, self.states.pointer, self.nx)
+
+    def get_states(self) -> Array:
+        """(nx,), a copy."""
+        if self.nx:
+            if self.version == 2:
+                self.fmu.fmi2GetContinuousStates(self.component, self.states.pointer, self.nx)
+            else:
+                self.fmu.fmi3GetContinuousStates(self.component, self.states.pointer, self.nx)
+        return self.states.values.copy()
+
+    def get_slopes(self) -> Array:
+        """(nx,) the derivatives; the array is used again by the next call."""
+        if self.nx:
+            if self.version == 2:
+                self.fmu.fmi2GetDerivatives(self.component, self.slopes.pointer, self.nx)
+            else:
+                self.fmu.fmi3GetContinuousStateDerivatives(self.component, self.slopes.pointer, self.nx)
+        return self.slopes.values
+
+    def get_nominals(self) -> Array:
+        """(nx,) typical sizes of the states, as the FMU says them."""
+        found = Vector(self.nx)
+        if self.nx:
+            if self.version == 2:
+                self.fmu.fmi2GetNominalsOfContinuousStates(self.component, found.pointer, self.nx)
+            else:
+                self.fmu.fmi3GetNominalsOfContinuousStates(self.component, found.pointer, self.nx)
+        return found.values
+
+    def get_indicators(self) -> Array:
+        """(nz,), a copy."""
+        if self.indicators.size:
+            if self.version == 2:
+                self.fmu.fmi2GetEventIndicators(self.component, self.indicators.pointer, self.indicators.size)
+            else:
+                self.fmu.fmi3GetEventIndicators(self.component, self.indicators.pointer, self.indicators.size)
+        return self.indicators.values.copy()
+
+    def enter_events(self) -> None:
+        self.fmu.enterEventMode()
+
+    def enter_continuous(self) -> None:
+        self.fmu.enterContinuousTimeMode()
+
+    def update(self) -> Update:
+        """One iteration of the discrete part."""
+        found = self.fmu.newDiscreteStates() if self.version == 2 else self.fmu.updateDiscreteStates()
+        again, end, _, states, defined, when = found
+        return Update(bool(again), bool(end), bool(states), float(when) if defined else None)
+
+    def completed_step(self) -> tuple[bool, bool]:
+        """Whether the FMU wants an event, and whether it wants to end."""
+        event, end = self.fmu.completedIntegratorStep()
+        return bool(event), bool(end)
+
+    # --- co-simulation ---
+
+    def step(self, t: float, h: float) -> float:
+        """The time reached. Raises RuntimeError where the FMU asks for the end of the run."""
+        if self.version == 2:
+            self.fmu.fmi2DoStep(self.component, t, h, 1)
+            return t + h
+        _, end, _, reached = self.fmu.doStep(t, h)
+        if end:
+            raise RuntimeError("the FMU asked for the end of the run")
+        return float(reached)
+
+    def set_slopes_of_inputs(self, references: Any, orders: Any, slopes: Vector) -> None:
+        """FMI 2.0 only: the time derivatives of inputs over the next step."""
+        self.fmu.fmi2SetRealInputDerivatives(self.component, references, slopes.size, orders, slopes.pointer)

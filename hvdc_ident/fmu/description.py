@@ -1,0 +1,283 @@
+"""What an FMU says of itself: its variables, what it can do, and what of it is used here."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from hvdc_ident.errors import ModelError
+from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier
+from hvdc_ident.frozen import FrozenMap
+
+Interface = Literal["model-exchange", "co-simulation"]
+INTERFACES: tuple[Interface, ...] = ("model-exchange", "co-simulation")
+REAL = ("Real", "Float64", "Float32")
+WHOLE = ("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Boolean")
+SETTABLE = ("parameter", "input")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable. kind: its type in the FMI version. start: None where the FMU does not say it. nominal: above 0.
+
+    tunable: whether it may be set during a run. whole: whether it takes whole numbers only. also: aliases, which are
+    other names of the same value reference.
+    """
+
+    name: str
+    reference: int
+    kind: str
+    unit: str = ""
+    start: float | None = None
+    nominal: float = 1.0
+    min: float = -math.inf
+    max: float = math.inf
+    description: str = ""
+    tunable: bool = False
+    continuous: bool = True
+    also: tuple[str, ...] = ()
+
+    @property
+    def whole(self) -> bool:
+        """Whether only whole numbers can be set; a Boolean is 0 or 1."""
+        return self.kind in WHOLE
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a worker and a model need to know of an FMU.
+
+    version: 2 or 3. token: the GUID or instantiation token. derivatives: value references in the order of the states.
+    completed_step: whether it wants to hear of finished integrator steps. directional: whether it offers directional
+    derivatives. variable_step: whether communication steps may differ. interpolates: whether it takes the slope of
+    inputs. step: communication step it suggests, s, or None.
+    """
+
+    path: Path
+    name: str
+    version: int
+    interface: Interface
+    identifier: str
+    token: str
+    parameters: FrozenMap[Variable]
+    inputs: FrozenMap[Variable]
+    outputs: FrozenMap[Variable]
+    states: FrozenMap[Variable]
+    derivatives: tuple[int, ...] = ()
+    indicators: int = 0
+    completed_step: bool = False
+    directional: bool = False
+    variable_step: bool = True
+    interpolates: bool = False
+    step: float | None = None
+    text: str = ""
+
+
+def read_description(path: Path, interface: Interface | None = None) -> Description:
+    """The description of a checked FMU; model exchange where it offers both and none is asked for.
+
+    Raises ModelError where the archive is refused, the XML makes no sense, or what is needed is not there.
+    """
+    names = check_archive(path)
+    given = _parsed(path)
+    if given.fmiMajorVersion not in (2, 3):
+        raise ModelError(
+            "this version of FMI is not read", where=str(path), expected="FMI 2.0 or 3.0", got=str(given.fmiVersion)
+        )
+    kind, chosen = _interface(path, given, interface)
+    identifier = check_identifier(path, chosen.modelIdentifier)
+    _check_binary(path, names, given.fmiMajorVersion, identifier)
+    variables = given.modelVariables
+    _refuse_clocks(path, variables)
+    states, derivatives = _states(path, given) if kind == "model-exchange" else (FrozenMap(), ())
+    found = {c: [v for v in variables if v.causality == c] for c in ("parameter", "input", "output")}
+    for v in (*found["parameter"], *found["input"], *found["output"]):
+        _refuse_array(path, v)
+    experiment = given.defaultExperiment
+    return Description(
+        path=path,
+        name=given.modelName or path.stem,
+        version=given.fmiMajorVersion,
+        interface=kind,
+        identifier=identifier,
+        token=given.instantiationToken or "",
+        parameters=_merged(_variable(v) for v in found["parameter"] if v.type in (*REAL, *WHOLE)),
+        inputs=_merged(_variable(v) for v in found["input"] if v.type in (*REAL, *WHOLE)),
+        outputs=FrozenMap({v.name: _variable(v) for v in found["output"] if v.type in (*REAL, *WHOLE)}),
+        states=states,
+        derivatives=derivatives,
+        indicators=int(given.numberOfEventIndicators),
+        completed_step=bool(getattr(chosen, "needsCompletedIntegratorStep", False)),
+        directional=bool(chosen.providesDirectionalDerivative) or _says_directional(path, kind),
+        variable_step=bool(getattr(chosen, "canHandleVariableCommunicationStepSize", True)),
+        interpolates=bool(getattr(chosen, "canInterpolateInputs", False)) and given.fmiMajorVersion == 2,
+        step=_number(getattr(chosen, "fixedInternalStepSize", None))
+        or _number(experiment.stepSize if experiment else None),
+        text=given.description or "",
+    )
+
+
+def _parsed(path: Path) -> Any:
+    """FMPy's reading of the XML. Its own validation is off: it refuses what can be worked with, as a missing start."""
+    from fmpy import read_model_description
+    from lxml import etree
+
+    try:
+        return read_model_description(str(path), validate=False)
+    except (etree.LxmlError, ValueError, TypeError, KeyError, IndexError, AttributeError) as e:
+        raise ModelError(f"the model description makes no sense: {_said(e)}", where=str(path)) from None
+    except Exception as e:  # FMPy raises bare Exceptions for what it does not support
+        if type(e).__module__ not in ("builtins", "fmpy.model_description"):
+            raise
+        raise ModelError(f"the model description cannot be used: {_said(e)}", where=str(path)) from None
+
+
+def _says_directional(path: Path, kind: Interface) -> bool:
+    """FMI 3's word for directional derivatives, which FMPy does not read."""
+    from xml.etree import ElementTree
+
+    with zipfile.ZipFile(path) as archive, archive.open(DESCRIPTION) as text:
+        for _, element in ElementTree.iterparse(text, events=("start",)):
+            if element.tag == {"model-exchange": "ModelExchange", "co-simulation": "CoSimulation"}[kind]:
+                return element.get("providesDirectionalDerivatives") in ("true", "1")
+            if element.tag == "ModelVariables":
+                break
+    return False
+
+
+def _said(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+
+
+def _interface(path: Path, given: Any, asked: Interface | None) -> tuple[Interface, Any]:
+    offered = {
+        k: v for k, v in zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True) if v is not None
+    }
+    wanted = asked or next(iter(offered), None)
+    if wanted is None or wanted not in offered:
+        expected = asked or "model exchange or co-simulation"
+        raise ModelError(
+            "the FMU does not offer what is asked for",
+            where=str(path),
+            expected=expected,
+            got=", ".join(offered) or "scheduled execution only",
+        )
+    return wanted, offered[wanted]
+
+
+def _check_binary(path: Path, names: Iterable[str], version: int, identifier: str) -> None:
+    from fmpy import platform, platform_tuple, sharedLibraryExtension
+
+    folders = {n.split("/")[1] for n in names if n.startswith("binaries/") and n.count("/") > 1}
+    folder = platform if version == 2 else platform_tuple
+    if f"binaries/{folder}/{identifier}{sharedLibraryExtension}" in set(names):
+        return
+    sources = any(n.startswith("sources/") and n.endswith(".c") for n in names)
+    have = ", ".join(sorted(folders)) or ("C sources only" if sources else "no binaries at all")
+    hint = "have its binary compiled for this machine, e.g. with FMPy's `fmpy compile`" if sources else ""
+    raise ModelError(
+        "the FMU has no binary for this machine",
+        where=str(path),
+        expected=f"binaries/{folder}/{identifier}{sharedLibraryExtension}",
+        got=have,
+        hint=hint,
+    )
+
+
+def _refuse_clocks(path: Path, variables: Iterable[Any]) -> None:
+    for v in variables:
+        if v.type == "Clock" or v.clocks:
+            raise ModelError(
+                "the FMU has clocks, which are not supported",
+                where=f"{path}, variable '{v.name}'",
+                hint="export it without synchronous parts",
+            )
+
+
+def _refuse_array(path: Path, v: Any) -> None:
+    if v.dimensions:
+        size = " x ".join(str(n) for n in v.shape)
+        raise ModelError(
+            "the FMU has an array among what is used, which is not supported",
+            where=f"{path}, variable '{v.name}'",
+            expected="scalar parameters, inputs, outputs and states",
+            got=f"an array of {size}",
+            hint="export its elements as scalars",
+        )
+
+
+def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...]]:
+    states: dict[str, Variable] = {}
+    derivatives = []
+    for unknown in given.derivatives:
+        derivative = unknown.variable
+        state = derivative.derivative
+        if state is None or isinstance(state, str):
+            raise ModelError(
+                f"the derivative '{derivative.name}' does not say of which state it is", where=f"{path}, ModelStructure"
+            )
+        _refuse_array(path, state)
+        if state.name in states:
+            raise ModelError(f"the state '{state.name}' has two derivatives", where=f"{path}, ModelStructure")
+        states[state.name] = _variable(state)
+        derivatives.append(int(derivative.valueReference))
+    return FrozenMap(states), tuple(derivatives)
+
+
+def _variable(v: Any) -> Variable:
+    """The variable with what its declared type says where it does not."""
+    declared = v.declaredType
+
+    def said(name: str) -> Any:
+        own = getattr(v, name, None)
+        return own if own is not None else getattr(declared, name, None)
+
+    nominal = abs(_number(said("nominal")) or 0.0)
+    low, high = _number(said("min")), _number(said("max"))
+    return Variable(
+        name=v.name,
+        reference=int(v.valueReference),
+        kind=v.type,
+        unit=said("unit") or "",
+        start=_number(v.start),
+        nominal=nominal or 1.0,
+        min=-math.inf if low is None else low,
+        max=math.inf if high is None else high,
+        description=said("description") or "",
+        tunable=v.variability == "tunable",
+        continuous=v.variability == "continuous",
+    )
+
+
+def _number(text: object) -> float | None:
+    """The finite number that the XML's text is, else None."""
+    if text is None:
+        return None
+    words = str(text).strip()
+    if words in ("true", "false"):
+        return float(words == "true")
+    try:
+        value = float(words)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _merged(variables: Iterable[Variable]) -> FrozenMap[Variable]:
+    """By name, one for each value reference: what shares one is one variable under several names."""
+    from dataclasses import replace
+
+    found: dict[tuple[int, bool], Variable] = {}
+    for v in variables:
+        key = (v.reference, v.kind in REAL)
+        first = found.get(key)
+        if first is None:
+            found[key] = v
+            continue
+        start = first.start if first.start is not None else v.start
+        found[key] = replace(first, also=(*first.also, v.name), start=start, unit=first.unit or v.unit)
+    return FrozenMap({v.name: v for v in found.values()})

@@ -1,0 +1,306 @@
+"""A run of a model-exchange FMU: scipy's LSODA between events, which are found on its interpolant. In the worker alone.
+
+Sensitivities S = dx/dp ride along as more states, S' = A S + df/dp, each column one directional derivative.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.fmu.binding import DISCARD, Block, Failure
+from hvdc_ident.fmu.plant import Plant, RunFailed
+from hvdc_ident.fmu.signals import Moving, Signals
+from hvdc_ident.fmu.tangent import Tangent
+from hvdc_ident.trajectory import Array
+
+MOST_STEPS = 200_000
+MOST_EVENTS = 100_000
+CHATTER = 50  # state events within CLOSE of each other
+CLOSE = 1e-9  # share of the span
+RETRIES = 8  # shorter steps tried where the FMU discards a point
+JUMP = 1e-6  # change of a derivative at an event, against its size, that sensitivities cannot pass
+
+
+class SensitivitiesLost(Exception):
+    """An event at which a derivative or a state jumps: the columns S are not right after it."""
+
+
+@dataclass
+class Counts:
+    """What a run cost."""
+
+    accepted: int = 0
+    events: int = 0
+    evaluations: int = 0
+    segments: int = 0
+
+
+@dataclass
+class Run:
+    """One run. names: what is read. tangent: the derivatives for sensitivities, or None. start: (nx, np) dx0/dp.
+
+    outputs (n, names) and gradients (n, names, np) are filled row by row.
+    """
+
+    plant: Plant
+    signals: Signals
+    time: Array
+    names: tuple[str, ...]
+    tolerance: float
+    tangent: Tangent | None = None
+    start: Array | None = None
+    counts: Counts = field(default_factory=Counts)
+
+    def __post_init__(self) -> None:
+        self.b = self.plant.binding
+        self.nx = self.b.nx
+        self.inputs = [Moving(t, v) for t, v in self.signals.each()]
+        self.moving = [k for k, m in enumerate(self.inputs) if not m.constant]
+        self.u = np.array([m.at(float(self.time[0]), True) for m in self.inputs])
+        chosen = [list(self.plant.description.inputs.values())[k] for k in self.moving]
+        self.follow = [k for k, v in zip(self.moving, chosen, strict=True) if v.continuous]
+        self.followed = Block(self.b, [list(self.plant.description.inputs.values())[k] for k in self.follow])
+        self.seen = self.plant.block(self.names)
+        self.columns = self.tangent.count if self.tangent else 0
+        self.outputs = np.empty((self.time.size, len(self.names)))
+        self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
+        self.row = 0
+        self.end = float(self.time[-1])
+        self.segment_end = self.end
+        self.close: list[float] = []
+
+    def go(self, values: Mapping[str, float]) -> None:
+        """Nothing; every row is filled. Raises RunFailed, Failure or SensitivitiesLost."""
+        t = float(self.time[0])
+        self.plant.begin(values, self.u, t, self.end, self.tolerance)
+        x = self.b.get_states()
+        self.atol = 1e-2 * self.tolerance * self.plant.nominals()
+        y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
+        stops = [s for s in self.signals.breaks.tolist() if t <= s <= self.end]
+        stops = sorted({*stops, self.end})
+        y = self._arrive(t, y, stops)
+        while t < self.end:
+            stop = next(s for s in stops if s > t)
+            due = self.plant.next_time
+            if due is not None and due <= t:
+                y = self._state_event(t, y)
+                continue
+            self.segment_end = stop if due is None else min(due, stop)
+            t, y = self._segment(t, y, self.segment_end)
+            if t >= self.segment_end:
+                y = self._arrive(t, y, stops, timed=due is not None and due <= t)
+
+    # --- between stops ---
+
+    def _segment(self, t: float, y: Array, end: float) -> tuple[float, Array]:
+        """Where the integration stopped, at `end` or at an event before it, with the event done."""
+        self.counts.segments += 1
+        self.positive = self.b.get_indicators() > 0.0
+        solver = self._solver(t, y, end)
+        retries = 0
+        while solver.status == "running":
+            before = float(solver.t)
+            try:
+                self._advance(solver)
+            except Failure as e:
+                if e.status != DISCARD or retries == RETRIES:
+                    raise
+                retries += 1
+                solver = self._solver(before, y, end, (end - before) * 10.0**-retries)
+                continue
+            y = solver.y.copy() if self.nx else y
+            if not np.isfinite(y).all():
+                raise RunFailed("a state is not finite", float(solver.t), "check parameter values and limits")
+            event = self._crossing(solver, before)
+            t = float(solver.t) if event is None else event
+            dense = solver.dense_output() if self.row < self.time.size and self.time[self.row] <= t else None
+            self._record_until(dense, t)
+            if event is not None:
+                y = np.asarray(solver.dense_output()(event), dtype=float) if self.nx else y
+                return event, self._state_event(event, y)
+            self._place(t, y[: self.nx], before_jump=t >= end)
+            if self.plant.description.completed_step:
+                wanted, over = self.b.completed_step()
+                if over:
+                    raise RunFailed("the FMU asked for the end of the run", t)
+                if wanted and t < end:
+                    return t, self._state_event(t, y)
+        return end, y
+
+    def _solver(self, t: float, y: Array, end: float, most: float = np.inf) -> Any:
+        from scipy.integrate import LSODA
+
+        atol = np.concatenate([self.atol, *(self.atol / s for s in (self.tangent.sizes if self.tangent else []))])
+        dummy = self.nx == 0
+        if dummy:
+            most = min(most, (end - t) / 50)
+        jac = self._jacobian if self.tangent is not None and not dummy else None
+        return LSODA(
+            (lambda _t, _y: np.zeros(1)) if dummy else self._slopes,
+            t,
+            np.zeros(1) if dummy else y,
+            end,
+            rtol=self.tolerance,
+            atol=1.0 if dummy else atol,
+            jac=jac,
+            max_step=most,
+        )
+
+    def _advance(self, solver: Any) -> None:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            message = solver.step()
+        self.counts.accepted += 1
+        if solver.status == "failed":
+            text = "; ".join([str(message or ""), *(str(w.message) for w in said)])
+            raise RunFailed(
+                f"the integrator gave up: {' '.join(text.split())[:200]}", float(solver.t), "check parameter values"
+            )
+        if self.counts.accepted > MOST_STEPS:
+            raise RunFailed(f"more than {MOST_STEPS} steps", float(solver.t), "look for a very fast part of the model")
+
+    def _place(self, t: float, x: Array, *, before_jump: bool = False) -> None:
+        """Nothing; the FMU stands at an instant and a state, its continuous inputs with it."""
+        self.b.set_time(t)
+        self.b.set_states(x)
+        if self.follow:
+            self.followed.set([self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.follow])
+
+    def _slopes(self, t: float, y: Array) -> Array:
+        self.counts.evaluations += 1
+        self._place(t, y[: self.nx])
+        slopes = self.b.get_slopes()
+        if not self.columns:
+            return slopes.copy()
+        found = np.empty(y.size)
+        found[: self.nx] = slopes
+        assert self.tangent is not None
+        for j in range(self.columns):
+            part = slice((j + 1) * self.nx, (j + 2) * self.nx)
+            found[part] = self.tangent.slopes(j, y[part])
+        return found
+
+    def _jacobian(self, t: float, y: Array) -> Array:
+        """For the stiff method's iteration: A on the diagonal; what couples S to x is left out."""
+        assert self.tangent is not None
+        self._place(t, y[: self.nx])
+        a = self.tangent.state_matrix()
+        return np.asarray(np.kron(np.eye(1 + self.columns), a), dtype=float) if self.columns else a
+
+    # --- events ---
+
+    def _crossing(self, solver: Any, before: float) -> float | None:
+        """The instant just after the first indicator of a step changed its sign, or None."""
+        if not self.b.indicators.size:
+            return None
+        t = float(solver.t)
+        inside = [s for s in self.time[self.row :][: np.searchsorted(self.time[self.row :], t)].tolist() if s > before]
+        dense: Any = None
+        low = before
+        for s in [*inside, t]:
+            if s < t and dense is None:
+                dense = solver.dense_output()
+            z = self._indicators(s, (dense(s) if s < t else solver.y)[: self.nx])
+            if ((z > 0.0) != self.positive).any():
+                return self._located(dense or solver.dense_output(), low, s)
+            low = s
+        return None
+
+    def _indicators(self, t: float, x: Array) -> Array:
+        self._place(t, x)
+        return self.b.get_indicators()
+
+    def _located(self, dense: Any, low: float, high: float) -> float:
+        """The right end of a bracket of the first change of sign, as narrow as times can be told apart."""
+        z_low = self._indicators(low, dense(low)[: self.nx])
+        z_high = self._indicators(high, dense(high)[: self.nx])
+        width = 1e-13 * max(abs(low), abs(high), self.end - float(self.time[0]))
+        halve = False
+        while high - low > width:
+            changed = np.flatnonzero((z_high > 0.0) != self.positive)
+            middle = 0.5 * (low + high)
+            steep = z_high[changed] - z_low[changed]
+            if not halve and changed.size and (steep != 0.0).all():
+                guess = float((low - z_low[changed] * (high - low) / steep).min())
+                edge = 0.01 * (high - low)
+                middle = (
+                    min(max(guess + 1e-3 * (high - low), low + edge), high - edge) if np.isfinite(guess) else middle
+                )
+            halve = not halve
+            z = self._indicators(middle, dense(middle)[: self.nx])
+            if ((z > 0.0) != self.positive).any():
+                high, z_high = middle, z
+            else:
+                low, z_low = middle, z
+        return high
+
+    def _state_event(self, t: float, y: Array) -> Array:
+        """The states after the event."""
+        self.counts.events += 1
+        span = self.end - float(self.time[0])
+        self.close = [s for s in self.close if t - s <= CLOSE * span] + [t]
+        if self.counts.events > MOST_EVENTS or len(self.close) > CHATTER:
+            raise RunFailed(
+                "a limit switches on and off without end", t, "add a hysteresis or a small lag where it acts"
+            )
+        self._place(t, y[: self.nx])
+        return self._through(t, y, None)
+
+    def _through(self, t: float, y: Array, u: Array | None) -> Array:
+        """The states after event mode at t, with inputs u set in it where they jump."""
+        old = self.b.get_slopes().copy() if self.columns else None
+        self.b.enter_events()
+        if u is not None:
+            self.plant.inputs.set(u)
+        changed = self.plant.iterate(t)
+        self.b.enter_continuous()
+        x = self.b.get_states() if changed else y[: self.nx]
+        if self.columns:
+            jumped = bool(np.abs(x - y[: self.nx]).max(initial=0.0) > 0.0)
+            if u is None and old is not None:
+                size = np.abs(old).max(initial=0.0) + np.abs(self.b.slopes.values).max(initial=0.0)
+                jumped |= bool(np.abs(self.b.get_slopes() - old).max(initial=0.0) > JUMP * max(size, 1e-300))
+            if jumped:
+                raise SensitivitiesLost(f"a state or a derivative jumps at {t:.6g} s")
+        return np.concatenate([x, y[self.nx :]]) if changed else y
+
+    def _arrive(self, t: float, y: Array, stops: Sequence[float], *, timed: bool = False) -> Array:
+        """The states after a stop: rows before its jump are read, then inputs and time events act, then those after."""
+        self._place(t, y[: self.nx], before_jump=True)
+        while self.row + 1 < self.time.size and self.time[self.row] == t == self.time[self.row + 1]:
+            self._record(y)
+        u = np.array([m.at(t, False) for m in self.inputs])
+        jumps = t in stops and bool((u != np.array([m.at(t, True) for m in self.inputs])).any())
+        if timed:
+            self.counts.events += 1
+            y = self._through(t, y, None)
+        if jumps:
+            y = self._through(t, y, u)
+        self.segment_end = self.end + 1.0 if t < self.end else t
+        self._place(t, y[: self.nx])
+        while self.row < self.time.size and self.time[self.row] <= t:
+            self._record(y)
+        return y
+
+    # --- rows ---
+
+    def _record_until(self, dense: Any, t: float) -> None:
+        """Nothing; the rows of a step before t are read; those at a stop are left to it."""
+        while self.row < self.time.size and self.time[self.row] < t:
+            s = float(self.time[self.row])
+            y = np.asarray(dense(s), dtype=float) if self.nx else np.zeros(0)
+            self._place(s, y[: self.nx])
+            self._record(y)
+
+    def _record(self, y: Array) -> None:
+        """Nothing; the row is filled: the FMU stands where it is to be read."""
+        self.outputs[self.row] = self.seen.get()
+        if self.tangent is not None:
+            for j in range(self.columns):
+                self.gradients[self.row, :, j] = self.tangent.outputs(j, y[(j + 1) * self.nx : (j + 2) * self.nx])
+        self.row += 1

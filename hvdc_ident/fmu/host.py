@@ -1,0 +1,236 @@
+"""The worker of an FMU as its owner sees it: started when needed, watched, and replaced when it dies, hangs or is old.
+
+This contains crashes, hangs and leaks. It does not contain malice: load only FMUs you trust.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
+from pathlib import Path
+from threading import Lock
+from typing import IO, Any
+
+import hvdc_ident
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fmu.archive import unpack
+from hvdc_ident.fmu.description import Description
+from hvdc_ident.fmu.messages import packed, unpacked
+from hvdc_ident.trajectory import Array
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What an FMU may use. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
+    runs: after which a worker is replaced by a new one."""
+
+    deadline: float = 60.0
+    load: float = 60.0
+    memory: int | None = 2 * 2**30
+    runs: int = 500
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: subprocess.Popen[bytes]
+    requests: Connection
+    answers: Connection
+    said: IO[bytes]
+    owner: int
+    runs: int = 0
+
+
+@dataclass(eq=False)
+class Host:
+    """The worker of one FMU. It travels to other processes without its worker and starts its own there."""
+
+    description: Description
+    limits: Limits = field(default_factory=Limits)
+
+    def __post_init__(self) -> None:
+        self._lock = Lock()
+        self._worker: _Worker | None = None
+        self._folder: Path | None = None
+        self._useless: SimulationError | None = None
+        self.memory = 0
+        self.started = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"description": self.description, "limits": self.limits}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.__post_init__()
+
+    def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> tuple[dict[str, Any], dict[str, Array]]:
+        """The worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker."""
+        with self._lock:
+            worker = self._ready()
+            worker.runs += 1
+            try:
+                worker.requests.send_bytes(packed(heading, arrays))
+            except OSError:
+                raise self._died(worker, "before the run") from None
+            answer, out = self._heard(worker, self.limits.deadline, "run")
+            self.memory = int(answer.get("memory", 0))
+            return answer, out
+
+    # --- one answer ---
+
+    def _heard(self, worker: _Worker, deadline: float, what: str) -> tuple[dict[str, Any], dict[str, Array]]:
+        until = time.monotonic() + deadline
+        while True:
+            try:
+                if not worker.answers.poll(max(until - time.monotonic(), 0.0)):
+                    self._end(worker)
+                    raise self._error(
+                        f"the FMU hangs: no result of the {what} after {deadline:g} s, its process was ended",
+                        hint="a longer deadline, if it is only slow",
+                    )
+                message = worker.answers.recv_bytes()
+            except (EOFError, OSError):
+                raise self._died(worker, f"in the {what}") from None
+            heading, arrays = unpacked(message)
+            if "more" in heading:
+                until = time.monotonic() + deadline
+                continue
+            if "done" in heading:
+                return heading, arrays
+            if heading.get("fatal"):
+                self._end(worker)
+            t = heading.get("time")
+            said = heading.get("said", "")
+            raise self._error(
+                heading["failed"],
+                where="" if t is None else f"t = {t:.6g} s",
+                got=f"the FMU said: {said}" if said else "",
+                hint=heading.get("hint", ""),
+            )
+
+    def _error(self, what: str, where: str = "", got: str = "", hint: str = "") -> SimulationError:
+        name = self.description.path.name
+        return SimulationError(what, where=f"{name}, {where}" if where else name, got=got, hint=hint)
+
+    def _died(self, worker: _Worker, when: str) -> SimulationError:
+        """Why the process is gone, in words."""
+        until = time.monotonic() + 2.0
+        while not (ended := os.wait4(worker.process.pid, os.WNOHANG))[0]:
+            if time.monotonic() > until:  # alive, but it has closed its pipes
+                worker.process.kill()
+            time.sleep(0.002)
+        _, status, usage = ended
+        worker.process.returncode = code = os.waitstatus_to_exitcode(status)
+        how = _signal(-code) if code < 0 else f"it ended itself with exit code {code} and no result"
+        limit = self.limits.memory
+        if limit is not None and usage.ru_maxrss * 1024 > 0.8 * limit:
+            how += f"; it had used all of its {limit / 2**20:.0f} MiB of memory"
+        said = self._said(worker)
+        self._end(worker)
+        return self._error(f"the FMU crashed {when}: {how}", got=f"the FMU said: {said}" if said else "")
+
+    def _said(self, worker: _Worker) -> str:
+        """The last line the process wrote."""
+        worker.said.seek(0, os.SEEK_END)
+        worker.said.seek(max(0, worker.said.tell() - 2000))
+        lines = worker.said.read().decode("utf-8", "replace").strip().splitlines()
+        return " ".join(lines[-1].split())[:300] if lines else ""
+
+    # --- the process ---
+
+    def _ready(self) -> _Worker:
+        worker = self._worker
+        if worker is not None and worker.owner != os.getpid():  # this process was forked: the worker is another's
+            self._worker = worker = self._folder = None
+        if worker is not None and worker.runs >= self.limits.runs:
+            self._end(worker)
+            worker = None
+        if worker is None:
+            if self._useless is not None:
+                raise self._useless
+            worker = self._start()
+        return worker
+
+    def _start(self) -> _Worker:
+        folder = self._unpacked()
+        inward, requests = os.pipe()
+        answers, outward = os.pipe()
+        said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the worker
+        root = str(Path(hvdc_ident.__file__).resolve().parents[1])
+        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "hvdc_ident.fmu.worker", str(inward), str(outward)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            pass_fds=(inward, outward),
+            env={**os.environ, **one, "PYTHONPATH": path},
+        )
+        os.close(inward)
+        os.close(outward)
+        worker = _Worker(
+            process, Connection(requests, readable=False), Connection(answers, writable=False), said, os.getpid()
+        )
+        self._worker = worker
+        self._finalizer = Finalize(self, _close, (worker,), exitpriority=20)
+        self.started += 1
+        try:
+            heading = {"parent": os.getpid(), "memory": self.limits.memory, "folder": str(folder)}
+            worker.requests.send_bytes(packed(heading))
+            worker.requests.send_bytes(pickle.dumps(self.description))
+            self._heard(worker, self.limits.load, "loading")
+        except OSError:
+            self._useless = self._died(worker, "in the loading")
+            raise self._useless from None
+        except SimulationError as e:
+            self._end(worker)
+            self._useless = e
+            raise
+        return worker
+
+    def _unpacked(self) -> Path:
+        if self._folder is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="hvdc_ident_fmu_"))
+            Finalize(self, shutil.rmtree, (self._folder, True), exitpriority=10)
+            unpack(self.description.path, self._folder)
+        return self._folder
+
+    def _end(self, worker: _Worker) -> None:
+        if self._worker is worker:
+            self._worker = None
+            self._finalizer.cancel()
+        _close(worker)
+
+    def close(self) -> None:
+        """Nothing; the worker is gone. The next run starts another."""
+        with self._lock:
+            if self._worker is not None:
+                self._end(self._worker)
+
+
+def _close(worker: _Worker) -> None:
+    """Nothing; the worker's process is gone."""
+    for end in (worker.requests, worker.answers, worker.said):
+        with contextlib.suppress(OSError):
+            end.close()
+    if worker.owner == os.getpid() and worker.process.returncode is None:
+        worker.process.kill()
+        worker.process.wait()
+
+
+def _signal(number: int) -> str:
+    try:
+        return f"its process was ended by {signal.Signals(number).name}"
+    except ValueError:
+        return f"its process was ended by signal {number}"

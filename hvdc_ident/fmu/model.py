@@ -1,0 +1,201 @@
+"""An FMU as a model: parameters, inputs, outputs and runs; with model exchange its equations too.
+
+Load only FMUs you trust: their machine code runs on this computer. It runs in a process of its own, which contains
+crashes, hangs and leaks, not malice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.effects.base import EffectUse
+from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.files import digest
+from hvdc_ident.fmu.description import Description, Interface, Variable, read_description
+from hvdc_ident.fmu.host import Host, Limits
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Output
+from hvdc_ident.parameters import Input, Parameter
+from hvdc_ident.simulate.engine import Tolerance
+from hvdc_ident.simulate.result import Simulation
+
+
+@dataclass(frozen=True)
+class FmuState:
+    """A continuous state of an FMU. nominal: its typical size."""
+
+    unit: str = ""
+    description: str = ""
+    nominal: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class FmuModel:
+    """An FMU with its parameters' and inputs' values, and effects at its inputs and outputs.
+
+    The start of a run is what the FMU's own initialisation gives for the inputs' first values.
+    host: its worker, shared by all models made from this one. effects: in the order they were put on.
+    """
+
+    name: str
+    host: Host
+    parameters: FrozenMap[Parameter]
+    inputs: FrozenMap[Input]
+    outputs: FrozenMap[Output]
+    states: FrozenMap[FmuState]
+    effects: tuple[EffectUse, ...] = ()
+    description: str = ""
+    source: str = ""
+    signals: FrozenMap[Any] = field(default_factory=FrozenMap)
+    algebraic: FrozenMap[Any] = field(default_factory=FrozenMap)
+
+    @property
+    def fmu(self) -> Description:
+        """What the FMU says of itself."""
+        return self.host.description
+
+    @property
+    def has_equations(self) -> bool:
+        """Whether derivatives can be asked for: model exchange."""
+        return self.fmu.interface == "model-exchange"
+
+    @cached_property
+    def slots(self) -> tuple[str, ...]:
+        """Names at which an effect may sit: inputs, and outputs as "outputs.NAME" where an input has the name."""
+        return (*self.inputs, *(o if o not in self.inputs else f"outputs.{o}" for o in self.outputs))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters' values by name."""
+        return {n: p.value for n, p in self.parameters.items()}
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Parameters, inputs and states."""
+        return (*self.parameters, *self.inputs, *self.states)
+
+    @cached_property
+    def text(self) -> str:
+        """Text that differs where the file, the values or the effects do."""
+        inputs = {n: i.value for n, i in self.inputs.items()}
+        return "\n".join(map(repr, (self.name, self.source, self.fmu.interface, self.values, inputs, self.effects)))
+
+    def with_values(self, values: Mapping[str, float]) -> FmuModel:
+        """The model with other parameter or input values. Raises UnknownNameError, or ModelError outside the bounds."""
+        parameters, inputs = dict(self.parameters), dict(self.inputs)
+        for name, value in values.items():
+            if name in parameters:
+                try:
+                    parameters[name] = replace(parameters[name], value=float(value))
+                except ModelError as e:
+                    raise e.at(f"parameter '{name}'") from None
+            elif name in inputs:
+                inputs[name] = replace(inputs[name], value=float(value))
+            else:
+                raise self._unknown(name)
+        return replace(self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs))
+
+    def _unknown(self, name: str) -> Exception:
+        for kind in (self.fmu.parameters, self.fmu.inputs):
+            for v in kind.values():
+                if name in v.also:
+                    return ModelError(
+                        f"'{name}' is another name of '{v.name}'", where=f"model '{self.name}'", expected=f"'{v.name}'"
+                    )
+        return unknown_name("parameter or input", name, [*self.parameters, *self.inputs], where=f"model '{self.name}'")
+
+    def with_effects(self, effects: Iterable[Any]) -> FmuModel:
+        """The model with effects at its inputs and outputs, one after the other; neutral ones change nothing."""
+        from hvdc_ident.fmu.ends import with_effects
+
+        return with_effects(self, effects)
+
+    def driven(self, slots: Iterable[str]) -> FmuModel:
+        """The model itself where only inputs are driven. Raises ModelError for any other slot."""
+        for name in slots:
+            if name not in self.inputs:
+                raise ModelError(
+                    f"'{name}' cannot be driven", where=f"model '{self.name}'", expected="an input: an FMU is closed"
+                )
+        return self
+
+    def parameterised(self, name: str) -> FmuModel:
+        """Never: an FMU has one parameterisation. Raises UnknownNameError."""
+        raise unknown_name("parameterisation", name, (), where=f"model '{self.name}'")
+
+    def simulate(
+        self,
+        experiment: Experiment,
+        values: Mapping[str, float] | None = None,
+        sensitivities: Sequence[str] = (),
+        *,
+        outputs: Sequence[str] | None = None,
+        tolerance: Tolerance | None = None,
+    ) -> Simulation:
+        """A run of the experiment in the FMU's worker.
+
+        values: parameters, and inputs that stay constant, where they differ from the model's. outputs: names of outputs
+        or states; default, what the experiment measured, else all outputs. notes: how derivatives were had and, where by
+        differences, their relative error.
+
+        Raises UnknownNameError for names it has not, SimulationError where the run fails.
+        """
+        from hvdc_ident.fmu.run import simulate
+
+        chosen = outputs if outputs is not None else (experiment.outputs or None)
+        return simulate(self, experiment, values or {}, tuple(sensitivities), chosen, tolerance or Tolerance())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
+
+
+def read_fmu(source: str | Path, *, interface: Interface | None = None, limits: Limits | None = None) -> FmuModel:
+    """The model of an FMU, 2.0 or 3.0. Load only FMUs you trust.
+
+    interface: model exchange where the FMU offers both and none is asked for. limits: of time, memory and runs.
+    The archive is checked before anything is unpacked; nothing of it is run before it is needed. Raises ModelError
+    where it cannot be used, SimulationError where it has to be run (a parameter without start) and fails.
+    """
+    path = Path(source)
+    if not path.is_file():
+        raise ModelError("the model file is not there", where=str(path))
+    found = read_description(path.resolve(), interface)
+    host = Host(found, limits or Limits())
+    starts = {n: v.start for n, v in found.parameters.items()}
+    if None in starts.values():
+        read = host.ask({"do": "starts"}, {})[1]["parameters"].tolist()
+        starts = {n: s if s is not None else r for (n, s), r in zip(starts.items(), read, strict=True)}
+        host.description = replace(
+            found,
+            parameters=FrozenMap({n: replace(v, start=starts[n]) for n, v in found.parameters.items()}),
+        )
+    return FmuModel(
+        name=found.name,
+        host=host,
+        parameters=FrozenMap({n: _parameter(v, float(starts[n] or 0.0)) for n, v in found.parameters.items()}),
+        inputs=FrozenMap({n: Input(v.start or 0.0, v.unit, v.description) for n, v in found.inputs.items()}),
+        outputs=FrozenMap({n: _output(v) for n, v in found.outputs.items()}),
+        states=FrozenMap({n: FmuState(v.unit, v.description, v.nominal) for n, v in found.states.items()}),
+        description=found.text,
+        source=digest(path.read_bytes()),
+    )
+
+
+def _parameter(v: Variable, start: float) -> Parameter:
+    """The parameter; bounds that its own start leaves are no bounds."""
+    low, high = (v.min, v.max) if v.min <= start <= v.max else (-np.inf, np.inf)
+    text = v.description + (f" (also {', '.join(v.also)})" if v.also else "")
+    return Parameter(start, v.unit, low, high, scale=v.nominal if start == 0.0 else 0.0, description=text.strip())
+
+
+def _output(v: Variable) -> Output:
+    import sympy as sp
+
+    return Output(sp.S.Zero, v.unit, v.description)

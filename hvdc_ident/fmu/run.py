@@ -1,0 +1,148 @@
+"""One experiment with an FMU: names looked up, the worker asked, effects at its ends put on, the result made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hvdc_ident.errors import HvdcIdentError, ModelError, unknown_name
+from hvdc_ident.experiment import Experiment, InputSignal
+from hvdc_ident.fmu.signals import Signals
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.simulate.engine import Tolerance
+from hvdc_ident.simulate.result import Simulation, Statistics
+from hvdc_ident.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from hvdc_ident.fmu.model import FmuModel
+
+LARGE = 1e300
+"""A bound where there is none: JSON has no infinity."""
+
+
+def simulate(
+    model: FmuModel,
+    experiment: Experiment,
+    values: Mapping[str, float],
+    sensitivities: tuple[str, ...],
+    outputs: Sequence[str] | None,
+    tolerance: Tolerance,
+) -> Simulation:
+    """The run, with its recording chains and effects. See `FmuModel.simulate`."""
+    from hvdc_ident.fmu.ends import chains, simulate_with_effects
+
+    place = f"experiment '{experiment.name}'"
+    given = {**experiment.values, **values}
+    checked = model.driven(experiment.drive).with_effects(chains(experiment))
+    for name in (*given, *experiment.inputs):
+        if name not in checked.parameters and name not in checked.inputs:
+            known = [*checked.parameters, *checked.inputs]
+            raise unknown_name("parameter or input", name, known, where=place)
+    for name in sensitivities:
+        if name not in checked.parameters and name not in checked.inputs:
+            raise unknown_name("parameter or input", name, [*checked.parameters, *checked.inputs], where=place)
+    for name in experiment.offsets:
+        if name not in checked.inputs:
+            raise unknown_name("input", name, checked.inputs, where=f"{place}, offsets")
+    names = tuple(checked.outputs if outputs is None else outputs)
+    for name in names:
+        if name not in checked.outputs and name not in checked.states:
+            raise unknown_name("output", name, [*checked.outputs, *checked.states], where=place)
+    try:
+        if checked.effects:
+            return simulate_with_effects(checked, experiment, given, sensitivities, names, tolerance)
+        return bare(checked, experiment, given, sensitivities, names, tolerance)
+    except HvdcIdentError as e:
+        raise e.at(place) from None
+
+
+def bare(
+    model: FmuModel,
+    experiment: Experiment,
+    given: Mapping[str, float],
+    sensitivities: tuple[str, ...],
+    names: tuple[str, ...],
+    tolerance: Tolerance,
+) -> Simulation:
+    """The run of the FMU itself, without effects."""
+    signals = Signals.of(list(inputs_of(model, experiment, given).values()))
+    heading = {
+        "do": "simulate",
+        "values": changed(model, given),
+        "outputs": names,
+        "parameters": sensitivities,
+        **about(model, sensitivities),
+        "tolerance": tolerance.rtol,
+    }
+    arrays = {
+        "time": experiment.time,
+        "sizes": signals.sizes,
+        "times": signals.times,
+        "points": signals.values,
+        "breaks": signals.breaks,
+    }
+    answer, out = model.host.ask(heading, arrays)
+    units = tuple(unit_of(model, n) for n in names)
+    accepted, events, evaluations, segments = answer["counts"]
+    method = "lsoda" if model.has_equations else "co-simulation"
+    notes = dict(answer["notes"])
+    errors = dict(zip(sensitivities, out["errors"].tolist(), strict=True))
+    worst = max(errors, key=lambda n: errors[n], default=None)
+    if worst is not None and errors[worst] > 0.0:
+        notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {worst}, the least certain"
+    return Simulation(
+        Trajectory(experiment.time, out["outputs"], names, units),
+        sensitivities,
+        out["gradients"],
+        Statistics("converged", method, accepted, 0, events, evaluations, segments, 0),
+        FrozenMap(notes),
+    )
+
+
+def inputs_of(model: FmuModel, experiment: Experiment, given: Mapping[str, float]) -> dict[str, InputSignal]:
+    """Every input's signal, its offset added."""
+    found = {}
+    for name, own in model.inputs.items():
+        signal = experiment.inputs.get(name) or InputSignal.constant(given.get(name, own.value))
+        offset = experiment.offsets.get(name, 0.0)
+        found[name] = InputSignal(signal.times, signal.values + offset, signal.breaks) if offset else signal
+    return found
+
+
+def unit_of(model: FmuModel, name: str) -> str:
+    """The unit of an output or a state."""
+    return model.outputs[name].unit if name in model.outputs else model.states[name].unit
+
+
+def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
+    """The values of the FMU's parameters that are not what it starts with. Raises ModelError where one cannot be set."""
+    found = {}
+    for name, variable in model.fmu.parameters.items():
+        value = float(given.get(name, model.parameters[name].value))
+        if not np.isfinite(value):
+            raise ModelError(f"the value of parameter '{name}' is not finite", where=f"model '{model.name}'")
+        if variable.whole and value != round(value):
+            raise ModelError(
+                f"parameter '{name}' takes whole numbers only", where=f"model '{model.name}'", got=f"{value:g}"
+            )
+        if value != variable.start:
+            found[name] = value
+    return found
+
+
+def about(model: FmuModel, sensitivities: Sequence[str]) -> dict[str, list[object]]:
+    """What differences need to know of parameters and inputs: typical sizes, bounds, where they stand if nobody sets them."""
+    sizes, bounds, starts = [], [], []
+    for name in sensitivities:
+        variable = model.fmu.parameters.get(name) or model.fmu.inputs[name]
+        if variable.whole:
+            raise ModelError(
+                f"there is no derivative by '{name}', which takes whole numbers only", where=f"model '{model.name}'"
+            )
+        own = model.parameters.get(name)
+        sizes.append(own.size if own else max(abs(model.inputs[name].value), variable.nominal))
+        bounds.append([max(own.min, -LARGE), min(own.max, LARGE)] if own else [-LARGE, LARGE])
+        starts.append(variable.start or 0.0)
+    return {"sizes": list(sizes), "bounds": list(bounds), "starts": list(starts)}
