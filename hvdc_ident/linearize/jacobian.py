@@ -18,6 +18,7 @@ from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_
 from hvdc_ident.linearize.schur import Eliminated, eliminate
 from hvdc_ident.linearize.system import System, system
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 
 Side = Literal["refuse", "below", "above"]
 WELL_POSED = 1e12
@@ -26,7 +27,7 @@ ON_KINK = 1e-9
 
 
 def linearize(
-    model: Model,
+    model: AnyModel,
     point: OperatingPoint | None = None,
     *,
     inputs: Sequence[str] | None = None,
@@ -46,6 +47,10 @@ def linearize(
     Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
     """
     at = find_operating_point(model) if point is None else point
+    if not isinstance(model, Model):
+        from hvdc_ident.linearize.external import linear_model
+
+        return linear_model(model, at, inputs, outputs, sensitivities)
     s = system(model, outputs)
     chosen = _chosen(s, inputs, model.name)
     for name in sensitivities:
@@ -114,8 +119,12 @@ def one_sided(model: Model, point: OperatingPoint, **options: object) -> tuple[L
     return below, linearize(model, point, side="above", **options)  # type: ignore[arg-type]
 
 
-def jacobian_error(model: Model, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
+def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
     """The largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
+    if not isinstance(model, Model):
+        from hvdc_ident.linearize.external import error_of
+
+        return error_of(model, point, outputs)
     s = system(model, outputs)
     y, w, p = point.y, point.w, point.p
     exact = s.jacobian(y, w, p, s.modes(y, w, p))[: s.layout.main]

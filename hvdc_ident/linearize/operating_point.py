@@ -14,8 +14,8 @@ from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.newton import ACCURACY, Root, newton, pseudo_transient
 from hvdc_ident.linearize.search import At, Search
-from hvdc_ident.linearize.system import System, system
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]
@@ -30,7 +30,7 @@ class OperatingPoint:
     method: "newton" or "pseudo-transient"; underdetermined points say "newton, least norm".
     """
 
-    model: Model
+    model: AnyModel
     states: FrozenMap[float]
     unknowns: FrozenMap[float]
     extras: FrozenMap[float]
@@ -88,7 +88,7 @@ class OperatingPoint:
 
 
 def find_operating_point(
-    model: Model,
+    model: AnyModel,
     fixed: Mapping[str, float] | None = None,
     free: Collection[str] = (),
     bounds: Bounds | None = None,
@@ -107,6 +107,10 @@ def find_operating_point(
 
     Raises UnknownNameError for a name the model lacks; SteadyStateError, with the worst equation, where there is none.
     """
+    if not isinstance(model, Model):
+        from hvdc_ident.linearize.external import find_point
+
+        return find_point(model, fixed or {}, free, bounds or {}, guess or {}, at, moving, time)
     search = Search.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
     return solve(model, search, guess or {})
 
@@ -177,7 +181,7 @@ def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
 
 
 def point_at(
-    model: Model,
+    model: AnyModel,
     states: Mapping[str, float],
     inputs: Mapping[str, float] | None = None,
     parameters: Mapping[str, float] | None = None,
@@ -197,15 +201,14 @@ def point_at(
 
 
 def continuation(
-    model: Model, name: str, values: Sequence[float], fixed: Mapping[str, float] | None = None
+    model: AnyModel, name: str, values: Sequence[float], fixed: Mapping[str, float] | None = None
 ) -> tuple[OperatingPoint, ...]:
     """The operating points along values of one parameter or input, each searched from the one before.
 
     A step that fails is halved up to ten times on the way. Raises SteadyStateError with the last value reached.
     """
-    known: System = system(model)
-    if name not in known.parameters and name not in known.inputs:
-        raise unknown_name("parameter or input", name, (*known.parameters, *known.inputs), where="continuation")
+    if name not in model.parameters and name not in model.inputs:
+        raise unknown_name("parameter or input", name, (*model.parameters, *model.inputs), where="continuation")
     points: list[OperatingPoint] = []
     guess: dict[str, float] = {}
     last: float | None = None
@@ -218,7 +221,7 @@ def continuation(
 
 
 def _step_to(
-    model: Model,
+    model: AnyModel,
     name: str,
     last: float | None,
     value: float,

@@ -12,11 +12,12 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 
 __all__ = ["is_shipped", "load_model", "shipped_models", "summaries"]
 
@@ -64,8 +65,16 @@ def _of_a_family(name: str) -> Model | None:
     return None
 
 
-def load_model(source: str | Path, *, trust: bool = False) -> Model:
-    """A shipped model by name, or the model of a file: a model card (.toml), or Python (.py, needs trust: runs code).
+def load_model(
+    source: str | Path,
+    *,
+    trust: bool = False,
+    interface: Literal["model-exchange", "co-simulation"] | None = None,
+) -> AnyModel:
+    """A shipped model by name, or the model of a file: a model card (.toml), an FMU (.fmu), or Python (.py, needs trust).
+
+    Python runs its code here; an FMU runs its own in a process of its own, which contains crashes, not malice: load
+    only FMUs you trust. interface: of an FMU that offers both (default: model exchange).
 
     Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
     """
@@ -78,11 +87,17 @@ def load_model(source: str | Path, *, trust: bool = False) -> Model:
         from hvdc_ident.model.card import read_card
 
         return read_card(path)
+    if suffix == ".fmu":
+        from hvdc_ident.fmu.model import read_fmu
+
+        return read_fmu(path, interface=interface)
     if suffix == ".py":
         return _from_python(path, trust)
     if suffix or path.exists():
         raise ModelError(
-            "this kind of model file cannot be read", where=text, expected="a model card (.toml) or a Python file (.py)"
+            "this kind of model file cannot be read",
+            where=text,
+            expected="a model card (.toml), an FMU (.fmu) or a Python file (.py)",
         )
     raise unknown_name("shipped model", text, shipped_models())
 

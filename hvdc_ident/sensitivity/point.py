@@ -15,6 +15,7 @@ from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.engine import Method, simulate
 from hvdc_ident.trajectory import Array
 
@@ -40,7 +41,7 @@ class PointTask:
     method: the integrator of every run, fixed beforehand so that no point depends on those before it.
     """
 
-    model: Model
+    model: AnyModel
     experiments: tuple[Experiment, ...]
     names: tuple[str, ...]
     values: FrozenMap[float]
@@ -127,7 +128,7 @@ class PointTask:
         return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()
 
 
-def simulated(model: Model, experiment: Experiment, given: Any, outputs: tuple[str, ...], method: Method) -> Array:
+def simulated(model: AnyModel, experiment: Experiment, given: Any, outputs: tuple[str, ...], method: Method) -> Array:
     """(n, outputs) of one run whose integrator does not depend on the runs before it."""
     try:
         return simulate(model, experiment, given, outputs=outputs, method=method).trajectory.values
@@ -137,8 +138,10 @@ def simulated(model: Model, experiment: Experiment, given: Any, outputs: tuple[s
     return simulate(model, experiment, given, outputs=outputs, method="rosenbrock").trajectory.values
 
 
-def model_text(model: Model) -> str:
+def model_text(model: AnyModel) -> str:
     """The model as text that differs where its equations or its values do, to the last digit."""
+    if not isinstance(model, Model):
+        return model.text
     lines = [model.name, repr(model.values), repr({n: i.value for n, i in model.inputs.items()})]
     for kind in ("states", "signals", "algebraic", "outputs", "delays", "sampled"):
         for name, item in getattr(model, kind).items():

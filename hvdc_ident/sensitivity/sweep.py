@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hvdc_ident.errors import ComputationError, InputError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.sensitivity.axes import AxesLike, Points, points_of
 from hvdc_ident.sensitivity.point import PointTask, Reference, simulated
 from hvdc_ident.sensitivity.sweep_result import SweepResult
@@ -78,11 +78,11 @@ class _Table:
 
 
 def sweep(
-    model: Model,
+    model: AnyModel,
     experiments: Sequence[Experiment],
     axes: AxesLike,
     *,
-    against: Literal["data", "base"] | Model = "data",
+    against: Literal["data", "base"] | AnyModel = "data",
     outputs: Sequence[str] | None = None,
     values: Mapping[str, float] | None = None,
     want: Sequence[Want] = ("rmse",),
@@ -211,7 +211,7 @@ class _Told:
 
 
 def _check(
-    model: Model, experiments: Sequence[Experiment], points: Points, base: Mapping[str, float], want: Sequence[str]
+    model: AnyModel, experiments: Sequence[Experiment], points: Points, base: Mapping[str, float], want: Sequence[str]
 ) -> None:
     known = [*model.parameters, *model.inputs]
     for name in (*points.names, *base):
@@ -231,7 +231,7 @@ def _check(
             _check_values(model, experiments, name, axis.values[:, column])
 
 
-def _check_values(model: Model, experiments: Sequence[Experiment], name: str, values: Array) -> None:
+def _check_values(model: AnyModel, experiments: Sequence[Experiment], name: str, values: Array) -> None:
     for e in experiments:
         if name in e.inputs:
             raise StudyError(f"'{name}' is moved by experiment '{e.name}' and cannot be swept", where="sweep")
@@ -246,11 +246,11 @@ def _check_values(model: Model, experiments: Sequence[Experiment], name: str, va
 
 
 def _task(
-    model: Model,
+    model: AnyModel,
     experiments: tuple[Experiment, ...],
     names: tuple[str, ...],
     base: FrozenMap[float],
-    against: Literal["data", "base"] | Model,
+    against: Literal["data", "base"] | AnyModel,
     outputs: Sequence[str] | None,
     want: Sequence[str],
     linear: tuple[Sequence[str], Sequence[str]] | None,
@@ -287,7 +287,7 @@ def _task(
     return PointTask(model, experiments, names, base, tuple(references), poles, frequencies, *channels, method=method)
 
 
-def _method(model: Model, experiments: tuple[Experiment, ...], base: FrozenMap[float]) -> Method:
+def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMap[float]) -> Method:
     """The integrator of every point: the one that serves at the base values."""
     first = experiments[0]
     try:
@@ -302,10 +302,10 @@ def _method(model: Model, experiments: tuple[Experiment, ...], base: FrozenMap[f
 
 
 def _references(
-    model: Model,
+    model: AnyModel,
     e: Experiment,
     base: FrozenMap[float],
-    against: Literal["data", "base"] | Model,
+    against: Literal["data", "base"] | AnyModel,
     outputs: Sequence[str] | None,
     method: Method,
 ) -> list[Reference]:
@@ -323,7 +323,7 @@ def _references(
         return found
     chosen = tuple(outputs if outputs is not None else (e.outputs or model.outputs))
     rows = np.flatnonzero(e.compared)
-    if isinstance(against, Model):
+    if not isinstance(against, str) and hasattr(against, "outputs"):
         missing = [o for o in chosen if o not in against.outputs and o not in against.names]
         if missing and outputs is None:
             chosen = tuple(o for o in chosen if o not in missing)
@@ -337,10 +337,10 @@ def _references(
     return [Reference(e.name, o, rows, np.array(run[rows, k])) for k, o in enumerate(chosen)]
 
 
-def _unit(model: Model, name: str) -> str:
+def _unit(model: AnyModel, name: str) -> str:
     return model.parameters[name].unit if name in model.parameters else model.inputs[name].unit
 
 
-def _base_value(model: Model, base: Mapping[str, float], name: str) -> float:
+def _base_value(model: AnyModel, base: Mapping[str, float], name: str) -> float:
     own = model.parameters[name].value if name in model.parameters else model.inputs[name].value
     return float(base.get(name, own))

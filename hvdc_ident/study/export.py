@@ -39,6 +39,8 @@ def export(source: Study | Model | LinearModel, path: str | Path, linear: bool =
 def _model(source: Study | Model) -> Model:
     if isinstance(source, Model):
         return source
+    if not isinstance(source.model, Model):
+        raise StudyError("the model's equations are not here to be written", where=source.path.name, got="an FMU")
     return source.model.with_values(dict(source.values)) if source.values else source.model
 
 

@@ -17,7 +17,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.files import write_text
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.stage import Progress, silent
@@ -122,7 +122,7 @@ class Campaign:
         return np.round(np.arange(round(self.end / self.sample) + 1) * self.sample, 9)
 
     @property
-    def model(self) -> Model:
+    def model(self) -> AnyModel:
         """What makes the waveforms."""
         return load_model(self.source).with_effects(self.effects)
 

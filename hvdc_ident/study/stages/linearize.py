@@ -11,6 +11,11 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
     from hvdc_ident.study.study import Study
 
+CHECKS = {
+    "symbolic": "complex step of 1e-30 through the equations, relative to each row's largest entry",
+    "directional": "central differences of the FMU's derivatives, relative to each row's largest entry",
+    "finite-difference": "two step sizes of central differences, relative to each row's largest entry",
+}
 MOST_DRAWN = 12
 """Channels up to which the frequency response is written too, for the report to draw."""
 
@@ -29,9 +34,9 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         "operating_point": point.to_dict(),
         "modes": [m.to_dict() for m in model.modes()],
         "transfer_functions": [f.to_dict() for f in functions],
-        "method": "symbolic",
+        "method": model.provenance["method"],
         "jacobian_error": jacobian_error(point.model, point, model.output_names),
-        "jacobian_check": "complex step of 1e-30 through the equations, relative to each row's largest entry",
+        "jacobian_check": CHECKS[model.provenance["method"]],
     }
     if len(functions) <= MOST_DRAWN:
         data["frequency_response"] = model.bode().to_dict()
