@@ -64,6 +64,15 @@ def assessed(problem: Problem, result: FitResult) -> FitResult:
     )
 
 
+def in_final_weights(problem: Problem, result: FitResult) -> Problem:
+    """The problem with the standard deviations and the noise model that its fit ended with."""
+    return replace(
+        problem,
+        weights=problem.weights | _weights(result),
+        rho=problem.rho | dict(result.whitening),
+    )
+
+
 def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[str, float] | None]:
     """By held-out experiment its nuisances, estimated from its own record with the parameters at their estimates.
 

@@ -14,7 +14,7 @@ from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.files import digest
 from hvdc_ident.formats import read_waveforms
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.derived import raw_columns, with_phases
 from hvdc_ident.study.units import factor, same_unit
@@ -69,7 +69,7 @@ class Recordings:
 
 
 def read_experiments(
-    tables: Sequence[schema.Experiment], model: Model, recordings: Recordings, where: str
+    tables: Sequence[schema.Experiment], model: AnyModel, recordings: Recordings, where: str
 ) -> tuple[tuple[Experiment, ...], FrozenMap[FrozenMap[NoiseNote]]]:
     """The experiments, and where the noise of each output comes from."""
     wanted: dict[str, dict[str, list[str]]] = {}
@@ -99,7 +99,7 @@ def read_experiments(
     return tuple(found), FrozenMap(notes)
 
 
-def _check_names(table: schema.Experiment, model: Model, place: str) -> None:
+def _check_names(table: schema.Experiment, model: AnyModel, place: str) -> None:
     """Raises where the table names what the model does not have."""
     signals = [*table.inputs, *table.outputs, *table.drive]
     _known("input", table.inputs, model.inputs, f"{place}.inputs")
@@ -116,7 +116,7 @@ def _check_names(table: schema.Experiment, model: Model, place: str) -> None:
             hint="[model.values] for parameters",
         )
     _known("input", table.values, model.inputs, f"{place}.values")
-    _known("nuisance", table.nuisance, [TIME_SHIFT, *model.inputs], f"{place}.nuisance")
+    _known("nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive], f"{place}.nuisance")
     if isinstance(table.interpolation, dict):
         _known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
     for kind, names in (("values", table.values), ("drive", table.drive)):
@@ -148,7 +148,7 @@ def _channels(table: schema.Experiment) -> list[tuple[str, str]]:
 
 
 def _experiment(
-    table: schema.Experiment, model: Model, data: Trajectory, place: str
+    table: schema.Experiment, model: AnyModel, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
     data = with_phases(table.phases, data, place)
@@ -199,7 +199,7 @@ def _time(table: schema.Experiment, data: Trajectory, place: str) -> Array:
     return data.time * scale
 
 
-def _scaled(table: schema.Experiment, model: Model, signal: str, column: str, data: Trajectory, place: str) -> Array:
+def _scaled(table: schema.Experiment, model: AnyModel, signal: str, column: str, data: Trajectory, place: str) -> Array:
     """The column in the model's unit. Raises where the units contradict each other and no scale is given."""
     line = table.columns.get(signal) or schema.Column()
     recorded = line.unit if line.unit is not None else data.unit(column)
@@ -232,7 +232,7 @@ def _scaled(table: schema.Experiment, model: Model, signal: str, column: str, da
     )
 
 
-def _unit(model: Model, signal: str) -> str:
+def _unit(model: AnyModel, signal: str) -> str:
     for table in (model.inputs, model.outputs, model.signals, model.states, model.algebraic):
         if signal in table:
             return str(table[signal].unit)

@@ -32,6 +32,11 @@ def _effect_names(value: Any) -> Any:
     raise ValueError(f'effects: neither "all" nor a list of names: {value!r}')
 
 
+def _whitening(value: Any) -> Any:
+    """The way of whitening; true and false are words for two of them."""
+    return {True: "pre-event", False: "no"}[value] if isinstance(value, bool) else value
+
+
 def _not_text(value: Any) -> str:
     raise ValueError(f"names are text in quotes, not {value!r}")
 
@@ -66,16 +71,38 @@ class Model(Table):
 
     source: Name
     parameterisation: Name | None = None
+    interface: Literal["model-exchange", "co-simulation"] | None = None
     values: dict[Name, FiniteFloat] = {}
     effect: list[Effect] = []
 
 
+class Prior(Table):
+    """What is known of a candidate beforehand: a normal distribution in the parameter's unit."""
+
+    mean: FiniteFloat
+    std: Positive
+
+
 class Candidate(Table):
-    """One line of [parameters]: a parameter that may be estimated; what is left out is the model's own."""
+    """One line of [parameters]: a parameter that may be estimated; what is left out is the model's own.
+
+    prior: what is known beforehand. tie: an expression of other parameters that this one follows; it is then no
+    candidate. per-experiment: it has a value of its own in every experiment, as a nuisance.
+    """
 
     start: FiniteFloat | None = None
     min: FiniteFloat | None = None
     max: FiniteFloat | None = None
+    prior: Prior | None = None
+    tie: Annotated[str, StringConstraints(min_length=1, max_length=1000)] | None = None
+    per_experiment: bool = Field(default=False, alias="per-experiment")
+
+    @model_validator(mode="after")
+    def _tie_alone(self) -> Candidate:
+        others = (self.start, self.min, self.max, self.prior)
+        if self.tie is not None and (self.per_experiment or any(v is not None for v in others)):
+            raise ValueError("tie: a tied parameter has neither start, bounds nor prior of its own")
+        return self
 
 
 class Column(Table):
@@ -198,14 +225,23 @@ class Group(Table):
 
 
 class Fit(Table):
-    """[fit]: how the candidates are estimated."""
+    """[fit]: how the candidates are estimated.
+
+    starts: left out, 8, or 1 for an optimiser that searches the whole range by itself. whiten: true is "pre-event".
+    guard: s on either side of an input's break that are not compared. band: Hz, of the frequency-domain residual (left
+    out: all). tolerance: profile of the windowed errors, shipped or a TOML file beside the study.
+    """
 
     mode: Literal["simultaneous", "individual"] = "simultaneous"
     groups: list[Group] = []
     optimiser: Name = "trust-region"
     loss: Name = "linear"
-    starts: Annotated[int, Field(ge=1, le=10_000)] = 8
-    whiten: bool = False
+    starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    whiten: Annotated[Literal["no", "pre-event", "residual"], BeforeValidator(_whitening)] = "no"
+    guard: NotNegative = 0.0
+    residual: Literal["time", "frequency"] = "time"
+    band: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
+    tolerance: Name = "set-point-step-simulation"
 
     @model_validator(mode="after")
     def _groups_fit_the_mode(self) -> Fit:
@@ -213,6 +249,10 @@ class Fit(Table):
             raise ValueError('mode "individual" needs groups, one a controller')
         if self.groups and self.mode != "individual":
             raise ValueError('groups belong to mode "individual"')
+        if self.band is not None and self.residual != "frequency":
+            raise ValueError('band belongs to residual "frequency"')
+        if self.band is not None and not self.band[0] < self.band[1]:
+            raise ValueError("band: its end is not above its start")
         return self
 
 

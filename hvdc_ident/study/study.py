@@ -11,11 +11,12 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
+from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class Study:
 
     name: str
     path: Path
-    model: Model
+    model: AnyModel
     candidates: FrozenMap[Free]
     experiments: tuple[Experiment, ...]
     noise: FrozenMap[FrozenMap[NoiseNote]]
@@ -64,8 +65,10 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
     where = file.name
     model, model_sources = _model(settings.model, file, trust)
     recordings = Recordings(file.parent)
+    model = with_unknowns(settings, model, where)
     candidates = _candidates(settings, model, where)
     experiments, noise = read_experiments(settings.experiment, model, recordings, where)
+    experiments = with_nuisances(settings, model, experiments, tuple(candidates))
     study = Study(
         name=settings.name or file.stem,
         path=file,
@@ -94,7 +97,7 @@ def _read(file: Path) -> bytes:
         raise StudyError(f"the study file cannot be read: {(e.strerror or str(e)).lower()}", where=str(file)) from None
 
 
-def _model(table: schema.Model, file: Path, trust: bool) -> tuple[Model, dict[str, str]]:
+def _model(table: schema.Model, file: Path, trust: bool) -> tuple[AnyModel, dict[str, str]]:
     """The model as the study wants it, and the hash of the file it comes from."""
     source: str | Path = table.source
     sources: dict[str, str] = {}
@@ -109,7 +112,7 @@ def _model(table: schema.Model, file: Path, trust: bool) -> tuple[Model, dict[st
         sources[table.source] = digest(source.read_bytes())
     place = "model.source"
     try:
-        model = load_model(source, trust=trust)
+        model = load_model(source, trust=trust, interface=table.interface)
         if table.parameterisation is not None:
             place = "model.parameterisation"
             model = model.parameterised(table.parameterisation)
@@ -127,10 +130,12 @@ def _is_path(source: str) -> bool:
     return "/" in source or "\\" in source or Path(source).suffix in (".toml", ".fmu", ".py")
 
 
-def _candidates(settings: schema.StudyFile, model: Model, where: str) -> FrozenMap[Free]:
+def _candidates(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[Free]:
     found = {}
     for name, line in settings.parameters.items():
         place = f"{where}, parameters.{name}"
+        if line.tie is not None or line.per_experiment:
+            continue
         if name not in model.parameters:
             if name in model.inputs:
                 hint = "an experiment's inputs, or its values"
@@ -177,9 +182,16 @@ def _check_questions(study: Study, where: str) -> None:
         _all_known("measured output", group.outputs, measured, f"{place}.outputs")
         _all_known("experiment", group.experiments, names, f"{place}.experiments")
     if s.fit:
+        from hvdc_ident.fit.loss import LOSSES
         from hvdc_ident.fit.optimisers import catalogue
+        from hvdc_ident.fit.tolerance import tolerance
 
         _all_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
+        _all_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
+        try:
+            tolerance(s.fit.tolerance, study.path.parent)
+        except InputError as e:
+            raise e.at(f"{where}, fit.tolerance") from None
     if s.diagnose:
         _all_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
         if s.diagnose.effects != "all":
@@ -188,7 +200,7 @@ def _check_questions(study: Study, where: str) -> None:
             _all_known("effect", s.diagnose.effects, effects(), f"{where}, diagnose.effects")
 
 
-def _check_sweep(line: schema.Sweep, model: Model, where: str) -> None:
+def _check_sweep(line: schema.Sweep, model: AnyModel, where: str) -> None:
     """Raises where a swept value leaves the model's own bounds."""
     own = model.parameters[line.parameter]
     ends = line.values or [v for v in (line.min, line.max) if v is not None]

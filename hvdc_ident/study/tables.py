@@ -5,13 +5,16 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.assessment import Curve
 
 SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
 SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
@@ -32,6 +35,21 @@ def comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
     for output in experiment.outputs:
         header += [output, f"{output}.measured"]
         columns += [simulated[output], experiment.measured[output]]
+    return csv_text(header, np.column_stack(columns).tolist())
+
+
+def curves_csv(experiment: Experiment, curves: Mapping[str, Curve]) -> str:
+    """CSV text: time, then for each measured output OUTPUT, OUTPUT.measured and the ends of the 95 % band of a sample.
+
+    The columns OUTPUT.low and OUTPUT.high are left out where no estimate has a standard deviation.
+    """
+    header, columns = ["time"], [experiment.time]
+    for output, c in curves.items():
+        header += [output, f"{output}.measured"]
+        columns += [c.model, c.measured]
+        if c.band is not None:
+            header += [f"{output}.low", f"{output}.high"]
+            columns += [c.model - c.band, c.model + c.band]
     return csv_text(header, np.column_stack(columns).tolist())
 
 

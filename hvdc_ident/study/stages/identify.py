@@ -23,7 +23,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     need_experiments(study, "identify", role="fit")
     need_candidates(study, "identify")
     need_start(study)
-    starts = max(study.settings.fit.starts, FEWEST_STARTS) if study.settings.fit else 8
+    starts = max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
     pair = study.settings.identifiability.pair if study.settings.identifiability else None
     with executor_of(study, options, "identify") as executor:
         report = identifiability(

@@ -1,0 +1,157 @@
+"""A study's fit: its problem, the fits it asks for, and what is written about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy as sp
+
+from hvdc_ident.fit import FitResult, Free, Group, Problem, fit, fit_each, fit_individually
+from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
+from hvdc_ident.fit.individual import part_of
+from hvdc_ident.fit.loss import loss
+from hvdc_ident.fit.tolerance import tolerance
+from hvdc_ident.fit.windowed import windowed_errors
+from hvdc_ident.model.definition import Model
+from hvdc_ident.study.schema import Fit
+from hvdc_ident.study.unknowns import priors
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.estimate import Executor, Progress
+    from hvdc_ident.study.study import Study
+
+
+def asked_of(study: Study) -> Fit:
+    """The study's [fit], or its defaults."""
+    return study.settings.fit or Fit()
+
+
+def with_settings(study: Study, problem: Problem) -> Problem:
+    """The problem with the loss, the guard, the band and the priors of the study."""
+    asked = asked_of(study)
+    band = None
+    if asked.residual == "frequency":
+        band = (asked.band[0], asked.band[1]) if asked.band else (0.0, np.inf)
+    known = {n: p for n, p in priors(study.settings, study.experiments).items() if n in problem.names}
+    return replace(problem, loss=loss(asked.loss), guard=asked.guard, band=band, priors=problem.priors | known)
+
+
+def as_reported(study: Study) -> bool:
+    """Whether the fit is of the same data in the same way as the report's, so that its profiles are the fit's."""
+    asked = asked_of(study)
+    plain = asked.loss == "linear" and asked.whiten == "no" and asked.residual == "time" and not asked.guard
+    return asked.mode == "simultaneous" and plain and not priors(study.settings, study.experiments)
+
+
+def groups_of(study: Study, problem: Problem) -> list[Group]:
+    """The groups of the individual mode with the parameters that are fitted; those with none are left out."""
+    free = [f.name for f in problem.free]
+    groups = [
+        Group(tuple(n for n in g.parameters if n in free), tuple(g.outputs or ()), tuple(g.experiments or ()))
+        for g in asked_of(study).groups
+    ]
+    return [g for g in groups if g.parameters]
+
+
+def fitted(
+    study: Study, problem: Problem, *, seed: int, executor: Executor | None, progress: Progress | None
+) -> FitResult:
+    """The fit the study asks for, with the statistics over its experiments one by one."""
+    asked = asked_of(study)
+    common: dict[str, Any] = {
+        "starts": asked.starts,
+        "seed": seed,
+        "optimiser": asked.optimiser,
+        "whiten": asked.whiten,
+        "executor": executor,
+        "progress": progress,
+    }
+    individual = asked.mode == "individual"
+    groups = groups_of(study, problem) if individual else []
+    result = fit_individually(problem, groups, **common) if individual else fit(problem, **common)
+    if result.status == "failed" or len(problem.fitted_experiments) < 2:
+        return result
+    return replace(result, per_experiment=_one_by_one(problem, groups, result, asked.whiten, executor, progress))
+
+
+def _one_by_one(
+    problem: Problem,
+    groups: list[Group],
+    result: FitResult,
+    whiten: str,
+    executor: Executor | None,
+    progress: Progress | None,
+) -> dict[str, Any]:
+    """The statistics over fits to single experiments, each begun at the estimates, group by group."""
+    at = {f.name: result.values[f.name] for f in problem.free}
+    parts = [part_of(problem, g, at) for g in groups] or [problem]
+    table: dict[str, Any] = {}
+    for part in parts:
+        begun = replace(part, free=tuple(_from(f, at[f.name]) for f in part.free))
+        if len(begun.fitted_experiments) > 1:
+            table |= fit_each(begun, whiten=whiten, executor=executor, progress=progress)
+    return table
+
+
+def _from(free: Free, value: float) -> Free:
+    return replace(free, start=min(max(value, free.min), free.max))
+
+
+def curves_of(problem: Problem, result: FitResult) -> dict[str, dict[str, Curve]]:
+    """Every output of every experiment at the estimates, by experiment and output."""
+    final = in_final_weights(problem, result)
+    return curves(final, result, held_out_nuisances(final, result))
+
+
+def errors_in_windows(study: Study, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
+    """The errors before, during and after the event, with the tolerance profile the study names."""
+    profile = tolerance(asked_of(study).tolerance, study.path.parent)
+    units = {n: o.unit for n, o in study.model.outputs.items()}
+    return windowed_errors(found, study.experiments, profile, units)
+
+
+def derived(study: Study, result: FitResult) -> dict[str, dict[str, Any]]:
+    """The parameters that follow from the fitted ones, by a tie or a parameterisation: {value, std, unit, expression}.
+
+    std by the derivative of the expression and the covariance of the estimates; None where one of them has none.
+    """
+    model = study.model
+    if not isinstance(model, Model):
+        return {}
+    names = [n for n, line in study.settings.parameters.items() if line.tie is not None]
+    if study.settings.model.parameterisation is not None:
+        from hvdc_ident.models import load_model
+
+        source = study.settings.model.source
+        plain = load_model(source) if "/" not in source and not source.endswith((".toml", ".py")) else None
+        if isinstance(plain, Model):
+            names += [n for n in plain.parameters if n in model.signals and n not in names]
+    table = {}
+    for name in names:
+        expression = model.signals[name].value
+        table[name] = {
+            **_value(expression, model, result),
+            "unit": model.signals[name].unit,
+            "expression": str(expression),
+        }
+    return table
+
+
+def _value(expression: sp.Expr, model: Model, result: FitResult) -> dict[str, float | None]:
+    values = {**model.values, **result.values}
+    at = {s: values[s.name] for s in expression.free_symbols}
+    value = float(expression.subs(at))
+    moved = [s for s in expression.free_symbols if s.name in result.estimates]
+    known = result.covariance
+    if (
+        not moved
+        or known is None
+        or any(result.estimates[s.name].std is None or s.name not in known.names for s in moved)
+    ):
+        return {"value": value, "std": None}
+    slope = np.array([float(sp.diff(expression, s).subs(at)) for s in moved])
+    place = [known.names.index(s.name) for s in moved]
+    return {"value": value, "std": float(np.sqrt(slope @ known.matrix[np.ix_(place, place)] @ slope))}

@@ -1,0 +1,86 @@
+"""What of [parameters] is no plain candidate: ties, values of their own in every experiment, priors, free starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.study import schema
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.prior import Prior
+    from hvdc_ident.model.external import AnyModel
+
+
+def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
+    """The model with its ties, and with start and bounds of the parameters that every experiment has for itself.
+
+    Raises StudyError or UnknownNameError for a tie or a bound that does not fit the model.
+    """
+    ties = {n: line.tie for n, line in settings.parameters.items() if line.tie is not None}
+    own = {n: line for n, line in settings.parameters.items() if line.per_experiment}
+    for name in (*ties, *own):
+        if name not in model.parameters:
+            raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
+    if not ties and not own:
+        return model
+    if not isinstance(model, Model):
+        first = next(iter((*ties, *own)))
+        raise StudyError(
+            f"'{first}' cannot be tied or given to each experiment",
+            where=f"{where}, parameters.{first}",
+            expected="a model with equations",
+            got="an FMU",
+        )
+    for name, line in own.items():
+        p = model.parameters[name]
+        start, low, high = (
+            old if new is None else new for new, old in ((line.start, p.value), (line.min, p.min), (line.max, p.max))
+        )
+        try:
+            changed = replace(p, value=start, min=low, max=high)
+        except InputError as e:
+            raise e.at(f"{where}, parameters.{name}") from None
+        model = replace(model, parameters=model.parameters | {name: changed})
+    try:
+        return model.tied(ties) if ties else model
+    except InputError as e:
+        raise e.at(f"{where}, parameters") from None
+
+
+def with_nuisances(
+    settings: schema.StudyFile, model: AnyModel, experiments: Sequence[Experiment], candidates: Sequence[str]
+) -> tuple[Experiment, ...]:
+    """The experiments with the parameters each has for itself: those asked for, and the free starts of states.
+
+    A start that is "free" is unknown: it is estimated in every experiment unless it is a candidate, one for all.
+    """
+    own = [n for n, line in settings.parameters.items() if line.per_experiment]
+    if isinstance(model, Model):
+        free = [f"{n}_start" for n, s in model.states.items() if s.start == "free"]
+        own += [n for n in free if n not in candidates and n not in own]
+    if not own:
+        return tuple(experiments)
+    return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own)))) for e in experiments)
+
+
+def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> FrozenMap[Prior]:
+    """The priors by unknown of a fit; one of a parameter that each experiment has for itself holds in every experiment."""
+    from hvdc_ident.fit.nuisance import unknown_of
+    from hvdc_ident.fit.prior import Prior
+
+    found: dict[str, Prior] = {}
+    for name, line in settings.parameters.items():
+        if line.prior is None:
+            continue
+        prior = Prior(line.prior.mean, line.prior.std)
+        if line.per_experiment:
+            found |= {unknown_of(e.name, name): prior for e in experiments if e.role == "fit"}
+        else:
+            found[name] = prior
+    return FrozenMap(found)
