@@ -43,14 +43,17 @@ def suffix() -> str:
 
 
 def compiled(command: list[str], sources: Mapping[str, str], identifier: str) -> bytes:
-    """The shared library made of the sources ({name: text}). Raises ComputationError with the compiler's first words."""
+    """The shared library made of the sources ({name: text}); CFLAGS is obeyed.
+
+    Raises ComputationError with the compiler's first words.
+    """
     with tempfile.TemporaryDirectory(prefix="hvdc-ident-") as place:
         at = Path(place)
         for name, text in sources.items():
             (at / name).write_text(text, encoding="utf-8")
         library = at / f"{identifier}{suffix()}"
         files = [n for n in sources if n.endswith(".c")]
-        line = [*command, *FLAGS, "-o", library.name, *files, "-lm"]
+        line = [*command, *FLAGS, *shlex.split(os.environ.get("CFLAGS", "")), "-o", library.name, *files, "-lm"]
         try:
             run = subprocess.run(line, cwd=at, capture_output=True, text=True, timeout=SECONDS, check=False)
         except (OSError, subprocess.TimeoutExpired) as e:
