@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
+    from hvdc_ident.sensitivity.local import sensitivities
     from hvdc_ident.sensitivity.sweep import sweep
     from hvdc_ident.simulate import simulate
     from hvdc_ident.study.export import export
@@ -47,6 +48,7 @@ __all__ = [
     "load_model",
     "load_study",
     "read_waveforms",
+    "sensitivities",
     "simulate",
     "sweep",
 ]
@@ -68,6 +70,7 @@ _HOME = {
     "load_model": "models",
     "load_study": "study.study",
     "read_waveforms": "formats",
+    "sensitivities": "sensitivity.local",
     "simulate": "simulate",
     "sweep": "sensitivity.sweep",
 }

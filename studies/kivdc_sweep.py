@@ -20,7 +20,7 @@ from hvdc_ident.linearize import find_operating_point
 from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity.forward import sensitivities
+from hvdc_ident.sensitivity.forward import trajectory_sensitivities
 from hvdc_ident.sensitivity.sweep import sweep
 from hvdc_ident.sensitivity.sweep_result import SweepResult
 from hvdc_ident.simulate import simulate
@@ -94,7 +94,7 @@ def crossings(x: Array, rises: Array, low: int) -> list[float | None]:
 def information(study: Study) -> dict[str, dict[str, float]]:
     """Relative 95 % half-width of KIVDC by noise, KPVDC unknown too, if nothing but white noise stood in the way."""
     at = {"KIVDC": 850.0, "KPVDC": 26.2}
-    s = sensitivities(study.model, study.experiments, ["KIVDC", "KPVDC"], values=at)
+    s = trajectory_sensitivities(study.model, study.experiments, ["KIVDC", "KPVDC"], values=at)
     j = {name: np.column_stack([s.of(name, OUTPUT, p) for p in s.parameters]) for name in MOVES}
     cases = {"vdc-step": [j["vdc-step"]], "with load step": [j["vdc-step"], j["load-step"]]}
     table = {}

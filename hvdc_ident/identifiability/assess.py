@@ -26,6 +26,7 @@ from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.structure import structure as structure_of
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.fisher import collinear_subsets
+from hvdc_ident.sensitivity.local import LocalSensitivities, sensitivities
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 ENOUGH = 5
@@ -160,6 +161,7 @@ def _assembled(
         },
         notes=tuple(so_far.notes),
         bootstrap=resampled,
+        sensitivities=_sensitivities(so_far, whole),
     )
 
 
@@ -169,6 +171,23 @@ def _whole(so_far: Findings, at: Optimum) -> Optimum:
     theta = [values[n] for n in so_far.free]
     theta += [v for u, v in zip(at.problem.names, at.theta, strict=True) if u not in so_far.free]
     return Optimum(replace(so_far.problem, weights=at.problem.weights), np.array(theta, dtype=float))
+
+
+def _sensitivities(so_far: Findings, whole: Optimum) -> LocalSensitivities | None:
+    """The exact sensitivities of a model with equations, at the values found or held, between what moves and what is seen."""
+    subject = so_far.problem.simulator
+    if not isinstance(subject, ModelSimulator) or not isinstance(subject.model, Model):
+        return None
+    experiments = so_far.problem.fitted_experiments
+    moved = [n for n in subject.model.inputs if any(n in e.inputs and not e.inputs[n].is_constant for e in experiments)]
+    return sensitivities(
+        subject.model,
+        experiments,
+        whole.names,
+        values=whole.problem.values(whole.theta),
+        inputs=moved or None,
+        ranges={n: f.drawn for n, f in so_far.free.items() if not f.min > 0},
+    )
 
 
 def _resampled(so_far: Findings, last: Optimum | None, executor: Executor | None) -> Bootstrap | None:

@@ -79,7 +79,7 @@ class Optimum:
         """What the curvature says, corrected for correlated samples."""
         source = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
         spans = np.array([u.span for u in self.problem.unknowns])
-        return uncertainty(self.blocks, self.problem.names, spans, source)
+        return uncertainty(self.blocks, self.problem.names, spans, source, noise_dof=self.problem.noise_dof)
 
     @property
     def deterministic(self) -> tuple[str, ...]:

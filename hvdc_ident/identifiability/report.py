@@ -21,6 +21,7 @@ from hvdc_ident.identifiability.recommend import Recommendation
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.sensitivity.fisher import Collinear
+from hvdc_ident.sensitivity.local import LocalSensitivities
 
 CONDITIONS = (
     "Every verdict holds for these outputs, experiments, noise and bounds, at the optimum of the pilot fit; with other "
@@ -37,6 +38,8 @@ class IdentifiabilityReport:
     their index, worst first within each size. shares: of each parameter's information, by experiment.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
     search met. bootstrap: the estimates of the set fitted, from experiments drawn anew, where there are enough.
+    sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
+    the model has no equations here.
     """
 
     parameters: FrozenMap[Verdict]
@@ -55,6 +58,7 @@ class IdentifiabilityReport:
     notes: tuple[str, ...] = ()
     pair: PairProfile | None = None
     bootstrap: Bootstrap | None = None
+    sensitivities: LocalSensitivities | None = None
 
     @property
     def conditional_on(self) -> dict[str, tuple[str, ...]]:
@@ -99,6 +103,7 @@ class IdentifiabilityReport:
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
             "pair": self.pair,
             "bootstrap": _bootstrap(self.bootstrap),
+            "sensitivities": self.sensitivities.to_dict() if self.sensitivities else None,
             "pilot": self.pilot,
             "notes": [*self.notes, CONDITIONS],
         }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +13,12 @@ from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.sensitivity.factors import Ranges, factors
 from hvdc_ident.simulate.engine import simulate
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray
-
-Ranges = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +140,7 @@ class Sensitivities:
         return figure
 
 
-def sensitivities(
+def trajectory_sensitivities(
     model: Model,
     experiments: Sequence[Experiment],
     parameters: Sequence[str] | None = None,
@@ -161,7 +159,7 @@ def sensitivities(
     if not experiments:
         raise StudyError("sensitivities need an experiment and there is none", expected="at least one experiment")
     names = tuple(model.parameters if parameters is None else parameters)
-    at, factors = _factors(model, names, values or {}, ranges or {})
+    at, scale = factors(model, names, values or {}, ranges or {})
     shown, times, gradients, compared, notes = {}, {}, {}, {}, {}
     for e in experiments:
         if e.name in gradients:
@@ -177,7 +175,7 @@ def sensitivities(
         names,
         tuple(model.parameters[p].unit for p in names),
         at,
-        factors,
+        scale,
         FrozenMap(shown),
         FrozenMap(units),
         FrozenMap(times),
@@ -228,32 +226,9 @@ def steady_sensitivities(
     outputs: names of outputs or signals; default, all outputs. Raises SteadyStateError where there is none.
     """
     names = tuple(model.parameters if parameters is None else parameters)
-    _, factors = _factors(model, names, values or {}, ranges or {})
+    _, scale = factors(model, names, values or {}, ranges or {})
     shown = tuple(outputs or model.outputs)
     rest = Experiment("rest", np.zeros(1))
     run = simulate(model, rest, values, names, outputs=shown)
     steady = dict(zip(shown, run.trajectory.values[0].tolist(), strict=True))
-    return SteadySensitivities(model.name, shown, names, FrozenMap(steady), factors, run.gradients[0])
-
-
-def _factors(
-    model: Model, names: Sequence[str], values: Mapping[str, float], ranges: Ranges
-) -> tuple[FrozenMap[float], FrozenMap[float]]:
-    """The parameters' values, and what their derivatives are multiplied by."""
-    at, factors = {}, {}
-    for name in names:
-        if name not in model.parameters:
-            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
-        own = model.parameters[name]
-        at[name] = float(values.get(name, own.value))
-        low, high = ranges.get(name, (own.min, own.max))
-        width = high - low
-        if name in ranges and not (math.isfinite(width) and width > 0):
-            raise StudyError(
-                f"the range of '{name}' is wrong", expected="finite min < max", got=f"min {low:g}, max {high:g}"
-            )
-        if name in ranges or (at[name] == 0 and math.isfinite(width) and width > 0):
-            factors[name] = float(width)
-        else:
-            factors[name] = abs(at[name]) or own.size
-    return FrozenMap(at), FrozenMap(factors)
+    return SteadySensitivities(model.name, shown, names, FrozenMap(steady), scale, run.gradients[0])

@@ -8,7 +8,7 @@ import pytest
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model.card import parse_card
-from hvdc_ident.sensitivity.forward import sensitivities, steady_sensitivities
+from hvdc_ident.sensitivity.forward import steady_sensitivities, trajectory_sensitivities
 
 CARD = """
 schema = 1
@@ -29,7 +29,7 @@ STEP = experiment("step", TIME, {"u": InputSignal.step(0.0, 1.0, 2.0)}, window=(
 
 
 def test_over_time_in_units_and_normalised():
-    found = sensitivities(MODEL, [STEP])
+    found = trajectory_sensitivities(MODEL, [STEP])
     k, e = 2.0, np.exp(-2.0 * TIME)
     want = -(2 - e) / k**2 + TIME * e / k  # d/dk of (2 - exp(-k t))/k: the start is at rest, so it moves too
     assert np.allclose(found.of("step", "y", "k"), want, atol=1e-7)
@@ -54,12 +54,12 @@ def test_at_rest():
 
 def test_nothing_silent():
     still = experiment("still", TIME, {"u": 1.0})
-    assert "no input moves" in sensitivities(MODEL, [still]).notes["still"]
+    assert "no input moves" in trajectory_sensitivities(MODEL, [still]).notes["still"]
     with pytest.raises(StudyError, match="need an experiment"):
-        sensitivities(MODEL, [])
+        trajectory_sensitivities(MODEL, [])
     with pytest.raises(UnknownNameError):
-        sensitivities(MODEL, [STEP], ["q"])
+        trajectory_sensitivities(MODEL, [STEP], ["q"])
     with pytest.raises(UnknownNameError):
-        sensitivities(MODEL, [STEP]).of("step", "q", "k")
+        trajectory_sensitivities(MODEL, [STEP]).of("step", "q", "k")
     with pytest.raises(StudyError, match="range"):
-        sensitivities(MODEL, [STEP], ranges={"k": (1, 1)})
+        trajectory_sensitivities(MODEL, [STEP], ranges={"k": (1, 1)})

@@ -1,0 +1,160 @@
+"""Exact sensitivities of eigenvalues and of the frequency response, in units and normalised."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.sensitivity.factors import Ranges, factors
+from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    import xarray
+
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSensitivities:
+    """Derivatives of a linear model by k parameters, the shift of its operating point included.
+
+    factors: what a derivative is multiplied by to be normalised, in the parameter's unit. eigenvalues: (m,) rad/s;
+    eigenvalue_gradients: (m, k). omega: (n,) rad/s; response: (n, outputs, inputs); response_gradients:
+    (n, outputs, inputs, k), all in units per parameter unit.
+    """
+
+    model: str
+    parameters: tuple[str, ...]
+    values: FrozenMap[float]
+    factors: FrozenMap[float]
+    eigenvalues: Complex
+    eigenvalue_gradients: Complex
+    omega: Array
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    response: Complex
+    response_gradients: Complex
+
+    @property
+    def _scale(self) -> Array:
+        return np.array([self.factors[p] for p in self.parameters])
+
+    def eigenvalue_array(self, *, normalised: bool = False) -> xarray.DataArray:
+        """d(lambda)/dp with labelled axes mode, parameter; modes in the order of `LinearModel.modes`."""
+        import xarray
+
+        found = self.eigenvalue_gradients * self._scale if normalised else self.eigenvalue_gradients
+        axes: dict[str, Any] = {"mode": np.arange(self.eigenvalues.size), "parameter": list(self.parameters)}
+        array = xarray.DataArray(found, coords=axes, dims=tuple(axes), name="eigenvalue sensitivity")
+        return array.assign_coords(eigenvalue=("mode", self.eigenvalues))
+
+    def response_array(self, *, normalised: bool = False) -> xarray.DataArray:
+        """dG/dp with labelled axes omega, output, input, parameter."""
+        import xarray
+
+        found = self.response_gradients * self._scale if normalised else self.response_gradients
+        axes = {
+            "omega": self.omega,
+            "output": list(self.outputs),
+            "input": list(self.inputs),
+            "parameter": list(self.parameters),
+        }
+        return xarray.DataArray(found, coords=axes, dims=tuple(axes), name="response sensitivity")
+
+    def channel(self, input: str, output: str, parameter: str, *, normalised: bool = False) -> Complex:
+        """(n,) the derivative of one channel's response by one parameter."""
+        for kind, name, known in (
+            ("input", input, self.inputs),
+            ("output", output, self.outputs),
+            ("parameter", parameter, self.parameters),
+        ):
+            if name not in known:
+                raise unknown_name(kind, name, known)
+        places = self.outputs.index(output), self.inputs.index(input), self.parameters.index(parameter)
+        found = self.response_gradients[(slice(None), *places)]
+        return np.asarray(found * self.factors[parameter] if normalised else found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Eigenvalues with their derivatives, and of each channel the largest normalised derivative and where it is."""
+        rows = zip(self.eigenvalues.tolist(), self.eigenvalue_gradients.tolist(), strict=True)
+        return {
+            "factors": dict(self.factors),
+            "eigenvalues": [
+                {
+                    "eigenvalue": [value.real, value.imag],
+                    "sensitivity": {p: [d.real, d.imag] for p, d in zip(self.parameters, line, strict=True)},
+                }
+                for value, line in rows
+            ],
+            "response": {
+                o: {i: {p: self._peak(i, o, p) for p in self.parameters} for i in self.inputs} for o in self.outputs
+            },
+        }
+
+    def _peak(self, input: str, output: str, parameter: str) -> dict[str, float]:
+        size = np.abs(self.channel(input, output, parameter, normalised=True))
+        largest = float(np.abs(self.response[:, self.outputs.index(output), self.inputs.index(input)]).max())
+        at = int(np.argmax(size))
+        peak = float(size[at])
+        return {"peak": peak, "of_largest_gain": peak / largest if largest > 0 else 0.0, "omega": float(self.omega[at])}
+
+    def plot(self, input: str | None = None, output: str | None = None, ax: Any = None) -> Any:
+        """Axes with one channel's normalised derivatives over frequency (default: the first), a curve a parameter."""
+        import matplotlib.pyplot as plt
+
+        source, target = input or self.inputs[0], output or self.outputs[0]
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        for p in self.parameters:
+            axes.loglog(self.omega / (2 * np.pi), np.abs(self.channel(source, target, p, normalised=True)), label=p)
+        axes.set_xlabel("frequency, Hz")
+        axes.set_ylabel(f"normalised derivative of {target}/{source}")
+        axes.legend(fontsize=8)
+        return axes
+
+
+def linear_sensitivities(
+    model: Model,
+    parameters: Sequence[str] | None = None,
+    *,
+    values: Mapping[str, float] | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    omega: Array | Sequence[float] | None = None,
+    ranges: Ranges | None = None,
+) -> LinearSensitivities:
+    """The exact derivatives of the eigenvalues and of the frequency response at the steady state of the given values.
+
+    inputs, outputs: of the response; default, all. omega: rad/s; default, around the poles. ranges: as factors, as in
+    `trajectory_sensitivities`. Raises SteadyStateError where there is no operating point, LinearizationError where the
+    model has no linear one.
+    """
+    from hvdc_ident.linearize import find_operating_point, frequency, linearize
+
+    names = tuple(model.parameters if parameters is None else parameters)
+    at, scale = factors(model, names, values or {}, ranges or {})
+    point = find_operating_point(model, values or {})
+    linear = linearize(model, point, inputs=inputs, outputs=outputs, sensitivities=names)
+    modes = linear.modes()
+    response = linear.bode(None if omega is None else np.asarray(omega, dtype=float))
+    slopes = frequency.sensitivity(linear, response.omega, names)
+    shape = (*response.values.shape, len(names))
+    return LinearSensitivities(
+        model.name,
+        names,
+        at,
+        scale,
+        np.array([m.eigenvalue for m in modes], dtype=complex),
+        np.array([[m.sensitivity[n] for n in names] for m in modes], dtype=complex).reshape(len(modes), len(names)),
+        response.omega,
+        tuple(linear.input_names),
+        tuple(linear.output_names),
+        np.asarray(response.values, dtype=complex),
+        np.stack([slopes[n] for n in names], axis=-1) if names else np.zeros(shape, dtype=complex),
+    )
