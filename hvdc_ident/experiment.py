@@ -93,7 +93,8 @@ class Experiment:
     inputs: signals by input name; an input not named keeps the model's start value. A name in `drive` is a slot that follows its signal.
     values: inputs held constant at other than the model's start value.
     measured: the recorded outputs at `time`, under the names of the model's outputs; None for a plain simulation.
-    noise: standard deviation of each measured output, in its unit. event: instant of the first disturbance, s.
+    noise: standard deviation of each measured output, in its unit; noise_dof: how many independent samples it was
+    estimated from, where it was (else it is exact). event: instant of the first disturbance, s.
     window: (from, to) in s of what is compared. role: "fit" or "holdout".
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
     offsets: constants added to inputs all along, in their units. nuisance: what is unknown about this experiment alone
@@ -113,6 +114,7 @@ class Experiment:
     instrument: FrozenMap[FrozenMap[float]] = field(default_factory=FrozenMap)
     nuisance: tuple[str, ...] = ()
     offsets: FrozenMap[float] = field(default_factory=FrozenMap)
+    noise_dof: FrozenMap[float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
@@ -124,7 +126,7 @@ class Experiment:
             )
         time.setflags(write=False)
         object.__setattr__(self, "time", time)
-        for name in ("inputs", "values", "noise", "offsets"):
+        for name in ("inputs", "values", "noise", "offsets", "noise_dof"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
         if self.measured is not None and not np.array_equal(self.measured.time, time):

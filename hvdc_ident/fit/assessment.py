@@ -59,7 +59,7 @@ def assessed(problem: Problem, result: FitResult) -> FitResult:
     held_out = {e.name for e in problem.experiments if e.role == "holdout"}
     return replace(
         result,
-        goodness=goodness(result, {n: c for n, c in found.items() if n not in held_out}),
+        goodness=goodness(problem, result, {n: c for n, c in found.items() if n not in held_out}),
         validation=validation(problem, result, {n: found.get(n) for n in sorted(held_out)}, nuisances),
     )
 
@@ -151,13 +151,14 @@ def curves(
     return table
 
 
-def goodness(result: FitResult, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
+def goodness(problem: Problem, result: FitResult, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
     """How well the fitted experiments are met.
 
     chi2, dof, p: of all residuals together, against the given noise, with the independent samples that correlated
-    residuals are worth; None, with the reason, where the noise came from the misfit. outputs: see `_quality`.
+    residuals are worth; None, with the reason, where the noise came from the misfit. noise_dof: samples behind a noise
+    that was estimated; the p is then that of F(dof, noise_dof), else of chi-square. outputs: see `_quality`.
     """
-    from scipy.stats import chi2
+    from scipy.stats import chi2, f
 
     table: dict[str, dict[str, Any]] = {}
     for experiment, line in found.items():
@@ -166,7 +167,8 @@ def goodness(result: FitResult, found: Mapping[str, Mapping[str, Curve]]) -> dic
     samples = sum(q["n"] for line in table.values() for q in line.values())
     effective = sum(result.effective_samples.values())
     given = bool(result.noise_source) and all(s == GIVEN for s in result.noise_source.values())
-    overall: dict[str, Any] = {"chi2": None, "dof": None, "p": None, "reason": ""}
+    behind = problem.noise_dof
+    overall: dict[str, Any] = {"chi2": None, "dof": None, "p": None, "reason": "", "noise_dof": None}
     if not given:
         overall["reason"] = "the noise is taken from the misfit, which then says nothing about the fit"
     elif result.chi2_per_dof is None or not samples:
@@ -174,7 +176,9 @@ def goodness(result: FitResult, found: Mapping[str, Mapping[str, Curve]]) -> dic
     else:
         dof = max(effective - len(result.fitted), 1.0)
         value = result.chi2_per_dof * dof
-        overall |= {"chi2": value, "dof": dof, "p": float(chi2.sf(value, dof))}
+        known = not np.isfinite(behind)
+        p = chi2.sf(value, dof) if known else f.sf(result.chi2_per_dof, dof, behind)
+        overall |= {"chi2": value, "dof": dof, "p": float(p), "noise_dof": None if known else behind}
     return {**overall, "outputs": table}
 
 

@@ -147,11 +147,11 @@ def _uncertainties(
     inside = [i for i, (u, v) in enumerate(zip(problem.unknowns, theta, strict=True)) if u.min < v < u.max]
     blocks = _informative(problem, blocks)
     _, prior = problem.prior(theta)
-    everything = uncertainty(blocks, names, spans, source, prior)
+    everything = uncertainty(blocks, names, spans, source, prior, problem.noise_dof)
     if len(inside) == len(names):
         return everything, everything
     fewer = [replace(b, jacobian=b.jacobian[:, inside]) for b in blocks]
-    inner = uncertainty(fewer, [names[i] for i in inside], spans[inside], source, prior[:, inside])
+    inner = uncertainty(fewer, [names[i] for i in inside], spans[inside], source, prior[:, inside], problem.noise_dof)
     return inner, everything
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.loss import LOSSES, Loss
-from hvdc_ident.fit.noise import sigmas
+from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
 from hvdc_ident.fit.nuisance import unknown_of, unknowns
 from hvdc_ident.fit.prior import Prior, prior_rows
 from hvdc_ident.fit.residual import Block, Treatment, residual_blocks
@@ -125,6 +125,14 @@ class Problem:
         """The standard deviation of each output, in its unit, by experiment and output."""
         fitted = self.fitted_experiments
         return FrozenMap({e.name: FrozenMap(sigmas(e, fitted, self.weights)) for e in self.experiments})
+
+    @cached_property
+    def noise_dof(self) -> float:
+        """How many independent samples the given noise of the least known output was estimated from; infinite: exact."""
+        fitted = self.fitted_experiments
+        known = [o for o in self.outputs if o not in self.weights and source_of(fitted, o) == GIVEN]
+        sums = [sum(e.noise_dof.get(o, np.inf) for e in fitted if o in e.outputs) for o in known]
+        return float(min(sums, default=np.inf))
 
     def values(self, theta: Array) -> dict[str, float]:
         """The parameters' values that go to the simulator, held ones included."""

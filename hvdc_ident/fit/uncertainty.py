@@ -77,10 +77,13 @@ def uncertainty(
     spans: Array,
     source: Mapping[str, str],
     prior: Array | None = None,
+    noise_dof: float = np.inf,
 ) -> Uncertainty:
     """What the blocks say about the unknowns whose columns they have, and the priors beside them.
 
     prior: (k, p) derivatives of the priors' residuals, which are independent and of standard deviation 1.
+    noise_dof: independent samples behind a given noise that was estimated: the intervals are then Student's (one
+    parameter's F quantile).
     spans: (p,) the range of each unknown. source: "given" or "misfit" by output: where sigma comes from.
     The correction is the sandwich (J'J)^-1 J'RJ (J'J)^-1 with R the AR(1) correlation within a record: (1+rho)/(1-rho)
     where the sensitivities are slow against the noise. It is never below the uncorrected variance.
@@ -105,7 +108,7 @@ def uncertainty(
     lift = np.where(std < raw_std, raw_std / np.where(std > 0, std, 1.0), 1.0)
     corrected = sandwich * np.outer(lift, lift)
     known = not from_misfit and not any(rho.values())
-    dof = np.inf if known else max(1.0, sum(effective.values()) - p)
+    dof = min(noise_dof, np.inf if known else max(1.0, sum(effective.values()) - p))
     return Uncertainty(
         tuple(names),
         inverse / np.outer(norms, norms),

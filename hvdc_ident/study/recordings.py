@@ -22,6 +22,8 @@ from hvdc_ident.trajectory import Array, Trajectory
 from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor
 
 TIME_SHIFT = "time-shift"
+MEDIAN_EFFICIENCY = 0.37
+"""Of the median absolute deviation as an estimate of the standard deviation of normal noise (Rousseeuw, Croux 1993)."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,7 @@ def _experiment(
         values=FrozenMap(table.values),
         measured=measured,
         noise=FrozenMap({o: n.std for o, n in notes.items() if n.source != "floor"}),
+        noise_dof=FrozenMap({o: _noise_dof(time, event) for o, n in notes.items() if n.source == "estimated"}),
         event=event,
         window=window,
         role=table.role,
@@ -282,6 +285,12 @@ def _noise(given: float | None, time: Array, values: Array, event: float | None)
     if std <= floor:
         return NoiseNote(floor, "floor")
     return NoiseNote(std, "given" if given is not None else "estimated")
+
+
+def _noise_dof(time: Array, event: float | None) -> float:
+    """What the rows behind an estimated standard deviation are worth: it is a median's, of efficiency 0.37."""
+    before = int((time < event).sum()) if event is not None else 0
+    return max(1.0, MEDIAN_EFFICIENCY * (before if before >= 8 else time.size))
 
 
 def _instrument(line: schema.Instrument) -> FrozenMap[float]:
