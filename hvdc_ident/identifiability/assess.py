@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.errors import SimulationError, StudyError
+from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
@@ -180,14 +180,18 @@ def _sensitivities(so_far: Findings, whole: Optimum) -> LocalSensitivities | Non
         return None
     experiments = so_far.problem.fitted_experiments
     moved = [n for n in subject.model.inputs if any(n in e.inputs and not e.inputs[n].is_constant for e in experiments)]
-    return sensitivities(
-        subject.model,
-        experiments,
-        whole.names,
-        values=whole.problem.values(whole.theta),
-        inputs=moved or None,
-        ranges={n: f.drawn for n, f in so_far.free.items() if not f.min > 0},
-    )
+    try:
+        return sensitivities(
+            subject.model,
+            experiments,
+            whole.names,
+            values=whole.problem.values(whole.theta),
+            inputs=moved or None,
+            ranges={n: f.drawn for n, f in so_far.free.items() if not f.min > 0},
+        )
+    except (SimulationError, SteadyStateError) as error:
+        so_far.notes.append(f"No table of sensitivities: {error}.")
+        return None
 
 
 def _resampled(so_far: Findings, last: Optimum | None, executor: Executor | None) -> Bootstrap | None:
