@@ -181,7 +181,10 @@ class Linearize(Table):
 
 
 class Sweep(Table):
-    """[[sweep]]: the values of one parameter, listed or spread over a range."""
+    """[[sweep]]: the values of one parameter, listed or spread over a range.
+
+    against: "data", "base", or another model, a shipped one or a path.
+    """
 
     parameter: Name
     min: FiniteFloat | None = None
@@ -189,7 +192,7 @@ class Sweep(Table):
     points: Annotated[int, Field(ge=2, le=1_000_000)] | None = None
     scale: Literal["linear", "log"] = "linear"
     sampling: Literal["grid", "latin-hypercube"] = "grid"
-    against: Literal["data", "base"] | None = None
+    against: Name | None = None
     want: Annotated[list[Literal["rmse", "poles", "bode"]], Field(min_length=1)] = ["rmse"]
     values: Annotated[list[FiniteFloat], Field(min_length=1)] | None = None
 

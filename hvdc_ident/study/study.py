@@ -26,6 +26,7 @@ class Study:
     model: with its parameterisation, effects and [model.values]. candidates: what may be estimated, with start and
     bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
     settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study.
+    against: the other model that sweeps are compared with, where they are.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Study:
     noise: FrozenMap[FrozenMap[NoiseNote]]
     settings: schema.StudyFile
     sources: FrozenMap[str]
+    against: AnyModel | None = None
 
     @property
     def folder(self) -> Path:
@@ -64,6 +66,7 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
     settings = parse_study(content, file)
     where = file.name
     model, model_sources = _model(settings.model, file, trust)
+    other, other_sources = _compared_with(settings, file, trust)
     recordings = Recordings(file.parent)
     model = with_unknowns(settings, model, where)
     candidates = _candidates(settings, model, where)
@@ -77,7 +80,8 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
         experiments=experiments,
         noise=noise,
         settings=settings,
-        sources=FrozenMap({where: digest(content), **model_sources, **recordings.digests}),
+        sources=FrozenMap({where: digest(content), **model_sources, **other_sources, **recordings.digests}),
+        against=other,
     )
     _check_questions(study, where)
     return study
@@ -99,17 +103,7 @@ def _read(file: Path) -> bytes:
 
 def _model(table: schema.Model, file: Path, trust: bool) -> tuple[AnyModel, dict[str, str]]:
     """The model as the study wants it, and the hash of the file it comes from."""
-    source: str | Path = table.source
-    sources: dict[str, str] = {}
-    if not is_shipped(table.source) and _is_path(table.source):
-        source = file.parent / table.source
-        if not source.is_file():
-            raise StudyError(
-                f"no model file '{table.source}'",
-                where=f"{file.name}, model.source",
-                expected="a path from the study's folder, or a shipped model: " + ", ".join(shipped_models()),
-            )
-        sources[table.source] = digest(source.read_bytes())
+    source, sources = _source(table.source, file, "model.source")
     place = "model.source"
     try:
         model = load_model(source, trust=trust, interface=table.interface)
@@ -124,6 +118,34 @@ def _model(table: schema.Model, file: Path, trust: bool) -> tuple[AnyModel, dict
     except InputError as e:
         raise e.at(f"{file.name}, {place}") from None
     return model, sources
+
+
+def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, str]]:
+    """A shipped model's name, or a file's path from the study's folder, with that file's hash."""
+    if is_shipped(name) or not _is_path(name):
+        return name, {}
+    source = file.parent / name
+    if not source.is_file():
+        raise StudyError(
+            f"no model file '{name}'",
+            where=f"{file.name}, {place}",
+            expected="a path from the study's folder, or a shipped model: " + ", ".join(shipped_models()),
+        )
+    return source, {name: digest(source.read_bytes())}
+
+
+def _compared_with(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyModel | None, dict[str, str]]:
+    """The other model that sweeps are compared with, where they are, and its file's hash."""
+    from hvdc_ident.study.sweeps import against_of
+
+    name = against_of(settings.sweep, f"{file.name}, sweep")
+    if name in ("data", "base"):
+        return None, {}
+    source, sources = _source(name, file, "sweep.against")
+    try:
+        return load_model(source, trust=trust), sources
+    except InputError as e:
+        raise e.at(f"{file.name}, sweep.against") from None
 
 
 def _is_path(source: str) -> bool:
@@ -170,10 +192,9 @@ def _check_questions(study: Study, where: str) -> None:
         _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
     if s.sweep:
-        from hvdc_ident.study.sweeps import against_of, axes_of
+        from hvdc_ident.study.sweeps import axes_of
 
         axes_of(s.sweep, 0, f"{where}, sweep")
-        against_of(s.sweep, f"{where}, sweep")
     if s.identifiability:
         _all_known("candidate", s.identifiability.pair, study.candidates, f"{where}, identifiability.pair")
     for number, group in enumerate(s.fit.groups if s.fit else (), start=1):

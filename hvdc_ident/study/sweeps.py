@@ -28,8 +28,8 @@ def axes_of(tables: Sequence[schema.Sweep], seed: int, where: str = "sweep") -> 
     return tuple(axes)
 
 
-def against_of(tables: Sequence[schema.Sweep], where: str = "sweep") -> Literal["data", "base"]:
-    """What the sweep is compared with: every table that says so says the same."""
+def against_of(tables: Sequence[schema.Sweep], where: str = "sweep") -> str:
+    """What the sweep is compared with, "data", "base" or a model's name: every table that says so says the same."""
     said = {t.against for t in tables if t.against is not None}
     if len(said) > 1:
         raise StudyError("the sweep tables do not agree on `against`", where=where, got=" and ".join(sorted(said)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import signal
 import subprocess
@@ -186,6 +187,20 @@ def test_a_sweep_of_two_tables_is_their_product_and_reaches_the_page(tmp_path):
     assert "RMSE over k" in page and "poles over k" in page and "1 points failed" in page
 
 
+@pytest.mark.parametrize("against", ["other.toml", "base"])
+def test_a_sweep_is_compared_with_another_model_or_the_base(tmp_path, against):
+    """The other model is the same lag with k = 3: it is met there, as the base is at k = 2."""
+    path = study(tmp_path, f'[[sweep]]\nparameter = "k"\nvalues = [1, 2, 3]\nagainst = "{against}"\n')
+    (tmp_path / "other.toml").write_text(CARD.replace("value = 2.0", "value = 3.0").replace('"lag"', '"other"'))
+    result = CliRunner().invoke(app, ["sweep", str(path), "--json"])
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    errors = [p["rmse"]["y"]["e"] for p in found["points"]]
+    assert found["against"] == ("other" if against != "base" else "base")
+    assert errors.index(min(errors)) == (2 if against != "base" else 1) and min(errors) < 1e-9
+    assert ("other.toml" in found["sources"]) == (against != "base")
+
+
 @pytest.mark.parametrize(
     ("extra", "text"),
     [
@@ -193,6 +208,8 @@ def test_a_sweep_of_two_tables_is_their_product_and_reaches_the_page(tmp_path):
         (GRID.format(points=5) * 2, "swept twice"),
         ('[[sweep]]\nparameter = "q"\nvalues = [1]\n', "no parameter 'q'"),
         ('[[sweep]]\nparameter = "k"\nvalues = [-1]\n', "bounds"),
+        ('[[sweep]]\nparameter = "k"\nvalues = [1]\nagainst = "vsc-hvdc-lnk"\n', "did you mean 'vsc-hvdc-link'"),
+        ('[[sweep]]\nparameter = "k"\nvalues = [1]\nagainst = "gone.toml"\n', "no model file 'gone.toml'"),
         ('[[sweep]]\nparameter = "k"\nvalues = [1]\nsampling = "latin-hypercube"\n', "Latin hypercube"),
     ],
 )

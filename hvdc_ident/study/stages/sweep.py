@@ -38,7 +38,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             study.model,
             study.experiments,
             axes_of(tables, options.seed),
-            against=against_of(tables),
+            against=study.against or ("base" if against_of(tables) == "base" else "data"),
             values=study.values,
             want=want,
             linear=(linear.inputs or list(study.model.inputs), linear.outputs or list(study.model.outputs))
