@@ -60,3 +60,34 @@ def sweep_poles(parameter: str, values: Array, poles: np.ndarray) -> Figure:
     axes.grid(True, color="#e4e4e4", linewidth=0.6)
     axes.tick_params(labelsize=8)
     return fig
+
+
+def sweep_bode(parameter: str, values: Array, omega: Array, response: np.ndarray, channel: str) -> Figure:
+    """Gain and phase of one channel, a curve a row, (rows, frequencies) complex, colored by the parameter."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    fig = figure(7.4, 4.4)
+    gain, phase = fig.subplots(2, 1, sharex=True)
+    scale, hertz = Normalize(float(values.min()), float(values.max())), omega / (2 * np.pi)
+    for value, row in zip(values, response, strict=True):
+        color = colormaps["viridis"](scale(value))
+        size = np.abs(row)
+        gain.plot(hertz, 20 * np.log10(np.where(size > 0, size, np.nan)), color=color, linewidth=0.9)
+        phase.plot(hertz, np.degrees(np.unwrap(np.angle(row))), color=color, linewidth=0.9)
+    gain.set_xscale("log")
+    marks = [10.0**k for k in range(int(np.floor(np.log10(hertz[0]))), int(np.ceil(np.log10(hertz[-1]))) + 1)]
+    gain.set_xticks(marks, [f"{m:g}" for m in marks])
+    gain.set_xticks([], minor=True)
+    gain.set_xlim(hertz[0], hertz[-1])
+    gain.set_ylabel("gain, dB")
+    gain.set_title(channel, fontsize=8)
+    phase.set_ylabel("phase, deg")
+    phase.set_xlabel("frequency, Hz")
+    for axes in (gain, phase):
+        axes.grid(True, color="#e4e4e4", linewidth=0.6)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    fig.colorbar(ScalarMappable(scale, "viridis"), ax=[gain, phase], label=parameter)
+    return fig

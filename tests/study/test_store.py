@@ -181,10 +181,15 @@ def test_two_workers_give_the_bytes_of_one(tmp_path, monkeypatch):
 
 
 def test_a_sweep_of_two_tables_is_their_product_and_reaches_the_page(tmp_path):
-    path = study(tmp_path, GRID.format(points=4) + 'want = ["rmse", "poles"]\n')
+    path = study(tmp_path, GRID.format(points=4) + 'want = ["rmse", "poles", "bode"]\n')
     assert CliRunner().invoke(app, ["run", str(path), "--quiet"]).exit_code == 0
     page = (tmp_path / "s-results" / "report.html").read_text()
     assert "RMSE over k" in page and "poles over k" in page and "1 points failed" in page
+    assert "frequency response of y over u over k" in page
+    found = json.loads((tmp_path / "s-results" / "sweep.json").read_text())
+    gains = [abs(complex(*p["bode"]["y"]["u"][0])) for p in found["points"] if p["status"] == "done"]
+    wanted = [1 / np.hypot(k, found["omega"][0]) for k in (4 / 3, 8 / 3, 4)]  # 1/(s + k)
+    assert gains == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("against", ["other.toml", "base"])

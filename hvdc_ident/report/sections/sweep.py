@@ -10,11 +10,13 @@ from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import number, table, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
-from hvdc_ident.report.sweep import sweep_errors, sweep_poles
+from hvdc_ident.report.sweep import sweep_bode, sweep_errors, sweep_poles
 from hvdc_ident.trajectory import Array
 
 MOST = 2000
 """Rows that are drawn; of more, every so many."""
+CURVES, CHANNELS = 40, 4
+"""Frequency responses drawn in one figure, and figures of them."""
 
 
 def _render(results: Results) -> str:
@@ -37,7 +39,8 @@ def _render(results: Results) -> str:
     errors = _errors(good)
     lines.append(_best(good, list(parameters), errors, found.get("units") or {}))
     step = max(1, len(good) // MOST)
-    lines += [_figures(p, parameters, good[::step], errors, step, found.get("units") or {}) for p in parameters]
+    units, omega = found.get("units") or {}, found.get("omega") or []
+    lines += [_figures(p, parameters, good[::step], errors, step, units, omega) for p in parameters]
     return "\n".join(lines)
 
 
@@ -67,6 +70,7 @@ def _figures(
     errors: dict[tuple[str, str], Array],
     step: int,
     units: dict[str, Any],
+    omega: list[float],
 ) -> str:
     values = np.array([p["values"][name] for p in points], dtype=float)
     about = parameters[name]
@@ -81,7 +85,24 @@ def _figures(
         poles = np.array([p["poles"] for p in points], dtype=float)
         fig = sweep_poles(name, values, poles[..., 0] + 1j * poles[..., 1])
         drawn.append(f"<figure>{svg(fig, f'poles over {name}')}</figure>")
+    if points[0].get("bode"):
+        drawn += _bode(name, values, points, omega)
     return "\n".join(drawn)
+
+
+def _bode(name: str, values: Array, points: list[dict[str, Any]], omega: list[float]) -> list[str]:
+    """One figure a channel, up to a few, with a curve for every so many points."""
+    rows = np.flatnonzero(np.array(omega) > 0)
+    some = np.unique(np.linspace(0, len(points) - 1, min(len(points), CURVES)).astype(int))
+    channels = [(o, i) for o, line in points[0]["bode"].items() for i in line][:CHANNELS]
+    drawn = []
+    for output, source in channels:
+        pairs = np.array([points[k]["bode"][output][source] for k in some], dtype=float)
+        label = f"{output} over {source}"
+        responses = (pairs[..., 0] + 1j * pairs[..., 1])[:, rows]
+        fig = sweep_bode(name, values[some], np.array(omega)[rows], responses, label)
+        drawn.append(f"<figure>{svg(fig, f'frequency response of {label} over {name}')}</figure>")
+    return drawn
 
 
 SECTION = Section(order=35, title="Sweep", render=_render)
