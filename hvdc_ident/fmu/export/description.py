@@ -9,7 +9,7 @@ from hvdc_ident.fmu.export.program import TOLERANCE
 from hvdc_ident.fmu.export.variables import Variable, Variables
 
 KINDS = {"model-exchange": "ModelExchange", "co-simulation": "CoSimulation"}
-_SI: Mapping[str, Mapping[str, int]] = {
+SI: Mapping[str, Mapping[str, int]] = {
     "s": {"s": 1},
     "1/s": {"s": -1},
     "Hz": {"s": -1},
@@ -120,8 +120,8 @@ def _units(root: ET.Element, variables: Variables) -> None:
     units = ET.SubElement(root, "UnitDefinitions")
     for name in names:
         unit = ET.SubElement(units, "Unit", name=name)
-        if name in _SI:
-            ET.SubElement(unit, "BaseUnit", {n: str(e) for n, e in _SI[name].items()})
+        if name in SI:
+            ET.SubElement(unit, "BaseUnit", {n: str(e) for n, e in SI[name].items()})
 
 
 def _numbers(v: Variable) -> dict[str, str]:

@@ -1,0 +1,157 @@
+"""Any sympy model as Modelica text: flat, without libraries, with its steady start as initial equations."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.files import write_text
+from hvdc_ident.fmu.export.description import SI
+from hvdc_ident.fmu.export.modelica_text import Printer, identifier
+from hvdc_ident.fmu.export.program import Program
+from hvdc_ident.model.definition import Model
+
+
+def save_modelica(model: Model, path: str | Path) -> Path:
+    """The path, once the model's Modelica text is written there; the Modelica model has the file's name."""
+    path = Path(path)
+    return write_text(path, modelica(model, path.stem))
+
+
+def modelica(model: Model, name: str = "", steady: bool | None = None) -> str:
+    """The Modelica text of a model, each signal under its own name.
+
+    name: of the Modelica model (default: the model's own, as an identifier). steady: True writes the steady start as
+    initial equations, so that parameters and inputs move it; False writes its numbers, which every tool can start
+    from; None is True but for a model with sampled values, for tools seldom solve for discrete values. Raises
+    ExpressionError for an expression that Modelica has no words for.
+    """
+    numbers = bool(model.sampled) if steady is None else not steady
+    return "\n".join(_Writer(model, name, numbers).lines()) + "\n"
+
+
+def output_name(model: Model, name: str) -> str:
+    """What an output is called in the Modelica text: NAME_output where NAME is another variable."""
+    own = name in model.states or name in model.signals or name in model.algebraic
+    shown = own and model.outputs[name].value == symbol(name)
+    return name if shown or name not in model.names else f"{name}_output"
+
+
+class _Writer:
+    """Collects declarations and equations of one model."""
+
+    def __init__(self, model: Model, name: str, numbers: bool) -> None:
+        self.model = model
+        self.name = re.sub(r"[^A-Za-z0-9_]", "_", name or model.name)
+        if not re.match(r"[A-Za-z]", self.name):
+            self.name = f"M_{self.name}"
+        taken = {*model.names, *model.outputs, self.name, "time"}
+        free = (n for k in itertools.count(1) if (n := f"helper_{k}") not in taken)
+        self.text = Printer(lambda: next(free))
+        self.start = Program(model)
+        # An output that shows the variable of its name is that variable.
+        self.shown = {n for n in model.outputs if output_name(model, n) == n and n in model.names}
+        self.numbers = numbers
+
+    def lines(self) -> Iterator[str]:
+        """The whole text, line by line."""
+        m = self.model
+        equations = list(self._equations())
+        initial = list(self._initial())
+        yield f"model {self.name} {_string(m.description or m.name)}"
+        yield from (f"  {line}" for line in self._declarations())
+        yield from (f"  Real {n};" for n in self.text.helpers)
+        if initial:
+            yield "initial equation"
+            yield from (f"  {line}" for line in initial)
+        yield "equation"
+        yield from (f"  {line}" for line in equations)
+        yield from (f"  {n} = {value};" for n, value in self.text.helpers.items())
+        yield f"end {self.name};"
+
+    def _declarations(self) -> Iterator[str]:
+        m, rest = self.model, self.start.rest
+        for n, q in m.parameters.items():
+            bounds = {"min": q.min, "max": q.max}
+            given = [f"{k} = {v!r}" for k, v in bounds.items() if abs(v) < float("inf")]
+            yield _declared("parameter Real", n, [*_unit(q.unit), *given], q.unit, q.description, repr(q.value))
+        for n, i in m.inputs.items():
+            yield _declared("input Real", n, [*_unit(i.unit), f"start = {i.value!r}"], i.unit, i.description)
+        for k, (n, s) in enumerate(m.states.items()):
+            start = [f"start = {float(rest[k])!r}", *(["fixed = true"] if self.numbers and s.start is None else [])]
+            yield _declared(self._kind(n), n, [*_unit(s.unit), *start], s.unit, s.description)
+        known = {n: float(rest[len(m.states) + k]) for k, n in enumerate(self.start.structure.unknowns)}
+        for n, z in m.algebraic.items():
+            start = [f"start = {known[n]!r}"] if n in known else []
+            yield _declared(self._kind(n), n, [*_unit(z.unit), *start], z.unit, z.description)
+        for n, g in m.signals.items():
+            yield _declared(self._kind(n), n, _unit(g.unit), g.unit, g.description)
+        for n in m.delays:
+            yield f"Real {identifier(n)};"
+        at = len(rest) - len(m.sampled)
+        for k, n in enumerate(m.sampled):
+            held = f"(start = {float(rest[at + k])!r}, fixed = true)"
+            yield f"discrete Real {identifier(n)}_taken{held};"
+            yield f"discrete Real {identifier(n)}{held};"
+        for n, o in m.outputs.items():
+            if n not in self.shown:
+                yield _declared("output Real", output_name(m, n), _unit(o.unit), o.unit, o.description)
+
+    def _kind(self, name: str) -> str:
+        return "output Real" if name in self.shown else "Real"
+
+    def _equations(self) -> Iterator[str]:
+        m, text = self.model, self.text
+        for n, s in m.states.items():
+            yield f"der({identifier(n)}) = {text(s.derivative)};"
+        for n, z in m.algebraic.items():
+            yield f"{identifier(n)} = {text(z.equation)};"
+        for n, g in m.signals.items():
+            yield f"{identifier(n)} = {text(g.value)};"
+        for n, d in m.delays.items():
+            yield f"{identifier(n)} = delay({text(d.of)}, {text(d.time)});"
+        for n, q in m.sampled.items():
+            taken, period, compute = f"{identifier(n)}_taken", text(q.period), text(q.compute)
+            yield f"when sample(0, {period}) then {taken} = {text(q.value)}; end when;"
+            if q.compute == 0:
+                yield f"when sample(0, {period}) then {identifier(n)} = {text(q.value)}; end when;"
+            else:
+                yield f"when sample({compute}, {period}) then {identifier(n)} = pre({taken}); end when;"
+        for n, o in m.outputs.items():
+            if n not in self.shown:
+                yield f"{identifier(output_name(m, n))} = {text(o.value)};"
+
+    def _initial(self) -> Iterator[str]:
+        for n, s in self.model.states.items():
+            if s.start == "free":
+                yield f"{identifier(n)} = {identifier(f'{n}_start')};"
+            elif s.start is not None:
+                yield f"{identifier(n)} = {self.text(s.start)};"
+            elif not self.numbers:
+                yield f"{identifier(n)} = {self.text(s.rest)};" if s.rest is not None else f"der({identifier(n)}) = 0;"
+
+
+def _declared(kind: str, name: str, attributes: Iterable[str], unit: str, description: str, value: str = "") -> str:
+    listed = ", ".join(attributes)
+    words = " ".join(description.split())
+    note = " ".join(t for t in (words, f"[{unit}]" if unit and unit not in SI else "") if t)
+    return (
+        f"{kind} {identifier(name)}"
+        + (f"({listed})" if listed else "")
+        + (f" = {value}" if value else "")
+        + (f" {_string(note)}" if note else "")
+        + ";"
+    )
+
+
+def _unit(unit: str) -> list[str]:
+    """The unit attribute, for units that Modelica's grammar of units knows; others stand in the description."""
+    return [f'unit = "{unit}"'] if unit in SI else []
+
+
+def _string(text: str) -> str:
+    escaped = " ".join(text.split()).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
