@@ -1,0 +1,93 @@
+"""The two small plants of the study, as plain functions; their cards for the package stand in `cards/`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+See = Callable[[str, Array], Array]
+Flow = Callable[[list[Array], Mapping[str, Array], Mapping[str, Array], See], list[Array]]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A plant: values of parameters and inputs, where its states may be looked for, and its equations.
+
+    flow(x, inputs, parameters, see): rates of the states; every signal passes `see(slot, value)`, which returns what
+    its readers get, and keeps it. fitted: the parameters a fit may move. kicks: by input, the size of a small step.
+    slots: where an effect may hide, but for the outputs; a signal stands after those it may bring in.
+    """
+
+    name: str
+    parameters: Mapping[str, float]
+    inputs: Mapping[str, float]
+    states: Mapping[str, float]
+    outputs: tuple[str, ...]
+    fitted: tuple[str, ...]
+    kicks: Mapping[str, float]
+    slots: tuple[str, ...]
+    resistance: tuple[str, str]
+    flow: Flow
+
+
+def _station(x: list[Array], u: Mapping[str, Array], p: Mapping[str, Array], see: See) -> list[Array]:
+    ref, grid, bus = see("Pref", u["Pref"]), see("E", u["E"]), see("Vbus", u["Vbus"])
+    amps, integral, vdc = see("I", x[0]), see("xi", x[1]), see("Vdc", x[2])
+    volts = see("V", grid - p["Z"] * amps)
+    power = see("P", volts * amps)
+    measured = see("Pm", power)
+    err = see("err", ref - measured)
+    order = see("order", p["KP"] * err + integral)
+    current = see("current", np.minimum(np.maximum(order, -1.2), 1.2))
+    line = see("Iline", (vdc - bus) / p["Rl"])
+    see("outputs.P", power)
+    see("outputs.Vdc", vdc)
+    see("outputs.order", order)
+    return [(current - amps) / p["Ta"], p["KI"] * err, (power / vdc - line) / p["C"]]
+
+
+def _drive(x: list[Array], u: Mapping[str, Array], p: Mapping[str, Array], see: See) -> list[Array]:
+    ref, load = see("wref", u["wref"]), see("load", u["load"])
+    speed, amps, integral = see("w", x[0]), see("i", x[1]), see("xs", x[2])
+    measured = see("wm", speed)
+    err = see("err", ref - measured)
+    order = see("vo", p["KP"] * err + integral)
+    volts = see("v", np.minimum(np.maximum(order, -4.0), 4.0))
+    emf = see("emf", p["k"] * speed)
+    torque = see("torque", p["k"] * amps)
+    friction = see("friction", p["b"] * speed)
+    see("outputs.w", speed)
+    see("outputs.i", amps)
+    see("outputs.vo", order)
+    return [(torque - friction - load) / p["J"], (volts - emf - p["R"] * amps) / p["L"], p["KI"] * err]
+
+
+STATION = Plant(
+    name="station",
+    parameters={"KP": 0.3, "KI": 25.0, "C": 0.25, "Ta": 0.01, "Z": 0.15, "Rl": 0.1},
+    inputs={"Pref": 0.5, "E": 1.0, "Vbus": 1.0},
+    states={"I": 0.5, "xi": 0.5, "Vdc": 1.05},
+    outputs=("P", "Vdc", "order"),
+    fitted=("KP", "KI", "C"),
+    kicks={"Pref": 0.1, "E": 0.05, "Vbus": 0.02},
+    slots=("Pref", "E", "Vbus", "I", "xi", "Vdc", "V", "P", "Pm", "err", "order", "current", "Iline"),
+    resistance=("Iline", "Rl"),
+    flow=_station,
+)
+DRIVE = Plant(
+    name="drive",
+    parameters={"KP": 1.2, "KI": 14.0, "J": 0.02, "k": 0.5, "b": 0.02, "R": 0.5, "L": 0.005},
+    inputs={"wref": 1.0, "load": 0.1},
+    states={"w": 1.0, "i": 0.3, "xs": 0.7},
+    outputs=("w", "i", "vo"),
+    fitted=("KP", "KI", "J"),
+    kicks={"wref": 0.3, "load": 0.1},
+    slots=("wref", "load", "w", "i", "xs", "wm", "err", "vo", "v", "emf", "torque", "friction"),
+    resistance=("", ""),
+    flow=_drive,
+)
+PLANTS = {p.name: p for p in (STATION, DRIVE)}

@@ -1,0 +1,194 @@
+"""The study's own simulator: the classical Runge-Kutta method at a fixed step, on a batch of runs at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hidden.operators import CATALOGUE, OUTSIDE, Operator
+from hidden.plants import Plant
+
+Array = NDArray[np.float64]
+STEP = 2e-4
+LEAD = 1.0
+"""s: how long a run that has no steady start waits for rest before its first row."""
+STAGES = (0.0, 0.5, 0.5, 1.0)
+WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """An input: straight lines through points (time, value), a time that stands twice is a jump; constant outside."""
+
+    points: tuple[tuple[float, float], ...]
+
+    def at(self, t: Array, before: bool = False) -> Array:
+        """Values at times; at a jump the one after it, or before it."""
+        times, values = np.array(self.points).T
+        right = np.searchsorted(times, t, side="left" if before else "right")
+        low, high = np.clip(right - 1, 0, None), np.clip(right, None, times.size - 1)
+        span = times[high] - times[low]
+        share = np.where(span > 0, (t - times[low]) / np.where(span > 0, span, 1.0), 0.0)
+        return np.where(right == 0, values[0], values[low] + np.clip(share, 0, 1) * (values[high] - values[low]))
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """An effect at a slot. parameters: numbers, or one a run. source: the signal it brings in."""
+
+    effect: str
+    at: str
+    parameters: Mapping[str, float | Array]
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a batch: the inputs that move and the parameters that differ from the plant's."""
+
+    inputs: Mapping[str, Signal] = field(default_factory=dict)
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+def simulate(
+    plant: Plant,
+    runs: Sequence[Run],
+    hidden: Sequence[Hidden] = (),
+    *,
+    rows: int = 300,
+    interval: float = 4e-3,
+    watch: Sequence[str] = (),
+    step: float = STEP,
+) -> Array:
+    """(rows, runs, outputs) at k * interval s; or of the slots in `watch` (as their readers see them)."""
+    return _Batch(plant, runs, hidden, rows, interval, watch, step).result()
+
+
+class _Batch:
+    def __init__(
+        self,
+        plant: Plant,
+        runs: Sequence[Run],
+        hidden: Sequence[Hidden],
+        rows: int,
+        interval: float,
+        watch: Sequence[str],
+        step: float,
+    ) -> None:
+        self.plant, self.n, self.h = plant, len(runs), step
+        self.rows, self.every = rows, round(interval / step)
+        assert abs(self.every * step - interval) < 1e-12, "the rows fall on whole steps"
+        self.watch = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
+        kinds = CATALOGUE | OUTSIDE
+        waits = any(kinds[h.effect].waits_for_rest for h in hidden)
+        self.lead = round(LEAD / step) if waits else 0
+        self.steps = self.lead + (rows - 1) * self.every + 1
+        self.p = {
+            n: np.array([float(r.values.get(n, v)) for r in runs]) for n, v in plant.parameters.items()
+        }
+        self.chains: dict[str, list[tuple[Operator, int, str]]] = {}
+        count = len(plant.states)
+        for e in hidden:
+            full = {n: np.broadcast_to(np.asarray(v, dtype=float), (self.n,)) for n, v in e.parameters.items()}
+            operator = kinds[e.effect](full, step, self.steps)
+            self.chains.setdefault(e.at, []).append((operator, count, e.source))
+            count += operator.states
+        self.count = count
+        self.inputs = self._inputs(runs)
+        self.raw = (*plant.inputs, *plant.states)
+        self.seen: dict[str, Array] = {}
+
+    def _inputs(self, runs: Sequence[Run]) -> dict[str, Array]:
+        """(steps, 3, runs): at the beginning, the middle and just before the end of every step."""
+        t = (np.arange(self.steps) - self.lead) * self.h
+        found = {}
+        for name, value in self.plant.inputs.items():
+            table = np.full((self.steps, 3, self.n), value)
+            for k, run in enumerate(runs):
+                if name in run.inputs:
+                    signal = run.inputs[name]
+                    table[:, 0, k] = signal.at(t)
+                    table[:, 1, k] = signal.at(t + 0.5 * self.h)
+                    table[:, 2, k] = signal.at(t + self.h, before=True)
+            found[name] = table
+        return found
+
+    # --- one evaluation ---
+
+    def _flow(self, mode: str, x: list[Array], inputs: Mapping[str, Array], t: float, share: float) -> list[Array]:
+        """Rates of all states. mode: "rest" (operators as they are at rest), "begin" (they set themselves up) or "run"."""
+        rates: dict[int, Array] = {}
+        seen = self.seen
+        own = {**inputs, **dict(zip(self.plant.states, x, strict=False))}
+
+        def see(slot: str, u: Array) -> Array:
+            own[slot] = u
+            for operator, first, source in self.chains.get(slot, ()):
+                # Of an input or a state the value itself is brought in, of a signal what its readers get.
+                other = None if not source else own[source] if source == slot or source in self.raw else seen[source]
+                if mode != "run":
+                    if mode == "begin":
+                        x[first : first + operator.states] = operator.begin(u, other)
+                    u = operator.rest(u, other)
+                    continue
+                z = x[first : first + operator.states]
+                y = operator.value(u, z, t, share, other)
+                for k, rate in enumerate(operator.rates(u, z)):
+                    rates[first + k] = rate
+                u = y
+            seen[slot] = u
+            return u
+
+        plant = self.plant.flow(x, inputs, self.p, see)
+        return plant + [rates[k] for k in sorted(rates)]
+
+    def _rest(self) -> list[Array]:
+        """The states at which nothing moves, by Newton's method with differences; operators are set up there."""
+        inputs = {n: v[0, 0] for n, v in self.inputs.items()}
+        m = len(self.plant.states)
+        x = [np.full(self.n, g) for g in self.plant.states.values()]
+        for _ in range(60):
+            f = np.array(self._flow("rest", x, inputs, 0.0, 0.0)[:m])
+            jac = np.empty((self.n, m, m))
+            for j in range(m):
+                d = 1e-6 * (1.0 + np.abs(x[j]))
+                moved = [*x[:j], x[j] + d, *x[j + 1 :]]
+                jac[:, :, j] = ((np.array(self._flow("rest", moved, inputs, 0.0, 0.0)[:m]) - f) / d).T
+            bad = np.abs(np.linalg.det(jac)) < 1e-12
+            jac[bad] += 1e-6 * np.eye(m)
+            change = np.linalg.solve(jac, f.T[:, :, None])[:, :, 0].T
+            x = [a - np.clip(c, -0.5, 0.5) for a, c in zip(x, change, strict=True)]
+            if np.abs(change).max() < 1e-12:
+                break
+        x = x + [np.zeros(self.n) for _ in range(self.count - m)]
+        self._flow("begin", x, inputs, 0.0, 0.0)
+        return x
+
+    # --- the run ---
+
+    def result(self) -> Array:
+        """(rows, runs, watched); a run that leaves all bounds is nan from there on."""
+        with np.errstate(all="ignore"):
+            return self._result()
+
+    def _result(self) -> Array:
+        x = self._rest()
+        out = np.full((self.rows, self.n, len(self.watch)), np.nan)
+        h = self.h
+        for step in range(self.steps):
+            t = (step - self.lead) * h
+            total = [np.zeros(self.n) for _ in x]
+            rate: list[Array] = []
+            for stage, (share, weight) in enumerate(zip(STAGES, WEIGHTS, strict=True)):
+                at = x if stage == 0 else [a + share * h * r for a, r in zip(x, rate, strict=True)]
+                inputs = {n: v[step, (0, 1, 1, 2)[stage]] for n, v in self.inputs.items()}
+                rate = self._flow("run", at, inputs, t + share * h, share)
+                if stage == 0 and step >= self.lead and (step - self.lead) % self.every == 0:
+                    for k, name in enumerate(self.watch):
+                        out[(step - self.lead) // self.every, :, k] = self.seen[name]
+                total = [a + weight * r for a, r in zip(total, rate, strict=True)]
+            x = [a + h * r for a, r in zip(x, total, strict=True)]
+        return out
