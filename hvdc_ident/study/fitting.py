@@ -43,7 +43,7 @@ def as_reported(study: Study) -> bool:
     """Whether the fit is of the same data in the same way as the report's, so that its profiles are the fit's."""
     asked = asked_of(study)
     plain = asked.loss == "linear" and asked.whiten == "no" and asked.residual == "time" and not asked.guard
-    return asked.mode == "simultaneous" and plain and not priors(study.settings, study.experiments)
+    return plain and not priors(study.settings, study.experiments)
 
 
 def groups_of(study: Study, problem: Problem) -> list[Group]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hvdc_ident.study.stage import Options, Outcome, Stage
 
 if TYPE_CHECKING:
+    from hvdc_ident.fit import Group
     from hvdc_ident.study.study import Study
 
 FEWEST_STARTS = 4
@@ -16,7 +17,7 @@ FEWEST_STARTS = 4
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """A verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
-    from hvdc_ident.identifiability import identifiability
+    from hvdc_ident.identifiability import identifiability, identifiability_by_group
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
 
@@ -26,18 +27,26 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     starts = max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
     pair = study.settings.identifiability.pair if study.settings.identifiability else None
     with executor_of(study, options, "identify") as executor:
-        report = identifiability(
-            study.model,
-            study.experiments,
-            tuple(study.candidates.values()),
-            starts=starts,
-            seed=options.seed,
-            executor=executor,
-            progress=options.progress,
-            pair=(pair[0], pair[1]) if pair else None,
-        )
+        common: dict[str, Any] = {
+            "starts": starts,
+            "seed": options.seed,
+            "executor": executor,
+            "progress": options.progress,
+            "pair": (pair[0], pair[1]) if pair else None,
+        }
+        asked = (study.model, study.experiments, tuple(study.candidates.values()))
+        groups = groups_of(study)
+        report = identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
     bounds = {n: {"start": f.start, "min": f.min, "max": f.max} for n, f in study.candidates.items()}
     return Outcome({**report.to_dict(), "candidates": bounds})
+
+
+def groups_of(study: Study) -> list[Group]:
+    """The groups that the fit takes one after the other; none where it takes all together."""
+    from hvdc_ident.fit import Group
+
+    asked = study.settings.fit.groups if study.settings.fit else []
+    return [Group(tuple(g.parameters), tuple(g.outputs or ()), tuple(g.experiments or ())) for g in asked]
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:
