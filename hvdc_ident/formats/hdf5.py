@@ -77,7 +77,8 @@ def _group(group: Any, prefix: str, above: Any, path: Path, depth: int) -> Itera
     """The records of a group and of those inside it. above: the time of the groups around it."""
     if depth > _MAX_DEPTH or len(group) > _MAX_SETS:
         raise damaged(path, f"too many data sets in '{prefix or '/'}', or groups too deep")
-    local = [name for name in group if group.get(name, getclass=True, getlink=True).__name__ == "HardLink"]
+    kinds = {name: group.get(name, getclass=True, getlink=True) for name in group}
+    local = [name for name, kind in kinds.items() if kind is not None and kind.__name__ == "HardLink"]  # none outside
     sets = {n: group[n] for n in local if hasattr(group[n], "shape") and group[n].dtype.kind in "fiub"}
     name = time_name(list(sets))
     clock = above

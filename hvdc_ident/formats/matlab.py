@@ -1,4 +1,4 @@
-"""MATLAB files of version 5 to 7.2 (scipy) and 7.3 (HDF5), as Simulink and scripts save waveforms.
+"""MATLAB files of version 5 to 7.2, and 7.3 (HDF5), as Simulink and scripts save waveforms.
 
 Three layouts are understood: a vector called time, t or tout with vectors or matrices of as many rows beside it; a
 matrix whose first column is the time; Simulink's "structure with time" (fields `time` and `signals`, each with `values`
@@ -8,7 +8,6 @@ a form MathWorks does not publish: they are refused with the way out.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import event_rows, pick
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
+from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
 from hvdc_ident.trajectory import Array, Trajectory
 
 NAME = "matlab"
@@ -66,23 +66,14 @@ def _waveforms(path: Path) -> Trajectory:
 
 
 def _version_5(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat, whosmat
-    from scipy.io.matlab import MatReadError, MatReadWarning
-
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MatReadWarning)
-            for name, shape, kind in whosmat(path):
-                check_size(1, int(np.prod([int(n) for n in shape], dtype=object)), path)
-                if kind in ("opaque", "object", "function", "unknown") and name:
-                    raise _object(path, name)
-            return dict(loadmat(path, squeeze_me=True, struct_as_record=False))
-    except WaveformError:
-        raise
-    except (MatReadError, MemoryError) as error:
+        found = variables(path.read_bytes())
+    except (Mat5Error, MemoryError, OverflowError, ValueError) as error:
         raise damaged(path, f"MATLAB file cannot be read: {error}") from None
-    except Exception as error:  # scipy's reader lets through whatever broken bytes lead to
-        raise damaged(path, f"MATLAB file cannot be read: {type(error).__name__}: {error}") from None
+    opaque = next((name for name, value in found.items() if isinstance(value, Opaque)), None)
+    if opaque is not None and not any(isinstance(v, np.ndarray | dict) for v in found.values()):
+        raise _object(path, opaque)
+    return found
 
 
 def _version_73(path: Path) -> dict[str, Any]:
@@ -118,11 +109,10 @@ def _empty(item: Any) -> bool:
     return bool(item.attrs.get("MATLAB_empty", 0))
 
 
-def _parts(variables: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
+def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
     """The records among the variables, each with a time of its own."""
-    fields = {k: _fields(v) for k, v in variables.items() if not k.startswith("__")}
-    structures = {k: v for k, v in fields.items() if isinstance(v, dict)}
-    arrays = {k: np.asarray(v, dtype=float) for k, v in fields.items() if _numeric(v)}
+    structures = {k: v for k, v in found.items() if isinstance(v, dict)}
+    arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
     for name, structure in structures.items():
         yield from _structure(name, structure, path)
     time = time_name(list(arrays))
@@ -156,11 +146,11 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         return
     columns: dict[str, Array] = {}
     for i, signal in enumerate(_list(listed)):
-        fields = _fields(signal)
-        if not isinstance(fields, dict) or not _numeric(fields.get("values")):
+        if not isinstance(signal, dict) or not _numeric(signal.get("values")):
             continue
-        label = str(fields.get("label") or "") if isinstance(fields.get("label"), str) else ""
-        _add(columns, label or f"{name}.{i + 1}", np.asarray(fields["values"], dtype=float), clock.size)
+        label = signal.get("label")
+        shown = label if isinstance(label, str) and label else f"{name}.{i + 1}"
+        _add(columns, shown, np.asarray(signal["values"], dtype=float), clock.size)
     if columns:
         yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
 
@@ -191,20 +181,13 @@ def _labels(name: str, n: int) -> tuple[str, ...]:
     return (name,) if n == 1 else tuple(f"{name}({i + 1})" for i in range(n))
 
 
-def _fields(value: Any) -> Any:
-    """A structure as a dict; anything else as it is."""
-    names = getattr(value, "_fieldnames", None)
-    return {k: getattr(value, k) for k in names} if names is not None else value
-
-
 def _list(value: Any) -> list[Any]:
     """The elements of a structure array, however it was stored."""
-    if isinstance(value, dict):  # version 7.3: one list a field
-        n = max((len(v) for v in value.values() if isinstance(v, list)), default=0)
-        if n == 0:
-            return [value]
-        return [{k: v[i] for k, v in value.items() if isinstance(v, list) and i < len(v)} for i in range(n)]
-    return list(np.atleast_1d(value))
+    if isinstance(value, dict):  # one structure; or version 7.3's array of them: one list a field
+        lists = {k: v for k, v in value.items() if isinstance(v, list)}
+        n = max(map(len, lists.values()), default=0)
+        return [{k: v[i] for k, v in lists.items() if i < len(v)} for i in range(n)] if n else [value]
+    return value if isinstance(value, list) else []
 
 
 def _numeric(value: Any) -> bool:

@@ -8,6 +8,7 @@ Source: PSCAD manual, "Output files"; the files themselves.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,7 +132,9 @@ def _table(path: Path, columns: int) -> Array:
         except ValueError:
             skip = 1
     try:
-        table = np.loadtxt(path, skiprows=skip, ndmin=2, dtype=float, encoding="latin-1")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # no rows at all
+            table = np.loadtxt(path, skiprows=skip, ndmin=2, dtype=float, encoding="latin-1")
     except (ValueError, UserWarning) as error:
         raise damaged(path, f"not a table of numbers: {error}") from None
     if table.shape[0] < 2 or table.shape[1] < columns + 1:

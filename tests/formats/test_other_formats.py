@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -150,10 +151,35 @@ def test_a_broken_date_is_named_with_its_line(tmp_path: Path) -> None:
         read_waveforms(tmp_path / "pmu.csv")
 
 
-def test_matlab_objects_are_refused_with_the_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from scipy.io import savemat
-
-    savemat(tmp_path / "s.mat", {"ts": TIME})
-    monkeypatch.setattr("scipy.io.whosmat", lambda path: [("ts", (1, 1), "opaque")])
+def test_matlab_objects_are_refused_with_the_way_out(tmp_path: Path) -> None:
+    """A file of one variable of class 17, as a timeseries is saved, laid out by hand."""
+    flags = struct.pack("<IIII", 6, 8, 17, 0)
+    body = flags + struct.pack("<II", 1, 2) + b"ts".ljust(8, b"\0")
+    content = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 14, len(body)) + body
+    (tmp_path / "s.mat").write_bytes(content)
     with pytest.raises(WaveformError, match="Structure with time"):
         read_waveforms(tmp_path / "s.mat")
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_what_another_package_writes_is_read_as_it_reads_it(tmp_path: Path, compressed: bool) -> None:
+    from scipy.io import savemat
+
+    rng = np.random.default_rng(0)
+    wanted = {
+        "t": np.arange(5.0),
+        "single": rng.normal(size=5).astype("f4"),
+        "whole": np.arange(5, dtype="i2"),
+        "flags": np.array([True, False, True, True, False]),
+        "wide": rng.normal(size=(5, 2)),
+    }
+    savemat(
+        tmp_path / "s.mat",
+        {**wanted, "text": "a label", "cells": np.array([1, "x"], object)},
+        do_compression=compressed,
+    )
+    found = read_waveforms(tmp_path / "s.mat")
+    np.testing.assert_array_equal(found["single"], wanted["single"])
+    np.testing.assert_array_equal(found["whole"], wanted["whole"])
+    np.testing.assert_array_equal(found["flags"], wanted["flags"])
+    np.testing.assert_array_equal(found["wide(2)"], wanted["wide"][:, 1])
