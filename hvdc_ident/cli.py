@@ -324,23 +324,33 @@ def export(
         typer.Option(
             "--to",
             metavar="FILE",
-            help=".toml (the model); .mat .json .csv .m .tex .zpk .mo (the linear model).",
+            help=".fmu .mo .toml (the model); .ssv (its parameters); .mat .json .csv .m .tex .zpk (the linear model).",
             show_default=False,
         ),
     ],
-    linear: Annotated[bool, typer.Option("--linear", help="The linear model, whatever the ending.")] = False,
+    linear: Annotated[
+        bool, typer.Option("--linear", help="The linear model, where the ending has both (.mo).")
+    ] = False,
+    fmi: Annotated[
+        str | None, typer.Option("--fmi", metavar="2|3", help="Version of an FMU; default 2.", show_default=False)
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--kind", metavar="me|cs", help="One kind of FMU; default both.", show_default=False)
+    ] = None,
+    source_only: Annotated[bool, typer.Option("--source-only", help="An FMU of sources, without a binary.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
 ) -> None:
     """Write the model or its linear model in the format of FILE's ending."""
-    from hvdc_ident.study.export import export as write
+    from hvdc_ident.study.export import fmu_options, write
     from hvdc_ident.study.study import load_study
 
-    written = write(load_study(study, trust), to, linear)
+    written = write(load_study(study, trust), to, linear, fmu_options(fmi, kind, source_only))
+    size = written.path.stat().st_size
     if json:
-        _print_json({"schema": 1, "file": written.as_posix(), "bytes": written.stat().st_size})
-    _say(f"{written}: {written.stat().st_size} bytes", json=json, quiet=quiet)
+        _print_json({"schema": 1, "file": written.path.as_posix(), "bytes": size, "note": written.note})
+    _say(f"{written.path}: {size} bytes" + (f"; {written.note}" if written.note else ""), json=json, quiet=quiet)
 
 
 @app.command()

@@ -1,7 +1,9 @@
-"""What `export` writes: the model as a card, or its linear model in the format of the file's ending."""
+"""What `export` writes: the model itself or its linear model, in the format of the file's ending."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,28 +14,114 @@ from hvdc_ident.study.study import Study
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
 
-LATER = {".fmu": "an FMU"}
+
+@dataclass(frozen=True)
+class FmuOptions:
+    """How an FMU is written. kinds: "model-exchange", "co-simulation". binary: None compiles where there is a compiler."""
+
+    version: str = "2.0"
+    kinds: tuple[str, ...] = ("model-exchange", "co-simulation")
+    binary: bool | None = None
 
 
-def export(source: Study | Model | LinearModel, path: str | Path, linear: bool = False) -> Path:
-    """The path, written in the format of its ending: .toml is the model, the others its linear model.
+@dataclass(frozen=True)
+class Written:
+    """A file that was written, and what is to be said of it."""
+
+    path: Path
+    note: str = ""
+
+
+def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOptions | None:
+    """The options as the command line says them: "2" or "3", "me" or "cs"; None where nothing is said."""
+    versions = {"2": "2.0", "2.0": "2.0", "3": "3.0", "3.0": "3.0"}
+    kinds = {"me": ("model-exchange",), "cs": ("co-simulation",)}
+    if fmi is None and kind is None and not source_only:
+        return None
+    if fmi is not None and fmi not in versions:
+        raise StudyError("this version of FMI cannot be written", where="--fmi", expected="2 or 3", got=repr(fmi))
+    if kind is not None and kind not in kinds:
+        raise StudyError("this kind of FMU is not known", where="--kind", expected="me or cs", got=repr(kind))
+    default = FmuOptions()
+    return FmuOptions(
+        versions[fmi] if fmi else default.version,
+        kinds[kind] if kind else default.kinds,
+        False if source_only else None,
+    )
+
+
+def export(
+    source: Study | Model | LinearModel, path: str | Path, linear: bool = False, fmu: FmuOptions | None = None
+) -> Path:
+    """The path, written in the format of its ending: .toml, .fmu and .mo are the model, .ssv its parameters, the others its linear model.
 
     source: a study, a model (linearised at its steady state) or a linear model. linear: the linear model even where the
-    ending is one of the nonlinear model's. Raises StudyError for an ending that is not known or not yet to be had.
+    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. Raises StudyError for an ending that is not
+    known, and where the model is not of the kind that the ending needs.
     """
-    from hvdc_ident.linearize.export import formats, write
+    return write(source, path, linear, fmu).path
+
+
+def write(
+    source: Study | Model | LinearModel, path: str | Path, linear: bool = False, fmu: FmuOptions | None = None
+) -> Written:
+    """The same, with what is to be said of the file: whether an FMU holds a binary."""
+    from hvdc_ident.linearize.export import formats
+    from hvdc_ident.linearize.export import write as write_linear
 
     path = Path(path)
     ending = path.suffix.lower()
-    if ending == ".toml" and not linear and isinstance(source, Study | Model):
-        from hvdc_ident.model.card import save_card
-
-        return save_card(_model(source), path)
-    known = [*([".toml"] if isinstance(source, Study | Model) and not linear else []), *formats()]
+    nonlinear = isinstance(source, Study | Model) and not linear
+    if fmu is not None and ending != ".fmu":
+        raise StudyError("options of an FMU do not go with this ending", where=str(path), expected="a file *.fmu")
+    if nonlinear and ending in _WRITERS:
+        assert isinstance(source, Study | Model)
+        return _WRITERS[ending](source, path, fmu or FmuOptions())
     if ending not in formats():
-        what = f"{LATER[ending]} cannot be written yet" if ending in LATER else "no export has this ending"
-        raise StudyError(what, where=str(path), expected=f"one of {', '.join(known)}")
-    return write(_linear(source), path)
+        known = sorted({*formats(), *(_WRITERS if nonlinear else ())})
+        raise StudyError("no export has this ending", where=str(path), expected=f"one of {', '.join(known)}")
+    return Written(write_linear(_linear(source), path))
+
+
+def _card(source: Study | Model, path: Path, _: FmuOptions) -> Written:
+    from hvdc_ident.model.card import save_card
+
+    return Written(save_card(_model(source), path))
+
+
+def _fmu(source: Study | Model, path: Path, options: FmuOptions) -> Written:
+    from hvdc_ident.fmu.export import export_fmu
+
+    ends = [float(e.time[-1]) for e in source.experiments] if isinstance(source, Study) else []
+    stop = max((t for t in ends if t > 0.0), default=1.0)
+    found = export_fmu(
+        _model(source), path, version=options.version, kinds=options.kinds, binary=options.binary, stop=stop
+    )
+    return Written(found.path, f"FMI {found.version}, {' and '.join(found.kinds)}; {found.note}")
+
+
+def _modelica(source: Study | Model, path: Path, _: FmuOptions) -> Written:
+    from hvdc_ident.fmu.export.modelica import save_modelica
+
+    return Written(save_modelica(_model(source), path))
+
+
+def _parameters(source: Study | Model, path: Path, _: FmuOptions) -> Written:
+    from hvdc_ident.files import write_text
+    from hvdc_ident.study.tables import ssv
+
+    model = source.model if isinstance(source, Study) else source
+    values = {n: q.value for n, q in model.parameters.items()}
+    values |= dict(source.values) if isinstance(source, Study) else {}
+    return Written(write_text(path, ssv(values, source.name)))
+
+
+_WRITERS: dict[str, Callable[[Study | Model, Path, FmuOptions], Written]] = {
+    ".toml": _card,
+    ".fmu": _fmu,
+    ".mo": _modelica,
+    ".ssv": _parameters,
+}
 
 
 def _model(source: Study | Model) -> Model:

@@ -144,8 +144,13 @@ Outcome event_update(Instance *i, double order) {
     Outcome outcome = consistent(i, 1);
     if (outcome != GOOD) return outcome;
     double source[SOME(ND + NQ)];
-    int published = 0;
+    double held[SOME(NQ)]; /* a sample of the period before that is due now gives way to none taken now */
+    int published = 0, due[SOME(NQ)];
     double now = s->t + 1e-13 * fmax(1.0, fabs(s->t));
+    for (int k = 0; k < NQ; k++) {
+        due[k] = s->publish[k] <= now;
+        held[k] = s->pending[k];
+    }
     for (int k = 0; k < NQ; k++)
         if (s->tick[k] <= now) {
             model_sources(&a, source);
@@ -155,9 +160,9 @@ Outcome event_update(Instance *i, double order) {
             s->tick[k] = s->start + s->ticks[k] * s->timing[ND + k];
         }
     for (int k = 0; k < NQ; k++)
-        if (s->publish[k] <= now) {
-            s->w[FIRST_SAMPLED + k] = s->pending[k];
-            s->publish[k] = INFINITY;
+        if (s->publish[k] <= now || due[k]) {
+            s->w[FIRST_SAMPLED + k] = due[k] ? held[k] : s->pending[k];
+            if (s->publish[k] <= now) s->publish[k] = INFINITY;
             published = 1;
         }
     if (published && (outcome = consistent(i, 1)) != GOOD) return outcome;
