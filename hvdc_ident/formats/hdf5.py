@@ -14,6 +14,7 @@ import numpy as np
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
 from hvdc_ident.trajectory import Trajectory
 
@@ -55,13 +56,28 @@ def sample(path: Path) -> None:
 
 
 def _waveforms(path: Path) -> Trajectory:
+    package("h5py", path)
+    return read_apart("hdf5", path)
+
+
+def waveforms_here(path: Path) -> Trajectory:
+    """All waveforms of the file, read in this process, which a damaged file may hang or end."""
     with open(path, "rb") as file:
         newest = file.read(8) == _HDF5
     try:
         parts = _hdf5(path) if newest else _netcdf3(path)
     except WaveformError:
         raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
+    except (
+        OSError,
+        RuntimeError,
+        LookupError,
+        ValueError,
+        TypeError,
+        ArithmeticError,
+        AttributeError,
+        MemoryError,
+    ) as error:
         raise damaged(path, f"the file cannot be read: {error}") from None
     if not parts:
         raise damaged(path, "no waveforms", expected="a data set 'time' and others of as many rows")

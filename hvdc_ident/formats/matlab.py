@@ -16,6 +16,7 @@ import numpy as np
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
 from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
 from hvdc_ident.trajectory import Array, Trajectory
@@ -59,7 +60,19 @@ def sample(path: Path) -> None:
 def _waveforms(path: Path) -> Trajectory:
     with open(path, "rb") as file:
         newest = file.read(len(_V73)) == _V73
-    parts = list(_parts(_version_73(path) if newest else _version_5(path), path))
+    if newest:
+        package("h5py", path)
+        return read_apart("matlab", path)
+    return _joined(_version_5(path), path)
+
+
+def waveforms_here(path: Path) -> Trajectory:
+    """All waveforms of a version 7.3 file, read in this process, which a damaged file may hang or end."""
+    return _joined(_version_73(path), path)
+
+
+def _joined(found: Mapping[str, Any], path: Path) -> Trajectory:
+    parts = list(_parts(found, path))
     if not parts:
         raise damaged(path, "no waveforms", expected="a time vector with signals, or a structure with time")
     return joined([_once(part, path) for part in parts], path)

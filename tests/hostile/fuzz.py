@@ -17,7 +17,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +40,14 @@ WORDS = [
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of input. good: whole examples, as bytes. use: what a user does with it, given the bytes and a folder."""
+    """One kind of input. good: whole examples, as bytes. use: what a user does with it, in a folder.
+
+    slow: each takes a process of its own.
+    """
 
     good: Callable[[Path], list[bytes]]
     use: Callable[[bytes, Path], object]
+    slow: bool = False
 
 
 def spoilt(content: bytes, rng: Rng) -> bytes:
@@ -242,7 +246,7 @@ KINDS: dict[str, Kind] = {
     "dymola": _file_of("dymola-mat", ".mat"),
     "pscad-header": _file_of("pscad", ".inf"),
     "pscad-data": _companion("pscad", ".inf", "sample_01.out"),
-    "hdf5": _file_of("hdf5", ".h5"),
+    "hdf5": replace(_file_of("hdf5", ".h5"), slow=True),
     "parquet": _file_of("parquet", ".parquet"),
     "fmu-zip": Kind(_good_zip, _use_fmu),
     "fmu-description": Kind(_good_fmu, _use_fmu_description),
