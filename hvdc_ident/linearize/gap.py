@@ -12,6 +12,7 @@ from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.reduce import without_sliding_means
 
 Complex = NDArray[np.complex128]
+Graph = tuple[Array, Array, Array, Array]
 LARGEST = 512  # coefficients of the truncated operator
 
 
@@ -34,7 +35,7 @@ def gap(first: LinearModel, second: LinearModel, tolerance: float = 1e-4) -> flo
     return max(_directed(graphs[0], graphs[1], scale, tolerance), _directed(graphs[1], graphs[0], scale, tolerance))
 
 
-def _graph(model: LinearModel) -> tuple[Array, Array, Array, Array]:
+def _graph(model: LinearModel) -> Graph:
     """A, B, C, D of the normalised right coprime factors [M; N], from the Riccati equation (Vidyasagar 1988)."""
     a, b, c, d = without_sliding_means(model)
     m = b.shape[1]
@@ -55,14 +56,14 @@ def _graph(model: LinearModel) -> tuple[Array, Array, Array, Array]:
     return a + b @ f, b @ root, np.vstack([f, c + d @ f]), np.vstack([root, d @ root])
 
 
-def _scale(graphs: list[tuple[Array, Array, Array, Array]]) -> float:
+def _scale(graphs: list[Graph]) -> float:
     """The frequency that the bilinear map sends to the middle of the circle: between the graphs' poles, rad/s."""
     poles = np.concatenate([np.abs(np.linalg.eigvals(a)) for a, _, _, _ in graphs if a.shape[0]] or [np.ones(1)])
     poles = poles[poles > 0]
     return float(np.exp(np.mean(np.log(poles)))) if poles.size else 1.0
 
 
-def _response(graph: tuple[Array, Array, Array, Array], omega: Array) -> Complex:
+def _response(graph: Graph, omega: Array) -> Complex:
     """(frequency, rows, inputs) of [M; N]."""
     a, b, c, d = graph
     if a.shape[0] == 0:
@@ -71,11 +72,11 @@ def _response(graph: tuple[Array, Array, Array, Array], omega: Array) -> Complex
     return c @ np.linalg.solve(inner, np.broadcast_to(b, (omega.size, *b.shape))) + d
 
 
-def _directed(graph: tuple[Array, ...], other: tuple[Array, ...], scale: float, tolerance: float) -> float:
+def _directed(graph: Graph, other: Graph, scale: float, tolerance: float) -> float:
     points = 16 * LARGEST
     theta = (np.arange(points) + 0.5) * 2 * np.pi / points - np.pi
     omega = scale * np.tan(theta / 2)
-    product = np.conj(np.swapaxes(_response(other, omega), 1, 2)) @ _response(graph, omega)  # type: ignore[arg-type]
+    product = np.conj(np.swapaxes(_response(other, omega), 1, 2)) @ _response(graph, omega)
     m = product.shape[1]
     # Fourier coefficients over the circle; s = scale (1 - z)/(1 + z) makes stable factors power series in z.
     orders = np.arange(-LARGEST + 1, LARGEST)

@@ -113,10 +113,31 @@ def _refuse_flat_roots(s: System, y: Array, w: Array, p: Array, modes: Array, mo
             )
 
 
-def one_sided(model: Model, point: OperatingPoint, **options: object) -> tuple[LinearModel, LinearModel]:
+def one_sided(
+    model: Model,
+    point: OperatingPoint,
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    pade_order: int = 5,
+    sensitivities: Sequence[str] = (),
+    descriptor: bool = False,
+) -> tuple[LinearModel, LinearModel]:
     """The linear models below and above the limit on which a point lies; equal where it lies on none."""
-    below = linearize(model, point, side="below", **options)  # type: ignore[arg-type]
-    return below, linearize(model, point, side="above", **options)  # type: ignore[arg-type]
+
+    def at(side: Side) -> LinearModel:
+        return linearize(
+            model,
+            point,
+            inputs=inputs,
+            outputs=outputs,
+            pade_order=pade_order,
+            sensitivities=sensitivities,
+            side=side,
+            descriptor=descriptor,
+        )
+
+    return at("below"), at("above")
 
 
 def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:

@@ -106,7 +106,8 @@ class _Along:
     def __init__(self, model: Model, parameter: str, fixed: dict[str, float]) -> None:
         self.model, self.parameter = model, parameter
         self.guess: Array | None = None
-        start = {parameter: (model.parameters | model.inputs)[parameter].value}  # type: ignore[operator]
+        own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
+        start = {parameter: own.value}
         self._search = Search.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
         names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
         self._place = names.index(parameter)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,10 +55,10 @@ class Loop:
         """T = L / (1 + L)."""
         return self._of(omega, lambda value: value / (1.0 + value), "T")
 
-    def _of(self, omega: Array | None, what: object, name: str) -> Response:
+    def _of(self, omega: Array | None, what: Callable[[Array], Array], name: str) -> Response:
         w = default_omega(self.open) if omega is None else np.atleast_1d(np.asarray(omega, dtype=float))
         values = transfer(self.open, 1j * w)
-        return Response(w, what(values), (name,), (self.signal,), source=f"{name} at '{self.signal}'")  # type: ignore[operator]
+        return Response(w, what(values), (name,), (self.signal,), source=f"{name} at '{self.signal}'")
 
 
 def open_model(model: Model, signal: str) -> tuple[Model, str]:
@@ -74,7 +74,7 @@ def open_model(model: Model, signal: str) -> tuple[Model, str]:
     returned = fresh(model, f"{signal}_returned")
     if signal in model.signals or signal in model.algebraic:
         value = model.signals[signal].value if signal in model.signals else model.algebraic[signal].equation
-        unit = (model.signals | model.algebraic)[signal].unit  # type: ignore[operator]
+        unit = model.signals[signal].unit if signal in model.signals else model.algebraic[signal].unit
         opened = driven(model, (signal,))
         return replace(opened, outputs=opened.outputs | {returned: Output(value, unit)}), returned
     if signal in model.states:
