@@ -97,8 +97,9 @@ class Experiment:
     estimated from, where it was (else it is exact). event: instant of the first disturbance, s.
     window: (from, to) in s of what is compared. role: "fit" or "holdout".
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
-    offsets: constants added to inputs all along, in their units. nuisance: what is unknown about this experiment alone
-    and is estimated with it: "time-shift", or the name of an input (its offset) or of a parameter (a value of its own).
+    offsets: constants added to inputs all along, in their units. starts: states that begin at a value and not at rest.
+    nuisance: what is unknown about this experiment alone and is estimated with it: "time-shift", or the name of an input
+    (its offset), a state (its start) or a parameter (a value of its own).
     """
 
     name: str
@@ -115,6 +116,7 @@ class Experiment:
     nuisance: tuple[str, ...] = ()
     offsets: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_dof: FrozenMap[float] = field(default_factory=FrozenMap)
+    starts: FrozenMap[float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
@@ -126,7 +128,7 @@ class Experiment:
             )
         time.setflags(write=False)
         object.__setattr__(self, "time", time)
-        for name in ("inputs", "values", "noise", "offsets", "noise_dof"):
+        for name in ("inputs", "values", "noise", "offsets", "noise_dof", "starts"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
         if self.measured is not None and not np.array_equal(self.measured.time, time):

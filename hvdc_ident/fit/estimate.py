@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from hvdc_ident.fit.assessment import assessed
+from hvdc_ident.fit.clock import has_clocks, searched
 from hvdc_ident.fit.intervals import estimates_of
 from hvdc_ident.fit.noise import GIVEN, floor_of, source_of
 from hvdc_ident.fit.nuisance import unknown_of
@@ -72,6 +73,9 @@ def fit(
         return _failed(first, begins, runs)
     local = TrustRegion()
     problem, best, rivals = weighted(first, usable, local)
+    if has_clocks(problem):
+        best = searched(problem, best, local)
+        rivals = [r for r in rivals if r.cost >= best.cost]
     if whiten == "residual":
         problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
     blocks = problem.blocks(best.theta)

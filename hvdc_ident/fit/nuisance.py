@@ -3,20 +3,22 @@
 A nuisance stands by name in `Experiment.nuisance` and has one unknown an experiment (`unknowns`):
 - "time-shift": the recorder's clock is late by so many s;
 - an input (or a driven slot): a constant is added to it all along, the steady start included;
-- a parameter: it has a value of its own in this experiment, as the free start of a state has.
+- a state: it begins at an unknown value and not at rest, as that of a block driven by recordings does;
+- a parameter: it has a value of its own in this experiment.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.fit.simulator import Simulator
+from hvdc_ident.fit.simulator import Simulator, WithInputs, WithStates
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.parameters import Input
 from hvdc_ident.trajectory import Array, Trajectory
@@ -42,8 +44,9 @@ def unknown_of(experiment: str, nuisance: str) -> str:
 def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[Free, ...]:
     """The unknowns of the experiment alone, in the order it names them.
 
-    A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0. A parameter has the
-    start and the bounds that the simulator gives it. Raises StudyError for a nuisance that is not known here.
+    A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0, a state's start at
+    the model's guess, without bounds. A parameter has the start and the bounds that the simulator gives it.
+    Raises StudyError for a nuisance that is not known here.
     """
     return tuple(_free(simulator, experiment, name) for name in experiment.nuisance)
 
@@ -52,11 +55,20 @@ def unit_of(simulator: Simulator, nuisance: str) -> str:
     """The unit of a nuisance."""
     if nuisance == TIME_SHIFT:
         return "s"
-    known: Mapping[str, Input] = getattr(simulator, "inputs", {})
-    for names in (simulator.parameters, known):
+    for names in (simulator.parameters, _inputs(simulator), _states(simulator)):
         if nuisance in names:
-            return names[nuisance].unit
+            return str(names[nuisance].unit)
     return ""
+
+
+def _inputs(simulator: Simulator) -> Mapping[str, Input]:
+    """The inputs, of a simulator that says what they are."""
+    return simulator.inputs if isinstance(simulator, WithInputs) else {}
+
+
+def _states(simulator: Simulator) -> Mapping[str, Any]:
+    """The states whose start may be given, of a simulator that says what they are."""
+    return simulator.states if isinstance(simulator, WithStates) else {}
 
 
 def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> Free:
@@ -65,10 +77,12 @@ def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> Free:
         return _clock(experiment, name)
     if nuisance in simulator.parameters:
         return Free.of(name, simulator.parameters[nuisance])
-    known: Mapping[str, Input] = getattr(simulator, "inputs", {})
+    known, states = _inputs(simulator), _states(simulator)
+    if nuisance in states:
+        return Free(name, states[nuisance].guess or 0.0, scale=1.0)
     if nuisance in known or (known and nuisance in experiment.drive):
         return _offset(experiment, nuisance, known, name)
-    names = ", ".join(map(repr, [TIME_SHIFT, *known, *(experiment.drive if known else ())]))
+    names = ", ".join(map(repr, [TIME_SHIFT, *known, *(experiment.drive if known else ()), *states]))
     raise StudyError(
         f"nuisance '{nuisance}' cannot be estimated",
         where=f"experiment '{experiment.name}'",
@@ -116,7 +130,10 @@ def observe(
     grid, rows = _shifted(experiment.time, tau)
     asked = experiment if tau == 0.0 else _on(grid, experiment)
     own = {n: v for n, v in given.items() if n in simulator.parameters}
-    offsets = {n: v for n, v in given.items() if n != TIME_SHIFT and n not in own}
+    starts = {n: v for n, v in given.items() if n in _states(simulator) and n not in own}
+    offsets = {n: v for n, v in given.items() if n != TIME_SHIFT and n not in own and n not in starts}
+    if starts:
+        asked = asked.with_(starts=asked.starts | starts)
     if offsets:
         asked = asked.with_(offsets=asked.offsets | {n: asked.offsets.get(n, 0.0) + v for n, v in offsets.items()})
     wanted = (*sensitivities, *(n for n in given if n != TIME_SHIFT)) if derivatives else ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.parameters import Input, Parameter
@@ -49,6 +49,15 @@ class WithInputs(Protocol):
     @property
     def inputs(self) -> Mapping[str, Input]:
         """The inputs by name, with start values and units."""
+
+
+@runtime_checkable
+class WithStates(Protocol):
+    """A simulator whose states may begin at given values; one that does not say so begins where it begins."""
+
+    @property
+    def states(self) -> Mapping[str, Any]:
+        """The states by name, with `guess` and `unit`."""
 
 
 @runtime_checkable

@@ -305,12 +305,13 @@ def simulate(
     values: parameters (and constant inputs) that differ from the model's. outputs: names of outputs or signals (default:
     all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
     the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
-    The name of an input among the sensitivities asks for the derivative by a constant added to that input all along.
+    The name of an input among the sensitivities asks for the derivative by a constant added to that input all along,
+    that of a state for the derivative by its start, which is then no longer the steady one.
     A model that is external (an FMU) runs itself, from its own start; `method` is then its own.
 
     Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
     """
-    from hvdc_ident.simulate.recording import with_offsets, with_recording
+    from hvdc_ident.simulate.recording import with_own, with_recording
 
     if not isinstance(model, Model):
         chosen = tuple(model.outputs) if outputs is None else outputs
@@ -325,11 +326,14 @@ def simulate(
             raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
     for name in experiment.offsets:
         if name not in plant.inputs:
-            raise unknown_name("input", name, plant.inputs, where=f"experiment '{experiment.name}', offsets")
-    moved = [n for n in plant.inputs if n in experiment.offsets or n in sensitivities]
-    plant, constants = with_offsets(plant, moved)
-    given |= {constants[n]: v for n, v in experiment.offsets.items()}
-    code = engine(plant, [constants.get(n, n) for n in sensitivities], outputs)
+            raise unknown_name("input", name, plant.inputs, where=f"experiment '{experiment.name}'")
+    for name in experiment.starts:
+        if name not in plant.states:
+            raise unknown_name("state", name, plant.states, where=f"experiment '{experiment.name}'")
+    own = {**experiment.offsets, **experiment.starts}
+    plant, parameter = with_own(plant, [n for n in (*plant.inputs, *plant.states) if n in own or n in sensitivities])
+    given |= {parameter[n]: v for n, v in own.items()}
+    code = engine(plant, [parameter.get(n, n) for n in sensitivities], outputs)
     p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
     if not np.isfinite(p).all():
         bad = [n for n, v in zip(plant.parameters, p, strict=True) if not np.isfinite(v)]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.model.definition import Model, State
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import simulate
@@ -28,6 +29,11 @@ class ModelSimulator:
     def inputs(self) -> Mapping[str, Input]:
         """The model's inputs by name; each may stand among the sensitivities, for a constant added to it."""
         return self.model.inputs
+
+    @property
+    def states(self) -> Mapping[str, State]:
+        """The states by name; each may stand among the sensitivities, for its start. An FMU shows none."""
+        return self.model.states if isinstance(self.model, Model) else {}
 
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()

@@ -1,5 +1,5 @@
 """How an experiment changes the model that is run: slots driven by recorded columns, outputs seen through instruments,
-inputs with an unknown offset."""
+inputs with an unknown offset, states with a start of their own."""
 
 from __future__ import annotations
 
@@ -38,21 +38,33 @@ def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
     return chains
 
 
-def with_offsets(model: Model, inputs: Sequence[str]) -> tuple[Model, FrozenMap[str]]:
-    """The model that adds an unknown constant to each of these inputs, and the constant's parameter by input.
+def with_own(model: Model, names: Sequence[str]) -> tuple[Model, FrozenMap[str]]:
+    """The model with what an experiment has for itself as parameters, and the parameter of each name.
 
-    The constant acts from the start on, the steady start included, and is 0 unless a value is given.
+    names: inputs, to which a constant is added all along, the steady start included (0 unless given); states, which
+    begin at a value instead of at rest. What the model calls free already is its own parameter.
     """
-    return _with_offsets(model, tuple(inputs)) if inputs else (model, FrozenMap())
+    return _with_own(model, tuple(names)) if names else (model, FrozenMap())
 
 
 @lru_cache(maxsize=32)
-def _with_offsets(model: Model, inputs: tuple[str, ...]) -> tuple[Model, FrozenMap[str]]:
-    names = {}
-    for name in inputs:
-        unit = model.inputs[name].unit
-        names[name] = offset = fresh(model, f"{name}_offset")
-        constant = Parameter(0.0, unit, description=f"constant added to {name}")
+def _with_own(model: Model, names: tuple[str, ...]) -> tuple[Model, FrozenMap[str]]:
+    found = {}
+    for name in names:
+        if name in model.states:
+            found[name] = f"{name}_start"
+            state = model.states[name]
+            if state.start != "free":
+                start = Parameter(state.guess or 0.0, state.unit, description=f"{name} at the start")
+                free = replace(state, start="free")
+                model = replace(
+                    model,
+                    states=model.states | {name: free},
+                    parameters=model.parameters | {found[name]: start},
+                )
+            continue
+        found[name] = offset = fresh(model, f"{name}_offset")
+        constant = Parameter(0.0, model.inputs[name].unit, description=f"constant added to {name}")
         model = replace(model, parameters=model.parameters | {offset: constant})
         model = rewritten(model, name, "offset", lambda m, u, offset=offset: (m, u + symbol(offset)))  # type: ignore[misc]
-    return model, FrozenMap(names)
+    return model, FrozenMap(found)

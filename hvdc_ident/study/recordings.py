@@ -118,7 +118,7 @@ def _check_names(table: schema.Experiment, model: AnyModel, place: str) -> None:
             hint="[model.values] for parameters",
         )
     _known("input", table.values, model.inputs, f"{place}.values")
-    _known("nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive], f"{place}.nuisance")
+    _known("nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive, *model.states], f"{place}.nuisance")
     if isinstance(table.interpolation, dict):
         _known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
     for kind, names in (("values", table.values), ("drive", table.drive)):
