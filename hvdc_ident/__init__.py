@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import inspect
 
+    from hvdc_ident.discrepancy import diagnose
     from hvdc_ident.experiment import Experiment, InputSignal
     from hvdc_ident.fit import fit
     from hvdc_ident.formats import read_waveforms
@@ -40,6 +41,7 @@ __all__ = [
     "Parameter",
     "Trajectory",
     "__version__",
+    "diagnose",
     "export",
     "find_operating_point",
     "fit",
@@ -62,6 +64,7 @@ _HOME = {
     "OperatingPoint": "linearize",
     "Parameter": "parameters",
     "Trajectory": "trajectory",
+    "diagnose": "discrepancy",
     "export": "study.export",
     "find_operating_point": "linearize",
     "fit": "fit",

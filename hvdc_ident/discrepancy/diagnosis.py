@@ -5,12 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
+import numpy as np
+
+from hvdc_ident.discrepancy.adequacy import Binned
+from hvdc_ident.discrepancy.ambiguity import rivals, separating
+from hvdc_ident.discrepancy.bode import responses
+from hvdc_ident.discrepancy.candidates import entries
+from hvdc_ident.discrepancy.explain import found_of
+from hvdc_ident.discrepancy.fallback import Fallback, fallback
+from hvdc_ident.discrepancy.gap import gap, with_given
+from hvdc_ident.discrepancy.lines import detectable, lines
+from hvdc_ident.discrepancy.localise import localise
+from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.result import Diagnosis
+from hvdc_ident.discrepancy.refit import Refit, judged
+from hvdc_ident.discrepancy.result import Diagnosis, Found, Rival
+from hvdc_ident.discrepancy.rounds import Search
+from hvdc_ident.discrepancy.search import Outcome, forward
+from hvdc_ident.discrepancy.verdict import Judgement, judge
+from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator
 from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 
 def diagnose(
@@ -41,4 +60,110 @@ def diagnose(
     Raises StudyError or UnknownNameError where there is nothing to diagnose, SimulationError where the nominal model
     cannot be run.
     """
-    raise NotImplementedError
+    model = _model_of(subject)
+    chosen = options or Options()
+    given, free = tuple(experiments), tuple(parameters)
+    names = "all" if effects == "all" else tuple(e.name for e in entries(effects))
+    _check_material(material or {}, given)
+    search = Search(
+        names, None if places is None else tuple(places), FrozenMap(material or {}), chosen, seed, executor, progress
+    )
+    search.tell(0, 1, "the nominal model, refitted")
+    start, notes = nominal(
+        ModelSimulator(model), given, free, held or {}, report, starts=chosen.starts, seed=seed, executor=executor
+    )
+    first = judged(Refit(model, (), start.problem, start.noise, start.theta))
+    outcome = forward(search, first)
+    judgement = judge(search, first, outcome)
+    other = fallback(search, first, outcome) if judgement.verdict == "unnameable" and chosen.fallback else None
+    return _assembled(search, model, first, outcome, judgement, other, free, notes)
+
+
+def _model_of(subject: Model | Simulator) -> Model:
+    if isinstance(subject, Model):
+        return subject
+    if isinstance(subject, ModelSimulator):
+        return subject.model
+    raise StudyError("only a model with equations can be diagnosed", got=type(subject).__name__)
+
+
+def _check_material(material: Mapping[str, float], experiments: tuple[Experiment, ...]) -> None:
+    measured = list(dict.fromkeys(o for e in experiments for o in e.outputs))
+    for output, band in material.items():
+        if output not in measured:
+            raise unknown_name("measured output", output, measured, where="material")
+        if not band > 0:
+            raise StudyError(
+                "an error band is not above 0", where=f"material of '{output}'", expected="above 0", got=f"{band:g}"
+            )
+
+
+def _assembled(
+    search: Search,
+    model: Model,
+    first: Refit,
+    outcome: Outcome,
+    judgement: Judgement,
+    other: Fallback | None,
+    free: tuple[Free, ...],
+    notes: tuple[str, ...],
+) -> Diagnosis:
+    search.tell(0, 1, "before and after")
+    in_place = judgement.verdict in ("named", "ambiguous")
+    groups: tuple[tuple[Rival, ...], ...] = ()
+    effects: tuple[Found, ...] = ()
+    last = first
+    if in_place:
+        last = outcome.refit
+        effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
+        groups = tuple(rivals(r, search.options) for r in outcome.kept)
+    elif other is not None and other.refit is not None:
+        last = other.refit
+    augmented = None if last is first else last.model.with_values(_own(last))
+    given = with_given(first, {f.name: f.start for f in free})
+    responses_found = responses(model, first, augmented, last)
+    sets = tuple(g for g in groups if len(g) > 1)
+    return Diagnosis(
+        verdict=judgement.verdict,
+        text=judgement.text if other is None else f"{judgement.text} {other.text}",
+        effects=effects,
+        ambiguity=sets,
+        separating_experiment=separating(sets) or judgement.experiment,
+        candidates=lines(outcome),
+        location=localise(model, first.nominal()),
+        detectable=detectable(outcome, search.options),
+        gap=gap(given, first, last),
+        remaining=remaining(first, last, judgement.tests, search),
+        parameters_before=FrozenMap({f.name: f.start for f in free}),
+        parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.start) for f in free}),
+        parameters_after=FrozenMap({f.name: last.values.get(f.name, f.start) for f in free}),
+        augmented=augmented,
+        fallback=None if other is None else other.to_dict(),
+        bode=responses_found,
+        noise={
+            o: {"std": n.std, "ar": list(n.model), "resolution": n.step, "source": n.source} for o, n in first.noise.items()
+        },
+        notes=notes,
+    )  # fmt: skip
+
+
+def _own(refit: Refit) -> dict[str, float]:
+    """The estimated values, inside the model's own bounds to the last digit."""
+    known = refit.model.parameters
+    return {n: float(np.clip(v, known[n].min, known[n].max)) for n, v in refit.values.items() if n in known}
+
+
+def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: Search) -> dict[str, Any]:
+    """What is left: whether it looks like noise, the share that was explained, and where it lies."""
+    rest: Nominal = last.nominal()
+    excess, left = first.chi2 - first.rows, max(last.chi2 - last.rows, 0.0)
+    place = localise(None, rest)
+    worst = min(tests, key=lambda b: b.p, default=None)
+    return {
+        "adequate": worst is None or worst.p > 0.05 / max(len(tests), 1),
+        "explained_share": float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else None,
+        "band_hz": place["band_hz"],
+        "block": next(iter(place["outputs"]), None),
+        "material": left / max(last.rows, 1) > (1.0 + search.options.holdout_share) ** 2 - 1.0,
+        "tests": [{"bins": b.name, "statistic": b.statistic, "expected": b.expected, "p": b.p} for b in tests],
+    }

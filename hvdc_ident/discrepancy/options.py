@@ -22,7 +22,7 @@ class Options:
     """
 
     significance: float = 0.01
-    bootstraps: int = 400
+    bootstraps: int = 200
     named_bic: float = 10.0
     set_bic: float = 6.0
     shortlist: int = 5
@@ -30,7 +30,7 @@ class Options:
     refits: int = 24
     most: int = 3
     holdout_share: float = 0.1
-    refuted: float = 0.1
+    refuted: float = 0.03
     starts: int = 4
     fallback: bool = True
     free_start: bool = False

@@ -1,0 +1,220 @@
+"""What is looked for: every effect of the catalogue at every place it may sit, in a few finite sizes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hvdc_ident.effects import Effect, EffectUse, Probe, SlotSignal, effects, probes, resistances, sources
+from hvdc_ident.errors import unknown_name
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.model.transform import slot
+from hvdc_ident.trajectory import Array
+
+Signals = Mapping[str, tuple[Array, ...]]
+"""By place: the signal in each fitted experiment."""
+
+SAME = 0.9995
+"""Correlation from which two signals are one, as a source."""
+STILL = 1e-9
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect at one place, or at several that share its parameters. source: the signal it brings in.
+
+    named: parameters of the model that stand in for some of its own. still: whether its signal never moves.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    probes: tuple[Probe, ...]
+    source: str = ""
+    named: FrozenMap[str] = FrozenMap()
+    still: bool = False
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        return f"{self.effect} at {', '.join(self.at)}" + (f" from {self.source}" if self.source else "")
+
+    def use(self, probe: Probe) -> EffectUse:
+        """The effect as the model takes it."""
+        return probe.use(self.at, self.source, self.named)
+
+
+def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:
+    """The effects of the catalogue to try; forms that have to be found first are not among them."""
+    catalogue = effects()
+    chosen = list(catalogue) if names == "all" else list(names)
+    for name in chosen:
+        if name not in catalogue:
+            raise unknown_name("effect", name, catalogue)
+    return tuple(catalogue[n] for n in chosen if not catalogue[n].needs_expression)
+
+
+def candidates(
+    model: Model,
+    signals: Signals,
+    times: Sequence[Array],
+    names: Iterable[str] | Literal["all"],
+    places: Iterable[str | tuple[str, ...]] | None,
+    tones: Iterable[float] = (),
+) -> tuple[Candidate, ...]:
+    """Every candidate. signals: at the model's slots, those of measured outputs included; times: (K,) of each experiment."""
+    live = [p for p in signals if _moves(model, p)]
+    groups = places_of(model, live, places)
+    about = {p: SlotSignal.of(times, signals[p], tones) for p in live}
+    brought = source_signals(model, signals)
+    found: list[Candidate] = []
+    for at in groups:
+        joined = SlotSignal.joined([about[p] for p in at])
+        still = joined.high - joined.low <= STILL * max(joined.peak, STILL)
+        kinds = {slot(model, p)[0] for p in at}
+        for effect in entries(names):
+            if not kinds <= set(effect.places):
+                continue
+            found += _at(model, effect, at, joined, still, about, brought)
+    return tuple(found)
+
+
+def _at(
+    model: Model,
+    effect: Effect,
+    at: tuple[str, ...],
+    signal: SlotSignal,
+    still: bool,
+    about: Mapping[str, SlotSignal],
+    brought: Sequence[str],
+) -> list[Candidate]:
+    if effect.resistance:
+        found = [n for n in resistances(model, at[0])] if len(at) == 1 else []
+        return [
+            Candidate(
+                effect.name, at, probes(effect, signal, given={effect.resistance: model.parameters[n].value}),
+                named=FrozenMap({effect.resistance: n}), still=still,
+            )
+            for n in found
+        ]  # fmt: skip
+    if not effect.needs_source:
+        return [Candidate(effect.name, at, probes(effect, signal), still=still and not _additive(effect))]
+    if len(at) > 1 or effect.name == "droop":  # without its deadband a droop is a negative coupling
+        return []
+    open_to = set(sources(model, at[0]))
+    return [
+        Candidate(effect.name, at, _halved(probes(effect, signal, about[s])), source=s)
+        for s in brought
+        if s in open_to and s != at[0] and not (still and about[s].high == about[s].low)
+    ]
+
+
+def _additive(effect: Effect) -> bool:
+    """Whether the effect is there with a signal that never moves."""
+    return effect.name in ("offset", "gain", "disturbance")
+
+
+def _halved(found: tuple[Probe, ...]) -> tuple[Probe, ...]:
+    """Of sizes that differ in sign alone the positive ones: the answer to the others is the same, reversed."""
+    kept: list[Probe] = []
+    for p in found:
+        mirrored = {n: -v for n, v in p.values.items()}
+        if not any(dict(q.values) == mirrored for q in kept):
+            kept.append(p)
+    return tuple(kept)
+
+
+def _moves(model: Model, place: str) -> bool:
+    """Whether a slot's signal depends on states or inputs at all; what is made of parameters alone is no signal."""
+    kind, name = slot(model, place)
+    if kind in ("input", "state", "output", "algebraic"):
+        return True
+    seen: set[str] = set()
+    stack = [name]
+    while stack:
+        n = stack.pop()
+        if n in seen:
+            continue
+        seen.add(n)
+        if n in model.signals:
+            stack.extend(s.name for s in model.signals[n].value.free_symbols)
+        elif n not in model.parameters:
+            return True
+    return False
+
+
+def source_signals(model: Model, signals: Signals) -> tuple[str, ...]:
+    """Signals worth bringing in: those that move, of several that move alike the first; inputs, states, then the rest."""
+    kinds = {p: slot(model, p)[0] for p in signals if _moves(model, p)}
+    order = sorted(
+        (p for p in kinds if kinds[p] != "output"),
+        key=lambda p: ("input", "state", "algebraic", "signal").index(kinds[p]),
+    )
+    named_out = {o for o in model.outputs}
+    order = [p for p in order if kinds[p] in ("input", "state") or p in named_out]
+    kept: list[str] = []
+    shapes: list[Array] = []
+    for p in order:
+        whole = np.concatenate([v - v[0] for v in signals[p]])
+        size = float(np.linalg.norm(whole))
+        if size <= STILL * max(1.0, float(np.abs(np.concatenate(signals[p])).max())):
+            continue
+        if any(abs(float(whole @ s)) / size > SAME for s in shapes):
+            continue
+        kept.append(p)
+        shapes.append(whole / size)
+    return tuple(kept)
+
+
+def places_of(
+    model: Model, live: Sequence[str], given: Iterable[str | tuple[str, ...]] | None
+) -> tuple[tuple[str, ...], ...]:
+    """The places to try: those given, or every slot and every family of slots that are named alike.
+
+    A family: slots of one kind whose names differ in digits, or, those left out, in one letter (Ir1, Ii1, Ir2, Ii2);
+    and the part of it that belongs to one station, with one digit.
+    """
+    if given is not None:
+        listed = [(g,) if isinstance(g, str) else tuple(g) for g in given]
+        for p in {p for at in listed for p in at}:
+            slot(model, p)
+        return tuple(at for at in listed if all(p in live for p in at))
+    families = [f for kind in ("input", "signal", "algebraic", "state", "output") for f in _families(model, live, kind)]
+    return (*((p,) for p in live), *dict.fromkeys(families))
+
+
+def _families(model: Model, live: Sequence[str], kind: str) -> list[tuple[str, ...]]:
+    names = [p for p in live if slot(model, p)[0] == kind]
+    # A digit marks one of several stations; "P1" and "Q1" are alike, "x" and "v" are not.
+    stems = {p: re.sub(r"\d+", "#", p.removeprefix("outputs.")) for p in names}
+    found: list[tuple[str, ...]] = []
+    left = list(names)
+    while left:
+        family = [left.pop(0)]
+        for p in family:
+            near = [q for q in left if _alike(stems[p], stems[q])]
+            family += near
+            left = [q for q in left if q not in near]
+        ordered = tuple(p for p in names if p in family)
+        if len(ordered) > 1:
+            found.append(ordered)
+        for digits in dict.fromkeys(tuple(re.findall(r"\d+", p)) for p in ordered):
+            part = tuple(p for p in ordered if tuple(re.findall(r"\d+", p)) == digits)
+            if 1 < len(part) < len(ordered):
+                found.append(part)
+        for stem in dict.fromkeys(stems[p] for p in ordered):
+            part = tuple(p for p in ordered if stems[p] == stem)
+            if 1 < len(part) < len(ordered):
+                found.append(part)
+    return found
+
+
+def _alike(a: str, b: str) -> bool:
+    """Whether two names without their digits differ in one letter at most, and are more than that letter."""
+    if len(a) != len(b) or a.isupper() != b.isupper():
+        return False
+    return sum(x != y for x, y in zip(a, b, strict=True)) <= min(1, len(a) - 1)

@@ -1,0 +1,180 @@
+"""The noise of the records: how large, how correlated from row to row, how coarse, told by what lies before the event.
+
+A fit's own residuals would tell it wrong where an effect is missing: they hold the effect. So the records before the
+event decide; given standard deviations stand unless those records are plainly noisier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.errors import StudyError
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.whitening import AR, autoregression, segments
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+from hvdc_ident.waveform import event_time, noise_floor
+
+FEWEST = 8
+"""Rows before an event from which anything is told of the noise."""
+SURE = 3.3
+"""Standard errors by which the records before the event must exceed a given noise to replace it."""
+SOFT = 1e-6
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of one output. std: in its unit, None where the data are deterministic (the misfit stands in).
+
+    model: its AR coefficients from row to row, () where it is white; error: the standard error of a single one. step:
+    what values are rounded to, 0 for nothing. source: where it comes from, in words. rows: how many before an event.
+    """
+
+    std: float | None
+    model: AR
+    error: float
+    step: float
+    source: str
+    rows: int
+
+
+def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[Noise]:
+    """The noise of every measured output, from all its records together."""
+    outputs = dict.fromkeys(o for e in experiments for o in e.outputs)
+    return FrozenMap({o: _noise(o, [e for e in experiments if o in e.outputs]) for o in outputs})
+
+
+def _noise(output: str, experiments: Sequence[Experiment]) -> Noise:
+    quiet = [r for e in experiments if (r := _before(e, output)).size >= FEWEST]
+    records = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
+    step = _step(records)
+    given = _given(output, experiments)
+    rows = sum(r.size for r in quiet)
+    power = sum(float(r @ r) for r in quiet)
+    scale = max((float(np.abs(r).max()) for r in records if r.size), default=1.0)
+    std = float(np.sqrt(power / max(rows - 2 * len(quiet), 1))) if rows else 0.0
+    if std <= 1e-12 * scale or (given is not None and std < 1e-3 * given):
+        std, model, error = 0.0, (), 0.0
+    else:
+        model, error = _model(quiet, rows, power) if _even(experiments) else ((), 0.0)
+    if given is None and std <= max((noise_floor(r) for r in records), default=0.0):
+        rounded = step / np.sqrt(12.0)
+        if rounded > 0.0:
+            return Noise(rounded, (), 0.0, step, "the resolution of the record", rows)
+        return Noise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
+    if given is None:
+        return Noise(std, model, error, step, "the records before the event", rows)
+    rho = sum(model) if len(model) != 1 else model[0]
+    independent = max(rows * (1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0)
+    if std > given * (1.0 + SURE / np.sqrt(2.0 * independent)):
+        return Noise(std, model, error, step, "the records before the event, noisier than what was given", rows)
+    return Noise(given, model, error, step, "given", rows)
+
+
+def _even(experiments: Sequence[Experiment]) -> bool:
+    """Whether the rows are evenly spaced, so that a model from row to row means something."""
+    try:
+        for e in experiments:
+            segments(e.time, e.name)
+    except StudyError:
+        return False
+    return True
+
+
+def _given(output: str, experiments: Sequence[Experiment]) -> float | None:
+    """The root mean square of the standard deviations given; None where one is missing or all are next to nothing."""
+    found = [e.noise.get(output) for e in experiments]
+    if any(n is None or n <= 0 for n in found):
+        return None
+    ranges = [float(np.ptp(e.measured[output])) for e in experiments if e.measured is not None]
+    value = float(np.sqrt(np.mean([n**2 for n in found if n is not None])))
+    return value if value > 1.001 * SOFT * max([*ranges, 0.0]) else None
+
+
+def _before(experiment: Experiment, output: str) -> Array:
+    """The rows before the event, less their straight line."""
+    assert experiment.measured is not None
+    event = experiment.event if experiment.event is not None else event_time(experiment.inputs)
+    if event is None:
+        return np.empty(0)
+    keep = (experiment.time < event - 1e-12) & np.isfinite(experiment.measured[output])
+    t, v = experiment.time[keep], experiment.measured[output][keep]
+    if v.size < FEWEST:
+        return np.empty(0)
+    x = t - t.mean()
+    power = float(x @ x)
+    rest = v - v.mean()
+    return np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
+
+
+def _model(quiet: Sequence[Array], rows: int, power: float) -> tuple[AR, float]:
+    """The AR model of several records together; of a single coefficient the error, freed of the bias a fitted line makes."""
+    longer = autoregression(quiet)
+    if len(longer) > 1:
+        return longer, 0.0
+    raw = sum(float(r[1:] @ r[:-1]) for r in quiet) / power
+    pairs = rows - len(quiet)
+    # A line fitted to n rows lowers the coefficient by (2 + 4 rho)/n (Kendall 1954, for a trend).
+    n = rows / len(quiet)
+    rho = float(np.clip((raw + 2.0 / n) / (1.0 - 4.0 / n) if n > 12 else raw, -0.5, 0.985))
+    error = float(np.sqrt(max(1.0 - rho**2, 0.02) / pairs))
+    return ((rho,), error) if abs(rho) > 1.645 * error else ((), 0.0)
+
+
+def _step(records: Sequence[Array]) -> float:
+    """What the records are rounded to; 0 where they are not."""
+    steps = []
+    for r in records:
+        floor = noise_floor(r) if r.size else 0.0
+        if r.size and floor > 1.001 * SOFT * float(np.ptp(r)):
+            steps.append(float(floor * np.sqrt(12.0)))
+    return max(steps, default=0.0)
+
+
+def draws(
+    problem: Problem, blocks: Sequence[Block], noise: FrozenMap[Noise], fitted: Sequence[Array], count: int, seed: int
+) -> list[Array]:
+    """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
+
+    fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
+    drawn too, within its error: what is not known of the noise widens what noise can do.
+    """
+    times = {e.name: e.time for e in problem.fitted_experiments}
+    outputs = list(dict.fromkeys(b.output for b in blocks))
+    found: list[Array] = []
+    for k, (b, y) in enumerate(zip(blocks, fitted, strict=True)):
+        n = noise[b.output]
+        random = np.random.default_rng([seed, 1, k])
+        model = np.repeat(np.array(n.model)[:, None], count, axis=1)
+        if len(n.model) == 1:  # one draw an output: its records share the noise
+            spread = np.random.default_rng([seed, 2, outputs.index(b.output)]).standard_normal(count)
+            model = np.clip(model + n.error * spread, -0.6, 0.99)
+        e = _coloured(random.standard_normal((y.size, count)), model)
+        if n.step:
+            size = max((n.std or 0.0) ** 2 - n.step**2 / 12.0, 0.0) ** 0.5
+            placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
+            e = (np.round((placed + size * e) / n.step) * n.step - placed) / b.sigma
+        found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
+    return found
+
+
+def _coloured(white: Array, model: Array) -> Array:
+    """(m, count) stationary AR noise of variance 1; model: (p, count) coefficients."""
+    p = model.shape[0]
+    if not p:
+        return white
+    settle = 200
+    lead = np.random.default_rng(0).standard_normal((settle, white.shape[1]))
+    e = np.vstack([lead, white])
+    for k in range(p, e.shape[0]):
+        for lag in range(p):
+            e[k] += model[lag] * e[k - 1 - lag]
+    kept = e[settle:]
+    if p == 1:
+        return np.asarray(kept * np.sqrt(1.0 - model[0] ** 2))
+    return np.asarray(kept / np.sqrt(np.mean(kept**2)))

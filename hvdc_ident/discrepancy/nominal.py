@@ -1,0 +1,142 @@
+"""The nominal model at its own best: refitted over what the data can tell, for a gap before that is the calibration's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.discrepancy.noise import Noise, noise_of
+from hvdc_ident.errors import StudyError
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit import Free, Problem, Simulator
+from hvdc_ident.fit.estimate import Executor
+from hvdc_ident.fit.residual import Block
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.identifiability.gate import gate, gated
+from hvdc_ident.identifiability.pilot import Optimum, pilot
+from hvdc_ident.sensitivity.fisher import independent, null_directions
+from hvdc_ident.trajectory import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """A model at its optimum, and what a test of it needs.
+
+    problem: with its weights and AR coefficients; theta: (p,) the optimum. noise: by output. extra: (N, q) further
+    nuisance directions, whitened (start states, where they are not known).
+    """
+
+    problem: Problem
+    theta: Array
+    noise: FrozenMap[Noise]
+    extra: Array | None = None
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Residuals and derivatives at the optimum."""
+        return self.problem.blocks(self.theta)
+
+    @cached_property
+    def residual(self) -> Array:
+        """(N,) whitened residuals of all blocks."""
+        return np.concatenate([b.residual for b in self.blocks])
+
+    @property
+    def chi2(self) -> float:
+        """The sum of squared residuals."""
+        return float(self.residual @ self.residual)
+
+    @cached_property
+    def basis(self) -> Array:
+        """(N, k) orthonormal: what fitted and nuisance parameters can make of the residual."""
+        columns = np.vstack([b.jacobian for b in self.blocks])
+        if self.extra is not None:
+            columns = np.hstack([columns, self.extra])
+        norms = np.linalg.norm(columns, axis=0)
+        columns = columns[:, norms > 0] / norms[norms > 0]
+        if not columns.shape[1]:
+            return np.zeros((columns.shape[0], 0))
+        u, s, _ = np.linalg.svd(columns, full_matrices=False)
+        return np.asarray(u[:, s > 1e-7 * s[0]])
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters at the optimum, those held included."""
+        return self.problem.values(self.theta)
+
+    def projected(self, columns: Array) -> Array:
+        """M columns: what the parameters cannot make good."""
+        return columns - self.basis @ (self.basis.T @ columns)
+
+    def fitted(self) -> list[Array]:
+        """The model's output at each block's rows, in its unit."""
+        by_name = {e.name: e for e in self.problem.fitted_experiments}
+        found = []
+        for b in self.blocks:
+            measured = by_name[b.experiment].measured
+            assert measured is not None
+            found.append(measured[b.output][b.rows] - b.misfit)
+        return found
+
+
+def nominal(
+    simulator: Simulator,
+    experiments: Sequence[Experiment],
+    parameters: Sequence[Free],
+    held: Mapping[str, float],
+    report: Mapping[str, Any] | None,
+    *,
+    starts: int,
+    seed: int,
+    executor: Executor | None,
+) -> tuple[Nominal, tuple[str, ...]]:
+    """The refitted nominal model, and remarks on what was held and on the noise.
+
+    Raises StudyError where there is nothing to compare, SimulationError where no start can be run.
+    """
+    fitted = [e for e in experiments if e.role == "fit" and e.outputs]
+    if not fitted:
+        raise StudyError("nothing to diagnose", expected='an experiment of role "fit" with measured outputs')
+    noise = noise_of([e for e in experiments if e.outputs])
+    problem = Problem(simulator, tuple(experiments), tuple(parameters), held=FrozenMap(held))
+    if report is not None:
+        problem = gated(problem, gate(report))
+    weights = {o: n.std for o, n in noise.items() if n.std is not None and o in problem.outputs}
+    given = {o for o, n in noise.items() if n.source == "given"}
+    problem = replace(
+        problem,
+        weights=FrozenMap({o: w for o, w in weights.items() if o not in given}),
+        rho=FrozenMap({o: n.model for o, n in noise.items() if n.model and o in problem.outputs}),
+    )
+    optimum, result = pilot(problem, starts=starts, seed=seed, executor=executor)
+    notes = (
+        [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
+    )
+    if report is None:
+        optimum, held_now = _told_apart(optimum)
+        notes += [f"Held at {v:g}, for these data do not tell it apart: {n}." for n, v in held_now.items()]
+    open_outputs = [o for o, n in noise.items() if n.std is None]
+    if open_outputs:
+        notes.append(f"{', '.join(open_outputs)}: no noise in the record; the misfit stands in for it.")
+    stated = {
+        o: replace(n, std=optimum.problem.weights.get(o)) if n.std is None and o in optimum.problem.weights else n
+        for o, n in noise.items()
+    }
+    return Nominal(optimum.problem, optimum.theta, FrozenMap(stated)), tuple(notes)
+
+
+def _told_apart(optimum: Optimum) -> tuple[Optimum, dict[str, float]]:
+    """The optimum without the parameters that these data do not tell apart from the others, held at their start."""
+    k = len(optimum.names)
+    dead = [n for n, c in zip(optimum.names, optimum.columns.T, strict=False) if not np.any(c)]
+    null = null_directions(optimum.columns)[:, :k]
+    kept = {optimum.names[i] for i in independent(optimum.information.matrix)}
+    lost = [n for n in optimum.names if n in dead or (n not in kept and np.any(null[:, optimum.names.index(n)]))]
+    if not lost or len(lost) == k:
+        return optimum, {}
+    starts = {f.name: f.start for f in optimum.problem.free if f.name in lost}
+    return optimum.held(dict.fromkeys(lost, "not told apart"), starts), starts

@@ -1,0 +1,107 @@
+"""Two effects at once, for one can mask the other: scored jointly, refitted jointly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.refit import Job, added, run
+from hvdc_ident.discrepancy.rounds import Round, Search, Trial, _gained, objections
+from hvdc_ident.discrepancy.scores import signature_rows
+from hvdc_ident.discrepancy.select import Ruler, best_of
+from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.errors import HvdcIdentError
+
+LOOKED_AT = 60
+TRIED = 3
+
+
+def pair(search: Search, before, found: Round) -> tuple[Round, Round] | None:  # type: ignore[no-untyped-def]
+    """Two rounds, each with one of the pair as its winner, where a pair passes that no single effect does; else None."""
+    nominal = before.nominal()
+    picks = best_of(found.scores, found.candidates)[:LOOKED_AT]
+    if len(picks) < 2:
+        return None
+    rows = signature_rows(nominal, found.candidates, found.paths, [Column(p.candidate, p.probe) for p in picks])
+    residual = nominal.projected(nominal.residual[:, None])[:, 0]
+    for i, j in _best(rows, residual)[:TRIED]:
+        search.tell(
+            0,
+            TRIED,
+            f"pair: {found.candidates[picks[i].candidate].label} with {found.candidates[picks[j].candidate].label}",
+        )
+        both = _tried(search, before, found, picks[i], picks[j])
+        if both is not None:
+            return both
+    return None
+
+
+def _best(rows, residual):  # type: ignore[no-untyped-def]
+    """Pairs by falling joint score, those left out that hardly beat their better half or are nearly one."""
+    g, b = rows @ rows.T, rows @ residual
+    d = np.maximum(np.diag(g), 1e-300)
+    single = b**2 / d
+    found = []
+    for i in range(len(b)):
+        for j in range(i + 1, len(b)):
+            det = g[i, i] * g[j, j] - g[i, j] ** 2
+            if det < 0.05 * g[i, i] * g[j, j]:
+                continue
+            t = (b[i] ** 2 * g[j, j] - 2 * b[i] * b[j] * g[i, j] + b[j] ** 2 * g[i, i]) / det
+            if t > 1.2 * max(single[i], single[j]) + 20.0:
+                found.append((t, i, j))
+    return [(i, j) for _, i, j in sorted(found, reverse=True)]
+
+
+def _tried(search: Search, before, found: Round, one, two):  # type: ignore[no-untyped-def]
+    """The two rounds of a pair that passes; None where it does not."""
+    k = len(before.problem.free)
+    try:
+        m1, p1, placed1, s1 = added(
+            before.model, before.problem, found.candidates[one.candidate], one.probe, one.factor
+        )
+        m2, p2, placed2, s2 = added(m1, p1, found.candidates[two.candidate], two.probe, two.factor)
+        nuisance = before.theta[k:]
+        both = run(
+            Job(
+                m2,
+                (*before.placed, placed1, placed2),
+                p2,
+                (np.concatenate([before.theta[:k], s1, s2, nuisance]),),
+                before.noise,
+            )
+        )
+        if both.failure:
+            return None
+        halves = [
+            run(
+                Job(
+                    m1, (*before.placed, placed1), p1, (np.concatenate([before.theta[:k], s1, nuisance]),), before.noise
+                )
+            ),
+            _other(before, found, two),
+        ]
+    except HvdcIdentError:
+        return None
+    if any(h.failure for h in halves):
+        return None
+    ruler = Ruler.of(both)
+    alone = min(halves, key=lambda h: h.chi2)
+    trial = Trial(two, both, ruler.gain(alone.chi2, both.chi2, both.count - alone.count))
+    whole = _gained(Trial(two, both, 0.0), before, ruler)
+    for t, reference in ((trial, alone), (whole, before)):
+        if objections(search, reference, t, found.scores, first=True):
+            return None
+    first = Trial(one, halves[0], ruler.gain(before.chi2, halves[0].chi2, halves[0].count - before.count))
+    left = replace(found, trials=(first,), winner=first, ruler=ruler, same={}, why="")
+    right = replace(found, before=halves[0], trials=(trial,), winner=trial, ruler=ruler, same={}, why="")
+    return left, right
+
+
+def _other(before, found: Round, pick):  # type: ignore[no-untyped-def]
+    k = len(before.problem.free)
+    m, p, placed, s = added(before.model, before.problem, found.candidates[pick.candidate], pick.probe, pick.factor)
+    return run(
+        Job(m, (*before.placed, placed), p, (np.concatenate([before.theta[:k], s, before.theta[k:]]),), before.noise)
+    )

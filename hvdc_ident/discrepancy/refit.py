@@ -1,0 +1,250 @@
+"""Refits: gains and effect together, with exact sensitivities, from where the score put them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.noise import Noise
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.errors import HvdcIdentError, SimulationError
+from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit.optimisers.trust_region import TrustRegion
+from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.uncertainty import uncertainty
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.trajectory import Array
+
+METHOD = TrustRegion(max_evaluations=60, gradient=1e-6, reduction=1e-7, step=1e-7)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect in a model: its candidate, its use, and by its own parameter names those of the model."""
+
+    candidate: Candidate
+    use: EffectUse
+    names: FrozenMap[str]
+    bounds: FrozenMap[tuple[float, float]]
+    start: FrozenMap[float]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start)."""
+
+    model: Model
+    placed: tuple[Placed, ...]
+    problem: Problem
+    begins: tuple[Array, ...]
+    noise: FrozenMap[Noise]
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """What a refit came to. failure: why it has no result, empty where it has one.
+
+    chi2: sum of squared residuals; rows: their number; correlation: lag-1 autocorrelation left in them. holdout: root
+    mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press: the same for
+    parts of the fitted ones predicted from the rest.
+    std: standard deviation of each effect parameter, by its name in the model.
+    """
+
+    model: Model
+    placed: tuple[Placed, ...]
+    problem: Problem
+    noise: FrozenMap[Noise]
+    theta: Array
+    chi2: float = np.inf
+    rows: int = 0
+    correlation: float = 0.0
+    holdout: float | None = None
+    press: float | None = None
+    std: FrozenMap[float | None] = FrozenMap()
+    failure: str = ""
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All estimated and held parameters."""
+        return self.problem.values(self.theta)
+
+    @property
+    def count(self) -> int:
+        """How many parameters the effects added."""
+        return sum(len(p.bounds) for p in self.placed)
+
+    def sizes(self, placed: Placed) -> dict[str, float]:
+        """The effect's own parameters at the optimum."""
+        at = self.values
+        own = dict(placed.start)
+        return own | {n: at[name] for n, name in placed.names.items() if name in at}
+
+    def nominal(self) -> Nominal:
+        """The refitted model as something to test further."""
+        return Nominal(self.problem, self.theta, self.noise)
+
+
+def added(
+    model: Model, problem: Problem, candidate: Candidate, probe: int, factor: float
+) -> tuple[Model, Problem, Placed, Array]:
+    """The model and problem with one more effect, and where it starts: the probe, or the size the score asks for.
+
+    Raises ModelError where the effect cannot be put there.
+    """
+    chosen = candidate.probes[probe]
+    values = _moved(candidate, chosen.values, chosen.free, factor)
+    use = candidate.use(replace(chosen, values=FrozenMap(values)))
+    before = set(model.parameters)
+    larger = model.with_effects([use])
+    new = [n for n in larger.parameters if n not in before]
+    present = [
+        n
+        for n in effects()[candidate.effect].parameters
+        if n not in candidate.named and not _absent(candidate, n, values)
+    ]
+    names = dict(zip(present, new, strict=True))
+    bounds = {n: b for n, b in chosen.free.items() if n in names}
+    free = tuple(Free(names[n], values[n], low, high) for n, (low, high) in bounds.items())
+    more = replace(problem, simulator=ModelSimulator(larger), free=(*problem.free, *free))
+    placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
+    return larger, more, placed, np.array([f.start for f in free])
+
+
+def _absent(candidate: Candidate, name: str, values: Mapping[str, float]) -> bool:
+    q = effects()[candidate.effect].parameters[name]
+    return q.optional and values[name] == q.neutral
+
+
+def _moved(
+    candidate: Candidate, values: Mapping[str, float], free: Mapping[str, tuple[float, float]], factor: float
+) -> dict[str, float]:
+    """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
+    entry, moved = effects()[candidate.effect], dict(values)
+    size = float(np.clip(abs(factor), 0.2, 5.0)) if np.isfinite(factor) and factor else 1.0
+    if factor < 0 and "phase" in moved:
+        moved["phase"] += np.pi if moved["phase"] <= 0 else -np.pi
+    sign = -1.0 if factor < 0 and "phase" not in moved else 1.0
+    for n, q in entry.parameters.items():
+        if q.neutral is None or n not in free or (q.optional and values[n] == q.neutral):
+            continue
+        neutral = values[q.neutral] if isinstance(q.neutral, str) else float(q.neutral)
+        if np.isinf(neutral):
+            continue
+        moved[n] = neutral + sign * size * (values[n] - neutral)
+    for n, (low, high) in free.items():
+        margin = 1e-3 * (high - low) if low <= 0 else 0.0
+        moved[n] = float(np.clip(moved[n], low + margin if margin else low * 1.001, high - 1e-3 * (high - low)))
+    return moved
+
+
+def run(job: Job) -> Refit:
+    """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
+    best: Refit | None = None
+    why = ""
+    for begin in job.begins:
+        try:
+            end = METHOD.run(job.problem, begin)
+            if end.status == "failed" or end.cost is None:
+                why = end.message
+                continue
+            if best is None or 2.0 * end.cost < best.chi2:
+                best = Refit(job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost)
+        except HvdcIdentError as error:
+            why = str(error)
+    if best is None:
+        return Refit(job.model, job.placed, job.problem, job.noise, job.begins[0], failure=why or "no start succeeded")
+    try:
+        return judged(best)
+    except HvdcIdentError as error:
+        return replace(best, failure=str(error))
+
+
+def judged(refit: Refit) -> Refit:
+    """The refit with its intervals, and what it predicts of data it has not seen."""
+    blocks = refit.problem.blocks(refit.theta)
+    names = refit.problem.names
+    spans = np.array([u.span for u in refit.problem.unknowns])
+    known = uncertainty(blocks, names, spans, dict.fromkeys(refit.problem.outputs, "given"))
+    chi2 = sum(float(b.residual @ b.residual) for b in blocks)
+    rows = sum(b.residual.size for b in blocks)
+    wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
+    own = [n for p in refit.placed for n in p.names.values() if n in names]
+    std = {n: (None if known.std(n) is None else wider * float(known.std(n) or 0.0)) for n in own}
+    return replace(
+        refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
+        press=press(blocks), std=FrozenMap(std),
+    )  # fmt: skip
+
+
+def _correlation(blocks: Sequence[Block]) -> float:
+    """The lag-1 autocorrelation of all residuals, 0 where it is negative or what chance gives."""
+    power = sum(float(b.residual @ b.residual) for b in blocks)
+    rows = sum(b.residual.size for b in blocks)
+    found = sum(float(b.residual[1:] @ b.residual[:-1]) for b in blocks) / power if power else 0.0
+    return found if found > 2.0 / np.sqrt(rows) else 0.0
+
+
+def holdout(problem: Problem, theta: Array) -> float | None:
+    """Root mean square of the held-out residuals in noise units, whitened; infinite where a held-out run fails."""
+    blocks = held_out(problem, theta)
+    if blocks is None:
+        return None
+    if not blocks:
+        return float("inf")
+    return float(np.sqrt(np.mean(np.concatenate([b.residual for b in blocks]) ** 2)))
+
+
+def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:
+    """The residuals of the held-out experiments; None where there are none, () where one cannot be run."""
+    others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
+    others = [e for e in others if set(e.outputs) & set(problem.outputs)]
+    if not others:
+        return None
+    # An output that was never fitted has no weight of its own; its records then judge nothing.
+    try:
+        blocks = replace(problem, experiments=tuple(others)).blocks(theta[: len(problem.free)], derivatives=False)
+    except SimulationError:
+        return ()
+    return tuple(b for b in blocks if b.output in problem.outputs)
+
+
+def press(blocks: Sequence[Block], parts: int = 4) -> float | None:
+    """Root mean square of each part's residuals predicted from the others, to first order (Allen's PRESS, by blocks).
+
+    Parts: experiments; of a single one, stretches of its rows. None where nothing can be left out.
+    """
+    names = list(dict.fromkeys(b.experiment for b in blocks))
+    pieces: list[tuple[Array, Array]] = []
+    if len(names) > 1:
+        for n in names:
+            own = [b for b in blocks if b.experiment == n]
+            pieces.append((np.concatenate([b.residual for b in own]), np.vstack([b.jacobian for b in own])))
+    else:
+        for k in range(parts):
+            cut = [slice(k * b.residual.size // parts, (k + 1) * b.residual.size // parts) for b in blocks]
+            pieces.append(
+                (
+                    np.concatenate([b.residual[c] for b, c in zip(blocks, cut, strict=True)]),
+                    np.vstack([b.jacobian[c] for b, c in zip(blocks, cut, strict=True)]),
+                )
+            )
+    matrix = sum(j.T @ j for _, j in pieces)
+    d = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    total, rows = 0.0, 0
+    for r, j in pieces:
+        rest = (matrix - j.T @ j) / np.outer(d, d)
+        shift = np.linalg.lstsq(rest, (j.T @ r) / d, rcond=1e-9)[0] / d
+        predicted = r + j @ shift
+        total, rows = total + float(predicted @ predicted), rows + r.size
+    return float(np.sqrt(total / rows)) if rows else None
+
+
+def unseen(refit: Refit) -> float | None:
+    """The held-out residual in noise units; without held-out experiments that of parts left out."""
+    return refit.holdout if refit.holdout is not None else refit.press

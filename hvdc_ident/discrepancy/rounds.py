@@ -1,0 +1,239 @@
+"""One round of the search: score everything on the model as it stands, refit the best, judge the winner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate, candidates
+from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.refit import Job, Refit, added, run, unseen
+from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.scores import Scores, runs, scored, signature_rows
+from hvdc_ident.discrepancy.select import (
+    Pick,
+    Ruler,
+    at_edge,
+    best_of,
+    clear,
+    material_gap,
+    neighbours,
+    shortlist,
+)
+from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.discrepancy.tones import tones
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+LOOKED_AT = 80
+"""Candidates, the best by score, whose signatures are compared with each other."""
+STEP = 0.05
+"""Share of the gap that a second effect has to take away at least."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """What stays the same over the rounds."""
+
+    effects: tuple[str, ...] | str
+    places: tuple[str | tuple[str, ...], ...] | None
+    material: FrozenMap[float]
+    options: Options
+    seed: int
+    executor: Executor | None = None
+    progress: Progress | None = None
+
+    def tell(self, done: int, total: int, text: str) -> None:
+        """Nothing; whoever watches is told."""
+        if self.progress:
+            self.progress(done, total, text)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC)."""
+
+    pick: Pick
+    refit: Refit
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """What one round found. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
+
+    trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
+    """
+
+    before: Refit
+    paths: Mapping[str, Along]
+    candidates: tuple[Candidate, ...]
+    scores: Scores
+    trials: tuple[Trial, ...]
+    failed: tuple[Trial, ...]
+    same: Mapping[int, list[Pick]]
+    winner: Trial | None
+    why: str
+    significant: bool
+    ruler: Ruler | None
+
+    def score_p(self, candidate: int) -> tuple[float, float, int]:
+        """The best score of a candidate, its p, and the column it stands in (-1: none)."""
+        t = self.scores.t
+        own = [k for k, c in enumerate(self.scores.columns) if c.candidate == candidate]
+        if not own:
+            return 0.0, 1.0, -1
+        k = max(own, key=lambda j: t[j])
+        return float(t[k]), self.scores.p(float(t[k])), k
+
+
+def slot_signals(paths: Mapping[str, Along]) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot that all experiments have, one array an experiment."""
+    common = [p for p in next(iter(paths.values())).slots if all(p in a.slots for a in paths.values())]
+    return {p: tuple(a.signal(p) for a in paths.values()) for p in common}
+
+
+def one_round(search: Search, before: Refit, number: int) -> Round:
+    """A round on the model as it stands. Raises SimulationError where that model cannot be run."""
+    options, nominal = search.options, before.nominal()
+    search.tell(0, 1, f"round {number}: the model's answers at every slot")
+    paths = runs(before.model, nominal)
+    found = candidates(
+        before.model,
+        slot_signals(paths),
+        [a.time for a in paths.values()],
+        search.effects,  # type: ignore[arg-type]
+        search.places,
+        tones(nominal),
+    )
+    there = {(p.candidate.effect, p.candidate.at, p.candidate.source) for p in before.placed}
+    found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
+    search.tell(0, 1, f"round {number}: scores of {len(found)} candidates")
+    scores = scored(
+        before.model, nominal, found, paths, bootstraps=options.bootstraps, seed=search.seed + number,
+        executor=search.executor,
+    )  # fmt: skip
+    picks = best_of(scores, found)
+
+    def nothing(why: str, significant: bool = False) -> Round:
+        return Round(before, paths, found, scores, (), (), {}, None, why, significant, None)
+
+    if not picks:
+        return nothing("no candidate leaves a trace in these data")
+    p = scores.p(picks[0].score)
+    if p > options.significance:
+        return nothing(f"the best score of all is what noise gives (p = {p:.2g})")
+    return _refitted(search, before, number, paths, found, scores, picks)
+
+
+def _refitted(
+    search: Search,
+    before: Refit,
+    number: int,
+    paths: Mapping[str, Along],
+    found: tuple[Candidate, ...],
+    scores: Scores,
+    picks: tuple[Pick, ...],
+) -> Round:
+    options, nominal = search.options, before.nominal()
+    threshold = scores.threshold(0.5)  # what noise reaches every other time is not worth a look
+    looked = [p for p in picks[:LOOKED_AT] if p.score > threshold]
+    rows = signature_rows(nominal, found, paths, [Column(p.candidate, p.probe) for p in looked])
+    chosen, same = shortlist(looked, found, rows, options)
+    trials = _trials(search, before, found, chosen, f"round {number}: refits")
+    done = [t.pick.candidate for t in trials] + [p.candidate for twins in same.values() for p in twins]
+    sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2 + 8.0 * t.refit.count)
+    best = [found[t.pick.candidate] for t in sound[:2]]
+    more = neighbours(looked, found, done, best, max(options.refits // 3, 2))
+    trials += _trials(search, before, found, more, f"round {number}: refits beside the best")
+    failed = tuple(t for t in trials if t.refit.failure)
+    sound = [t for t in trials if not t.refit.failure]
+    if not sound:
+        return Round(
+            before, paths, found, scores, (), failed, same, None, "no candidate could be refitted", True, None
+        )  # fmt: skip
+    least = min(sound, key=lambda t: t.refit.chi2)
+    ruler = Ruler.of(least.refit)
+    ranked = sorted((_gained(t, before, ruler) for t in sound), key=lambda t: -t.gain)
+    why = ""
+    for trial in ranked:
+        if ranked[0].gain - trial.gain > options.set_bic:
+            break
+        against = objections(search, before, trial, scores, first=number == 1)
+        if not against:
+            return Round(before, paths, found, scores, tuple(ranked), failed, same, trial, "", True, ruler)
+        why = why or f"{found[trial.pick.candidate].label}: {against}"
+    return Round(before, paths, found, scores, tuple(ranked), failed, same, None, why, True, ruler)
+
+
+def _gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
+    more = trial.refit.count - before.count
+    return Trial(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
+
+
+def _trials(search: Search, before: Refit, found: Sequence[Candidate], picks: Sequence[Pick], text: str) -> list[Trial]:
+    jobs, of, trials = [], [], []
+    for p in picks:
+        try:
+            jobs.append(_job(before, found[p.candidate], p))
+            of.append(p)
+        except HvdcIdentError as error:
+            none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
+            trials.append(Trial(p, none, -np.inf))
+    outcomes = search.executor.map(run, jobs) if search.executor is not None else map(run, jobs)
+    for k, (p, refit) in enumerate(zip(of, outcomes, strict=True)):
+        search.tell(k + 1, len(jobs), f"{text}: {found[p.candidate].label}")
+        trials.append(Trial(p, refit, -np.inf))
+    return trials
+
+
+def _job(before: Refit, candidate: Candidate, pick: Pick) -> Job:
+    model, problem, placed, start = added(before.model, before.problem, candidate, pick.probe, pick.factor)
+    k = len(before.problem.free)
+    own = np.concatenate([before.theta[:k], start, before.theta[k:]])
+    begins = [own]
+    if abs(pick.factor) < 0.5 or abs(pick.factor) > 2.0:
+        plain = added(before.model, before.problem, candidate, pick.probe, np.sign(pick.factor) or 1.0)[3]
+        begins.append(np.concatenate([before.theta[:k], plain, before.theta[k:]]))
+    return Job(model, (*before.placed, placed), problem, tuple(begins), before.noise)
+
+
+def objections(search: Search, before: Refit, trial: Trial, scores: Scores, *, first: bool) -> str:
+    """What speaks against naming a trial's effect; empty where nothing does."""
+    options, refit = search.options, trial.refit
+    last = len(refit.placed) - 1
+    if scores.p(trial.pick.score) > options.significance:
+        return f"its score is what noise gives somewhere (p = {scores.p(trial.pick.score):.2g})"
+    if not trial.gain > options.named_bic:
+        return f"it gains {trial.gain:.3g} in BIC, {options.named_bic:g} would be needed"
+    if at_edge(refit, last) or not clear(refit, last):
+        return "its size cannot be told from nothing"
+    was, now = unseen(before), unseen(refit)
+    if was is None or now is None:
+        return "nothing can be left out to judge it by"
+    if not now < was:
+        return f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
+    tables = _tables(before, refit) if search.material else None
+    if not material_gap(was, now, options.holdout_share, search.material, tables):
+        return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
+    if not first and was - now < STEP * was:
+        return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
+    return ""
+
+
+def _tables(before: Refit, after: Refit) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    return _worst(before), _worst(after)
+
+
+def _worst(refit: Refit) -> dict[str, float]:
+    """The largest RMSE of each output over all experiments, in its unit."""
+    found: dict[str, float] = {}
+    for output, row in refit.problem.rmse(refit.theta).items():
+        known = [v for v in row.values() if v is not None]
+        if known:
+            found[output] = max(known)
+    return found

@@ -1,0 +1,158 @@
+"""Which candidates are refitted, and what a refit must bring to be named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.scores import Scores
+from hvdc_ident.effects import clearance, effects
+from hvdc_ident.trajectory import Array
+
+SAME = 1.0
+"""Difference of scores, in units of chi2, up to which two signatures of one effect are one: its places cannot be told apart."""
+EACH = 4
+"""Places of one effect that are refitted at first."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A candidate to refit: its best probe, the size asked for in units of the probe's, and its score."""
+
+    candidate: int
+    probe: int
+    factor: float
+    score: float
+
+
+def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:
+    """Each candidate at its best size, by falling score."""
+    t, expected = scores.t, scores.expected
+    best: dict[int, int] = {}
+    for k, column in enumerate(scores.columns):
+        c = column.candidate
+        if t[k] > 0 and (c not in best or t[k] > t[best[c]]):
+            best[c] = k
+    picks = [Pick(c, scores.columns[k].probe, float(expected[k]), float(t[k])) for c, k in best.items()]
+    # Of equal scores the simpler: fewer places first, as listed.
+    return tuple(sorted(picks, key=lambda p: (-round(p.score, 6), len(found[p.candidate].at), p.candidate)))
+
+
+def shortlist(
+    picks: Sequence[Pick], found: Sequence[Candidate], rows: Array, options: Options
+) -> tuple[tuple[Pick, ...], dict[int, list[Pick]]]:
+    """The picks to refit, and for each (by candidate) those whose signature is the same at another place.
+
+    rows: (n, N) residualised signatures of the picks. The best of all; of each effect, places whose signature is like one
+    of the best (|cos| > options.collinear) or that score near the best.
+    """
+    unit = rows / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)[:, None]
+    cosines = np.abs(unit @ unit.T)
+    chosen: list[int] = []
+    same: dict[int, list[Pick]] = {}
+    used: dict[str, int] = {}
+    top = picks[0].score
+    for k, p in enumerate(picks):
+        effect = found[p.candidate].effect
+        twin = next(
+            (
+                j
+                for j in chosen
+                if found[picks[j].candidate].effect == effect and (1.0 - cosines[j, k] ** 2) * top < SAME
+            ),
+            None,
+        )
+        if twin is not None:
+            same.setdefault(picks[twin].candidate, []).append(p)
+            continue
+        near = bool(chosen) and float(cosines[k, chosen[: options.shortlist]].max()) > options.collinear
+        wanted = len(chosen) < options.shortlist or ((near or p.score > 0.5 * top) and used.get(effect, 0) < EACH)
+        if wanted and len(chosen) < options.refits and used.get(effect, 0) < 2 * EACH:
+            chosen.append(k)
+            used[effect] = used.get(effect, 0) + 1
+    return tuple(picks[k] for k in chosen), same
+
+
+def neighbours(
+    picks: Sequence[Pick], found: Sequence[Candidate], done: Sequence[int], best: Sequence[Candidate], limit: int
+) -> tuple[Pick, ...]:
+    """Candidates not refitted yet with the effect of one of the best, or at its places, by falling score."""
+    kinds = {c.effect for c in best}
+    places = {c.at for c in best}
+    left = [p for p in picks if p.candidate not in done]
+    near = [p for p in left if found[p.candidate].effect in kinds or found[p.candidate].at in places]
+    return tuple(near[:limit])
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """What BIC is counted by. effective: independent residuals; scale: how much larger than noise they are in the best model."""
+
+    rows: int
+    effective: float
+    scale: float
+
+    @classmethod
+    def of(cls, best: Refit) -> Ruler:
+        """From the best model found, whose residuals are nearest to noise."""
+        rho = min(max(best.correlation, 0.0), 0.999)
+        effective = max(best.rows * (1.0 - rho) / (1.0 + rho), 4.0)
+        return cls(best.rows, effective, max(best.chi2 / best.rows, 1.0))
+
+    def gain(self, before: float, after: float, more: int) -> float:
+        """The fall of BIC from one chi2 to another with `more` parameters more."""
+        share = self.effective / self.rows
+        return (before - after) * share / self.scale - more * float(np.log(self.effective))
+
+
+def clear(refit: Refit, which: int) -> bool:
+    """Whether some parameter that makes the effect vanish is two standard deviations from doing so, and inside its bounds."""
+    placed = refit.placed[which]
+    entry = effects()[placed.candidate.effect]
+    sizes = refit.sizes(placed)
+    away = clearance(entry, sizes)
+    for n, distance in away.items():
+        name = placed.names.get(n)
+        std = refit.std.get(name) if name else None
+        if name is None or std is None:
+            continue
+        neutral = entry.parameters[n].neutral
+        spread = std / sizes[n] ** 2 if isinstance(neutral, float) and np.isinf(neutral) else std
+        if abs(distance) > 2.0 * spread:
+            return True
+    return False
+
+
+def at_edge(refit: Refit, which: int) -> bool:
+    """Whether the effect's size stands on the bound next to neutral: it is not there."""
+    placed = refit.placed[which]
+    entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
+    switches = [n for n, q in entry.parameters.items() if q.neutral is not None and n in placed.bounds]
+    edges = []
+    for n in switches:
+        low, high = placed.bounds[n]
+        neutral = entry.parameters[n].neutral
+        if isinstance(neutral, str):
+            edges.append(sizes[n] == sizes[neutral])
+        else:
+            edges.append(
+                (neutral is not None and neutral <= low and sizes[n] <= low)
+                or (np.isinf(neutral or 0.0) and sizes[n] >= high)
+            )
+    return bool(edges) and all(edges)
+
+
+def material_gap(
+    before: float | None, after: float | None, share: float, bands: Mapping[str, float] | None,
+    tables: tuple[Mapping[str, float], Mapping[str, float]] | None,
+) -> bool:  # fmt: skip
+    """Whether the fall from before to after (pooled, noise units; or by output where bands are given) is of interest."""
+    if bands and tables:
+        first, second = tables
+        return any(first[o] > band and first[o] - second[o] > share * band for o, band in bands.items() if o in first)
+    return before is not None and after is not None and before - after > share

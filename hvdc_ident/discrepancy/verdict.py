@@ -1,0 +1,116 @@
+"""The verdict: named, ambiguous, unnameable, no evidence, or not excited."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.discrepancy.adequacy import Binned, adequacy
+from hvdc_ident.discrepancy.ambiguity import rivals
+from hvdc_ident.discrepancy.refit import Refit, unseen
+from hvdc_ident.discrepancy.result import Verdict
+from hvdc_ident.discrepancy.rounds import Search
+from hvdc_ident.discrepancy.search import Outcome
+from hvdc_ident.discrepancy.select import material_gap
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.simulate import simulate
+from hvdc_ident.trajectory import Array
+
+DOMINANT = 0.5
+"""Share of the gap that what is named has to explain."""
+REFUTED_P = 0.01
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict, why, the tests of what is left, and the experiment that would show more where nothing was excited."""
+
+    verdict: Verdict
+    text: str
+    tests: tuple[Binned, ...]
+    experiment: Mapping[str, Any] = field(default_factory=dict)
+
+
+def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
+    """The verdict on a search that has ended."""
+    options, last = search.options, outcome.refit
+    tests = adequacy(last.nominal(), _signals(last), bootstraps=options.bootstraps, seed=search.seed)
+    if not outcome.kept:
+        return _nothing(search, first, outcome, tests)
+    explained = first.chi2 - last.chi2
+    excess = max(first.chi2 - first.rows, explained)
+    labels = ", ".join(p.candidate.label for p in last.placed)
+    if explained < DOMINANT * excess:
+        return Judgement(
+            "unnameable",
+            f"Something is missing; the best of the catalogue ({labels}) explains only {explained / excess:.0%} of the gap.",
+            tests,
+        )
+    against = [b for b in tests if b.p <= REFUTED_P and b.excess > options.refuted * explained]
+    if against:
+        worst = max(against, key=lambda b: b.excess)
+        return Judgement(
+            "unnameable",
+            f"Something is missing, and no form of the catalogue has its shape: with {labels} the residuals over the "
+            f"{worst.name} are still not noise (p = {worst.p:.2g}).",
+            tests,
+        )
+    sets = [rivals(r, options) for r in outcome.kept]
+    if any(len(g) > 1 for g in sets):
+        others = max(len(g) for g in sets) - 1
+        return Judgement(
+            "ambiguous", f"Missing: {labels}, or one of {others} others that these data cannot tell from it.", tests
+        )
+    return Judgement("named", f"Missing: {labels}.", tests)
+
+
+def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned, ...]) -> Judgement:
+    found = outcome.rounds[-1]
+    options = search.options
+    was = unseen(first)
+    gap_there = material_gap(
+        was, 1.0, options.holdout_share, search.material, (_largest(first), dict.fromkeys(search.material, 0.0))
+    )
+    refused = [b for b in tests if b.p <= options.significance / max(len(tests), 1)]
+    if gap_there and (found.significant or refused):
+        why = found.why or "the residuals are not noise"
+        return Judgement(
+            "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
+        )
+    usable = found.scores.usable
+    if not usable.any():
+        still = list(dict.fromkeys(c.effect for c in found.candidates))
+        text = "None of the effects looked for is excited by these experiments."
+        advice = {"text": ". ".join(f"{e}: {effects()[e].excited_by}" for e in still)}
+        return Judgement("not-excited", text, tests, advice)
+    if found.significant:
+        return Judgement("no-evidence", f"No gap that matters: {found.why}.", tests)
+    return Judgement("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)
+
+
+def _largest(refit: Refit) -> dict[str, float]:
+    from hvdc_ident.discrepancy.rounds import _worst
+
+    return _worst(refit)
+
+
+def _signals(last: Refit) -> dict[str, dict[str, Array]]:
+    """The signal at the slots of each effect that was put in, at the rows of every fitted experiment."""
+    places = list(dict.fromkeys(p for placed in last.placed for p in placed.candidate.at))
+    found: dict[str, dict[str, Array]] = {}
+    for place in places:
+        name = place.removeprefix("outputs.")
+        by_experiment = {}
+        for e in last.problem.fitted_experiments:
+            try:
+                run = simulate(last.model, e.with_(measured=None), last.values, outputs=[name])
+            except SimulationError:
+                break
+            by_experiment[e.name] = np.asarray(run[name])
+        else:
+            found[place] = by_experiment
+    return found
