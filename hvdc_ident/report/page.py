@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hvdc_ident.files import write_text
 from hvdc_ident.report.html import text
+from hvdc_ident.report.interactive import scripts
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
@@ -30,8 +31,14 @@ tbody tr:hover { background: #f6f8fa; }
 code { font: .8rem ui-monospace, "Cascadia Mono", Menlo, Consolas, monospace; }
 sup { line-height: 0; font-size: .75em; }
 code { color: var(--soft); overflow-wrap: anywhere; }
+button, input[type=range] { font: inherit; } figure { position: relative; }
+figure > button { position: absolute; right: 0; top: 0; font-size: .8rem; padding: .1rem .5rem; color: var(--accent);
+  background: #fff; border: 1px solid var(--accent); border-radius: .3rem; cursor: pointer; }
+button:focus-visible, input:focus-visible, a:focus-visible, [tabindex]:focus-visible { outline: 3px solid #e69f00; }
+.letter { border: 1px solid var(--line); padding: 1rem 1.4rem; border-radius: .4rem; } .letter p { margin: .5rem 0; }
 figure { margin: .4rem 0 1rem; break-inside: avoid; } figure svg { width: 100%; height: auto; display: block; }
 @media print {
+  figure > button, input[type=range] { display: none; }
   body { max-width: none; padding: 0; font-size: 10pt; }
   h2, h3 { break-after: avoid; } tr { break-inside: avoid; }
 }
@@ -58,15 +65,20 @@ def page(folder: Path) -> str:
         if body:
             parts.append(f"<section>\n<h2>{text(section.title)}</h2>\n{body}\n</section>")
     heading = results.heading
-    title = text(heading.get("study", "study"))
+    return document(str(heading.get("study", "study")), str(heading.get("software", "")), "\n".join(parts))
+
+
+def document(title: str, subtitle: str, body: str) -> str:
+    """A whole page of a title and a body of HTML, with the scripts and the policy that the body needs."""
+    title = text(title)
+    needed, allowed = scripts(body)
+    policy = "; ".join(part for part in (POLICY, allowed) if part)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         f"<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<header><h1>{title}</h1><p>{text(heading.get('software', ''))}</p></header>\n"
-        + "\n".join(parts)
-        + "\n</body>\n</html>\n"
+        f"<header><h1>{title}</h1><p>{text(subtitle)}</p></header>\n{body}\n{needed}</body>\n</html>\n"
     )
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, visible
+from hvdc_ident.report.html import text
+from hvdc_ident.report.interactive import numbers
 from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
@@ -54,6 +56,33 @@ def waveforms(
     if shown is not None:
         top.set_ylim(*_limits([t for t in (before, after) if t is not None], output))
     return fig
+
+
+def traces(
+    output: str, unit: str, before: Trajectory | None, after: Trajectory | None
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The same curves for a figure that zooms: its traces and its layout, the residual below on the same time axis."""
+    found: list[dict[str, Any]] = []
+    shown = after if after is not None else before
+    if shown is not None:
+        found.append(_trace(shown.time, shown[f"{output}.measured"], "measured", MEASURED))
+    for table, color, label in ((before, BEFORE, "before"), (after, AFTER, "after")):
+        if table is not None:
+            left = table[f"{output}.measured"] - table[output]
+            found.append(_trace(table.time, table[output], label, color))
+            found.append(_trace(table.time, left, f"residual {label}", color) | {"yaxis": "y2"})
+    layout = {
+        "xaxis": {"title": {"text": "time, s"}, "anchor": "y2"},
+        "yaxis": {"title": {"text": text(f"{output}, {unit}" if unit else output)}, "domain": [0.3, 1.0]},
+        "yaxis2": {"title": {"text": "residual"}, "domain": [0.0, 0.24]},
+    }
+    return found, layout
+
+
+def _trace(time: Array, values: Array, name: str, color: str) -> dict[str, Any]:
+    x, y = visible(time, values)
+    line = {"color": color, "width": 1.3}
+    return {"type": "scatter", "mode": "lines", "x": numbers(x), "y": numbers(y), "name": name, "line": line}
 
 
 def _limits(tables: list[Trajectory], output: str) -> tuple[float, float]:

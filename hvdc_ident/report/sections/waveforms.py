@@ -6,9 +6,10 @@ from typing import Any
 
 from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import text
+from hvdc_ident.report.interactive import zoomable
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
-from hvdc_ident.report.waveforms import waveforms
+from hvdc_ident.report.waveforms import traces, waveforms
 from hvdc_ident.trajectory import Trajectory
 
 MOST = 60
@@ -44,7 +45,8 @@ def _figure(
     tables = [t if t is not None and output in t and f"{output}.measured" in t else None for t in (before, after)]
     window = about.get("window")
     fig = waveforms(output, unit, tables[0], tables[1], about.get("event"), tuple(window) if window else None)
-    return f"<figure>{svg(fig, f'{output} in {name}: measured and simulated')}</figure>"
+    label = f"{output} in {name}: measured and simulated"
+    return zoomable(svg(fig, label), label, *traces(output, unit, tables[0], tables[1]))
 
 
 SECTION = Section(order=40, title="Waveforms", render=_render)
