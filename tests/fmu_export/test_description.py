@@ -36,14 +36,14 @@ def test_it_says_what_the_model_is(tmp_path: Path, version: str) -> None:
     by_name = {v.name: v for v in d.modelVariables}
     assert [v.name for v in d.modelVariables if v.causality == "input"] == ["u", "d"]
     # An output that is a state is that variable; one whose name is an input's is told apart, as slots are.
-    assert {v.name for v in d.modelVariables if v.causality == "output"} == {
+    assert [v.name for v in d.modelVariables if v.causality == "output"] == [
         "x",
         "v",
         "outputs.u",
         "held",
         "late",
         "clock",
-    }
+    ]
     states = [u.variable.derivative for u in d.derivatives]
     assert [v.name for v in states] == ["x", "states.v", "f", "q"]
     assert [v.initial for v in states] == ["approx", "calculated", "calculated", "approx"]

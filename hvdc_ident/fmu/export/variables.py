@@ -40,9 +40,12 @@ class Variables:
 
     @cached_property
     def all(self) -> tuple[Variable, ...]:
-        """Every variable, by value reference."""
-        parts = (self._time(), self._inputs(), self._states(), self._rates(), self._outputs(), self._parameters())
-        return tuple(v for part in parts for v in part)
+        """Every variable as listed: time, inputs, outputs in the model's order, other states, derivatives, parameters."""
+        states, outputs = list(self._states()), list(self._outputs())
+        shown = {v.name: v for v in states if v.causality == "output"} | {v.name: v for v in outputs}
+        ordered = [shown[self._output_name(n)] for n in self.program.model.outputs]
+        inner = [v for v in states if v.causality != "output"]
+        return (*self._time(), *self._inputs(), *ordered, *inner, *self._rates(), *self._parameters())
 
     @cached_property
     def first(self) -> dict[str, int]:
@@ -70,7 +73,7 @@ class Variables:
 
     @property
     def outputs(self) -> tuple[Variable, ...]:
-        """The outputs, in the order of their value references."""
+        """The outputs, in the model's order."""
         return tuple(v for v in self.all if v.causality == "output")
 
     @property
@@ -146,6 +149,10 @@ class Variables:
         m = self.program.model
         return f"states.{name}" if name in m.outputs and name not in self.output_states else name
 
+    def _output_name(self, name: str) -> str:
+        m = self.program.model
+        return f"outputs.{name}" if name in m.inputs or name in m.parameters else name
+
     def _states(self) -> Iterator[Variable]:
         for k, (name, state) in enumerate(self.program.model.states.items()):
             searched = state.start is None
@@ -179,9 +186,8 @@ class Variables:
         for k, (name, output) in enumerate(m.outputs.items()):
             if name in self.output_states:
                 continue
-            taken = name in m.inputs or name in m.parameters
             yield Variable(
-                f"outputs.{name}" if taken else name,
+                self._output_name(name),
                 self.first["outputs"] + k,
                 "output",
                 "continuous",
