@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.factors import Ranges, factors
+from hvdc_ident.sensitivity.text import table_text
 from hvdc_ident.simulate.engine import simulate
 from hvdc_ident.trajectory import Array
 
@@ -122,22 +124,37 @@ class Sensitivities:
             "notes": dict(self.notes),
         }
 
-    def plot(self, experiment: str | None = None) -> Any:
-        """A figure of one experiment (default: the first): an axes an output, a curve a parameter, normalised."""
+    def plot(self, experiment: str | None = None, output: str | None = None, ax: Any = None) -> Any:
+        """Axes with one output's normalised derivatives in one experiment (default: the first), a curve a parameter."""
         import matplotlib.pyplot as plt
 
         name = next(iter(self.gradients)) if experiment is None else experiment
         if name not in self.gradients:
             raise unknown_name("experiment", name, self.gradients)
-        outputs = self.outputs[name]
-        figure, axes = plt.subplots(len(outputs), 1, sharex=True, squeeze=False, layout="constrained")
-        for ax, output in zip(axes[:, 0], outputs, strict=True):
-            for p in self.parameters:
-                ax.plot(self.times[name], self.of(name, output, p, normalised=True), label=p)
-            ax.set_ylabel(output)
-        axes[0, 0].legend(fontsize=8)
-        axes[-1, 0].set_xlabel("time, s")
-        return figure
+        shown = self.outputs[name][0] if output is None else output
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        for p in self.parameters:
+            axes.plot(self.times[name], self.of(name, shown, p, normalised=True), label=p)
+        unit = self.output_units.get(shown, "")
+        axes.set_ylabel(f"normalised derivative of {shown}" + (f", {unit}" if unit else ""))
+        axes.set_xlabel("time, s")
+        axes.set_title(name)
+        axes.legend(fontsize=8)
+        return axes
+
+    def __str__(self) -> str:
+        return table_text(("experiment", "output", "parameter", "rms", "peak"), self._lines())
+
+    def _repr_html_(self) -> str:
+        return "<pre>" + escape(str(self)) + "</pre>"
+
+    def _lines(self) -> list[tuple[str, ...]]:
+        return [
+            (e, o, p, f"{rms:.4g}", f"{peak:.4g}")
+            for e, lines in self.table.items()
+            for o, line in lines.items()
+            for p, (rms, peak) in line.items()
+        ]
 
 
 def trajectory_sensitivities(
@@ -211,6 +228,31 @@ class SteadySensitivities:
             for o, row in zip(self.outputs, self.gradients.tolist(), strict=True)
         }
         return {"model": self.model, "steady": dict(self.steady), "factors": dict(self.factors), "sensitivities": lines}
+
+    def plot(self, ax: Any = None) -> Any:
+        """Axes with a bar for every output and parameter: the derivative times the parameter's factor."""
+        import matplotlib.pyplot as plt
+
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        scaled = self.gradients * np.array([self.factors[p] for p in self.parameters])
+        width = 0.8 / len(self.parameters)
+        for k, p in enumerate(self.parameters):
+            axes.bar(np.arange(len(self.outputs)) + (k + 0.5) * width - 0.4, scaled[:, k], width, label=p)
+        axes.set_xticks(range(len(self.outputs)), self.outputs)
+        axes.set_ylabel("normalised derivative of the steady value")
+        axes.legend(fontsize=8)
+        return axes
+
+    def __str__(self) -> str:
+        lines = [
+            (o, f"{self.steady[o]:.6g}", p, f"{slope:.4g}")
+            for o, row in zip(self.outputs, self.gradients.tolist(), strict=True)
+            for p, slope in zip(self.parameters, row, strict=True)
+        ]
+        return table_text(("output", "steady value", "parameter", "derivative"), lines)
+
+    def _repr_html_(self) -> str:
+        return "<pre>" + escape(str(self)) + "</pre>"
 
 
 def steady_sensitivities(

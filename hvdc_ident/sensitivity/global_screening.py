@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.axes import Samples
 from hvdc_ident.sensitivity.sweep import Progress, Runner, sweep
+from hvdc_ident.sensitivity.text import table_text
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
@@ -59,6 +61,33 @@ class Screening:
             }
         head = {"method": self.method, "evaluations": self.evaluations, "failed": self.failed, "dropped": self.dropped}
         return {**head, "measures": found}
+
+    def plot(self, ax: Any = None) -> Any:
+        """Axes with a bar for every parameter and series: mu_star, or the total share of the variance."""
+        import matplotlib.pyplot as plt
+
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        name = "mu_star" if self.method == "morris" else "ST"
+        width = 0.8 / len(self.series)
+        for k, (o, e) in enumerate(self.series):
+            places = np.arange(len(self.parameters)) + (k + 0.5) * width - 0.4
+            spread = self.measures[f"{name}_conf"][k]
+            axes.bar(places, self.measures[name][k], width, yerr=spread, label=f"{o} in {e}")
+        axes.set_xticks(range(len(self.parameters)), self.parameters)
+        axes.set_ylabel(f"{name} of the RMSE")
+        axes.legend(fontsize=8)
+        return axes
+
+    def __str__(self) -> str:
+        lines = [
+            (o, e, p, *(f"{v[i, k]:.4g}" for v in self.measures.values()))
+            for i, (o, e) in enumerate(self.series)
+            for k, p in enumerate(self.parameters)
+        ]
+        return table_text(("output", "experiment", "parameter", *self.measures), lines)
+
+    def _repr_html_(self) -> str:
+        return "<pre>" + escape(str(self)) + "</pre>"
 
 
 def morris(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.factors import Ranges, factors
+from hvdc_ident.sensitivity.text import table_text
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
@@ -117,6 +119,17 @@ class LinearSensitivities:
         axes.set_ylabel(f"normalised derivative of {target}/{source}")
         axes.legend(fontsize=8)
         return axes
+
+    def __str__(self) -> str:
+        lines = [
+            (f"{value:.5g}", p, f"{slope:.4g}")
+            for value, row in zip(self.eigenvalues.tolist(), self.eigenvalue_gradients.tolist(), strict=True)
+            for p, slope in zip(self.parameters, row, strict=True)
+        ]
+        return table_text(("eigenvalue, rad/s", "parameter", "derivative"), lines)
+
+    def _repr_html_(self) -> str:
+        return "<pre>" + escape(str(self)) + "</pre>"
 
 
 def linear_sensitivities(

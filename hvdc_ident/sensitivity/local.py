@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 from hvdc_ident.errors import LinearizationError
@@ -42,11 +43,16 @@ class LocalSensitivities:
             "why": self.why,
         }
 
-    def plot(self, experiment: str | None = None) -> Any:
-        """A figure of the trajectories' derivatives, or axes with the response's where there is no experiment."""
-        if self.trajectories is not None:
-            return self.trajectories.plot(experiment)
-        return self.linear.plot() if self.linear is not None else None
+    def plot(self, ax: Any = None) -> Any:
+        """Axes with the first output's derivatives over time; of the steady state where there is no experiment."""
+        return self.trajectories.plot(ax=ax) if self.trajectories is not None else self.steady.plot(ax)
+
+    def __str__(self) -> str:
+        parts = [p for p in (self.trajectories, self.steady, self.linear) if p is not None]
+        return "\n\n".join([*map(str, parts), *([self.why] if self.why else [])])
+
+    def _repr_html_(self) -> str:
+        return "<pre>" + escape(str(self)) + "</pre>"
 
 
 def sensitivities(

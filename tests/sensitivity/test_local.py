@@ -95,8 +95,25 @@ def test_trajectories_and_steady_state_come_with_them() -> None:
     assert json.loads(json.dumps(told, allow_nan=False)) == told
     assert set(told) == {"trajectories", "steady", "linear", "why"}
     alone = hvdc_ident.sensitivities(MODEL)
-    assert alone.trajectories is None and alone.plot().get_xlabel() == "frequency, Hz"
-    assert found.plot().axes[0].get_ylabel() == "y2"
+    assert alone.trajectories is None and alone.linear.plot().get_xlabel() == "frequency, Hz"
+
+
+def test_results_draw_on_given_axes_and_tell_themselves() -> None:
+    import matplotlib.pyplot as plt
+
+    step = experiment("step", np.linspace(0, 3, 61), {"u": InputSignal.step(0.5, 1.0, 2.0)})
+    found = hvdc_ident.sensitivities(MODEL, [step])
+    for part in (found, found.trajectories, found.steady, found.linear):
+        axes = plt.subplots()[1]
+        assert part.plot(ax=axes) is axes and axes.get_legend() is not None
+        assert str(part).splitlines()[0] in part._repr_html_()
+    drawn = found.trajectories.plot("step", "y2").lines[2]
+    assert np.allclose(drawn.get_ydata(), found.trajectories.of("step", "y2", "c", normalised=True))
+    heights = [b.get_height() for b in found.steady.plot().patches]
+    assert heights[-1] == pytest.approx(10.0) and "eigenvalue, rad/s" in str(found)  # d(x^2)/dc = 2, times its range 5
+    with pytest.raises(UnknownNameError):
+        found.trajectories.plot("other")
+    plt.close("all")
 
 
 def test_a_model_without_a_linear_one_says_so() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from hvdc_ident.experiment import experiment
 from hvdc_ident.model.card import parse_card
 from hvdc_ident.sensitivity.global_screening import morris, sobol
 
+mpl.use("Agg")
 CARD = """
 schema = 1
 name = "sum"
@@ -44,5 +46,9 @@ def test_a_linear_model_has_known_indices():
     assert np.allclose(shares.measures["ST"], [[0.8, 0.2, 0]], atol=0.05)
     assert shares.to_dict()["measures"]["y"]["rest"]["c"]["ST"] == pytest.approx(0, abs=1e-9)
     assert found.to_xarray()["mu_star"].dims == ("series", "parameter")
+    axes = found.plot()
+    assert [b.get_height() for b in axes.patches] == pytest.approx([1, 0.5, 0], abs=1e-6)
+    assert "mu_star" in str(found) and str(found).splitlines()[0] in found._repr_html_()
+    assert "ST of the RMSE" in shares.plot(ax=axes).get_ylabel()
     with pytest.raises(StudyError, match="power of 2"):
         sobol(MODEL, [REST], RANGES, against="base", samples=100)
