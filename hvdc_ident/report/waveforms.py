@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, visible
-from hvdc_ident.report.html import text
-from hvdc_ident.report.interactive import numbers
+from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, visible, visible_rows
+from hvdc_ident.report.interactive import Curve
 from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
@@ -25,7 +24,8 @@ def waveforms(
 ) -> Figure:
     """The recorded and simulated output over time, and below it measured minus simulated.
 
-    before, after: tables with the columns OUTPUT and OUTPUT.measured, at the start values and at the estimates.
+    before, after: tables with the columns OUTPUT and OUTPUT.measured, at the start values and at the estimates; with
+    OUTPUT.low and OUTPUT.high the band between them is shaded.
     """
     fig = figure(7.4, 3.5)
     top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[3, 1])
@@ -37,6 +37,9 @@ def waveforms(
             continue
         dashes = (0, (5, 2)) if table is before else "-"
         top.plot(*visible(table.time, table[output]), color=color, linewidth=1.3, linestyle=dashes, label=label)
+        if f"{output}.low" in table:
+            band = [table[f"{output}.{end}"] for end in ("low", "high")]
+            top.fill_between(table.time, *band, color=color, alpha=0.15, linewidth=0, label="95 % band of a sample")
         left = table[f"{output}.measured"] - table[output]
         strip.plot(*visible(table.time, left), color=color, linewidth=0.8)
     unit_text = f", {unit}" if unit else ""
@@ -58,31 +61,23 @@ def waveforms(
     return fig
 
 
-def traces(
+def curves(
     output: str, unit: str, before: Trajectory | None, after: Trajectory | None
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The same curves for a figure that zooms: its traces and its layout, the residual below on the same time axis."""
-    found: list[dict[str, Any]] = []
+) -> tuple[dict[str, Array], list[Curve], tuple[str, str, str]]:
+    """The same for a figure that zooms: its columns, its curves, and the titles of its axes."""
+    tables = {label: t for label, t in (("before", before), ("after", after)) if t is not None}
     shown = after if after is not None else before
-    if shown is not None:
-        found.append(_trace(shown.time, shown[f"{output}.measured"], "measured", MEASURED))
-    for table, color, label in ((before, BEFORE, "before"), (after, AFTER, "after")):
-        if table is not None:
-            left = table[f"{output}.measured"] - table[output]
-            found.append(_trace(table.time, table[output], label, color))
-            found.append(_trace(table.time, left, f"residual {label}", color) | {"yaxis": "y2"})
-    layout = {
-        "xaxis": {"title": {"text": "time, s"}, "anchor": "y2"},
-        "yaxis": {"title": {"text": text(f"{output}, {unit}" if unit else output)}, "domain": [0.3, 1.0]},
-        "yaxis2": {"title": {"text": "residual"}, "domain": [0.0, 0.24]},
-    }
-    return found, layout
-
-
-def _trace(time: Array, values: Array, name: str, color: str) -> dict[str, Any]:
-    x, y = visible(time, values)
-    line = {"color": color, "width": 1.3}
-    return {"type": "scatter", "mode": "lines", "x": numbers(x), "y": numbers(y), "name": name, "line": line}
+    assert shown is not None
+    columns = {"x": shown.time, "measured": shown[f"{output}.measured"]}
+    columns |= {label: t[output] for label, t in tables.items() if len(t) == len(shown)}
+    rows = np.unique(np.concatenate([visible_rows(c) for c in columns.values()]))
+    found = [Curve("measured", MEASURED, "measured")]
+    for label, color in (("before", BEFORE), ("after", AFTER)):
+        if label in columns:
+            found.append(Curve(label, color, label))
+            found.append(Curve(f"residual {label}", color, "measured", minus=label, lower=True))
+    titles = ("time, s", f"{output}, {unit}" if unit else output, "residual")
+    return {name: values[rows] for name, values in columns.items()}, found, titles
 
 
 def _limits(tables: list[Trajectory], output: str) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from hvdc_ident.report.html import number, share, table, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
@@ -39,7 +41,61 @@ def _render(results: Results) -> str:
         f"<p>Experiment <strong>{text(n)}</strong> could not be simulated: {text(e.get('reason', ''))}</p>"
         for n, e in failed
     )
-    return table(header, rows, words=(0, 1, 2, 7)) + told
+    return table(header, rows, words=(0, 1, 2, 7)) + told + _windows(fit) + _held_out(fit)
+
+
+def _windows(fit: dict[str, Any]) -> str:
+    """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
+    found = fit.get("windowed_errors") or {}
+    profile, units = found.get("profile") or {}, fit.get("units") or {}
+    rows = []
+    for output, line in (found.get("errors") or {}).items():
+        for name, about in line.items():
+            if about.get("event") is None:
+                continue
+            cells = [text(output), text(name)]
+            for window in ("before", "during", "after"):
+                cells += [_error(about[window], kind) for kind in ("max", "mean", "mean_absolute")]
+            rows.append([*cells, text(units.get(output, ""))])
+    if not rows:
+        return ""
+    kinds = [f"{w}: {k}" for w in ("before", "during", "after") for k in ("max", "mean", "mean abs.")]
+    end = {a.get("end_from") for line in found["errors"].values() for a in line.values()}
+    steps = " A step counts as over where its record has settled." if "settling" in end else ""
+    told = (
+        f"<p class='small'>Model less record. Profile <strong>{text(profile.get('name', ''))}</strong>, version "
+        f"{text(profile.get('version', ''))}: {text(profile.get('title', ''))}; {text(profile.get('source', ''))}. "
+        f"An error above its limit is marked with its limit.{steps} {text(profile.get('notes', ''))}</p>"
+    )
+    head = ["output", "experiment", *kinds, "unit"]
+    return "<h3>Before, during and after the event</h3>" + table(head, rows, words=(0, 1, len(head) - 1)) + told
+
+
+def _error(window: dict[str, Any], kind: str) -> str:
+    value, limit = window.get(kind), (window.get("limits") or {}).get(kind)
+    if value is None:
+        return "–"
+    over = limit is not None and abs(value) > limit
+    return f"<strong>{number(value, 2)} &gt; {number(limit, 2)}</strong>" if over else number(value, 2)
+
+
+def _held_out(fit: dict[str, Any]) -> str:
+    """How the estimates hold in experiments that were kept out of the fit."""
+    rows = []
+    for name, line in (fit.get("validation") or {}).items():
+        if line.get("status") != "done":
+            rows.append([text(name), "–", "–", "–", "–", "could not be simulated at the estimates"])
+        for output, q in (line.get("outputs") or {}).items():
+            band = q.get("in_band")
+            note = "; ".join(
+                f"{n} {number(v)} from this record itself" for n, v in (line.get("nuisance") or {}).items()
+            )
+            cells = [text(name), text(output), number(q["rmse"], 3), number(q.get("of_fit"), 3)]
+            rows.append([*cells, f"{number(100.0 * band, 3)} %" if band is not None else "–", text(note)])
+    if not rows:
+        return ""
+    head = ["held-out experiment", "output", "RMSE", "of the fit's", "samples in the 95 % band", "note"]
+    return "<h3>Held-out experiments</h3>" + table(head, rows, words=(0, 1, 5))
 
 
 SECTION = Section(order=30, title="Error before and after", render=_render)

@@ -18,9 +18,83 @@ def _render(results: Results) -> str:
     header = ["parameter", "start", "fitted", "change", "std", "95 % interval", "bounds", "unit", "note"]
     held = fit.get("held") or {}
     fixed = [n for n in held if n not in candidates]
-    outcome = f"<p>The fit: <strong>{text(fit.get('status', ''))}</strong>; {text(fit.get('message', ''))}.</p>"
+    outcome = _outcome(fit)
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
-    return outcome + table(header, rows, words=(0, 7, 8)) + _weights(fit) + rest
+    return outcome + table(header, rows, words=(0, 7, 8)) + _weights(fit) + rest + _more(fit)
+
+
+STATUS = {
+    "converged": "The fit converged",
+    "at-bound": "The fit ended on a bound",
+    "two-optima": "The fit found two optima that are as good: neither is the answer by itself",
+    "not-converged": "The fit did not converge: its numbers are no estimates",
+    "failed": "The fit failed",
+}
+
+
+def _outcome(fit: dict[str, Any]) -> str:
+    """What became of the fit, said first."""
+    status = str(fit.get("status", ""))
+    return (
+        f"<p><strong>{text(STATUS.get(status, status))}</strong> ({text(status)}): {text(fit.get('message', ''))}.</p>"
+    )
+
+
+def _more(fit: dict[str, Any]) -> str:
+    """What was estimated beside the candidates, what follows from them, and how they hang together."""
+    return _derived(fit) + _nuisances(fit) + _correlation(fit) + _one_by_one(fit)
+
+
+def _derived(fit: dict[str, Any]) -> str:
+    lines = fit.get("derived") or {}
+    if not lines:
+        return ""
+    rows = [
+        [text(n), number(d["value"]), number(d.get("std"), 2), text(d.get("unit", "")), text(d["expression"])]
+        for n, d in lines.items()
+    ]
+    head = ["parameter", "value", "std", "unit", "expression"]
+    return "<h3>What follows from the estimates</h3>" + table(head, rows, words=(0, 3, 4))
+
+
+def _nuisances(fit: dict[str, Any]) -> str:
+    rows = []
+    for experiment, line in (fit.get("nuisance") or {}).items():
+        for name, e in line.items():
+            low, high = e.get("ci95") or (None, None)
+            interval = f"{number(low)} … {number(high)}" if e.get("ci95") else "–"
+            cells = [text(experiment), text(name), number(e["value"]), number(e.get("std"), 2), interval]
+            rows.append([*cells, text(e.get("unit", "")), text(e.get("reason", ""))])
+    if not rows:
+        return ""
+    head = ["experiment", "unknown of it alone", "value", "std", "95 % interval", "unit", "note"]
+    return "<h3>Unknown in single experiments</h3>" + table(head, rows, words=(0, 1, 5, 6))
+
+
+def _correlation(fit: dict[str, Any]) -> str:
+    matrix = fit.get("correlation") or {}
+    names = [n for n in matrix if n in (fit.get("fitted") or [])]
+    if len(names) < 2:
+        return ""
+    rows = [[text(a), *(number(matrix[a].get(b), 2) for b in names)] for a in names]
+    return "<h3>Correlation of the estimates</h3>" + table(["", *map(text, names)], rows, words=(0,))
+
+
+def _one_by_one(fit: dict[str, Any]) -> str:
+    lines = {n: d for n, d in (fit.get("per_experiment") or {}).items() if d.get("std") is not None}
+    if not lines:
+        return ""
+    rows = []
+    for name, d in lines.items():
+        low, high = d["ci95_of_mean"]
+        spread = [number(d["mean"]), number(d["std"], 2), number(d["variance"], 2), f"{number(low)} … {number(high)}"]
+        rows.append([text(name), number(d["n"]), *spread])
+    head = ["parameter", "fits", "mean", "std over fits", "variance", "95 % interval of the mean"]
+    told = (
+        "<p class='small'>Each experiment fitted alone. The interval is of the mean over these fits: it shrinks with "
+        "their number and is no interval of the parameter.</p>"
+    )
+    return "<h3>Experiment by experiment</h3>" + table(head, rows, words=(0,)) + told
 
 
 def _row(name: str, line: dict[str, Any], fit: dict[str, Any]) -> list[str]:

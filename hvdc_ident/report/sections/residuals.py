@@ -1,0 +1,65 @@
+"""Whether what is left over looks like noise: goodness of fit, whiteness, correlation with the inputs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.results import Results
+from hvdc_ident.report.section import Section
+
+LOW = 0.01
+"""A p below this is marked."""
+
+
+def _render(results: Results) -> str:
+    fit = results.get("fit")
+    tests = fit.get("residual_tests") or {}
+    if not tests:
+        return ""
+    rows = [_row(o, e, line, fit) for o, by_name in tests.items() for e, line in by_name.items()]
+    head = ["output", "experiment", "rows", "variance explained", "whiteness p", "runs p", "least p with an input", ""]
+    told = (
+        f"<p class='small'>p: the chance of such a value from white noise (Ljung and Box; Wald and Wolfowitz; cross-"
+        f"correlation with inputs, each filtered by itself). Below {LOW:g} it is marked: something is left over.</p>"
+    )
+    return _goodness(fit) + table(head, rows, words=(0, 1, 7)) + told
+
+
+def _goodness(fit: dict[str, Any]) -> str:
+    g = fit.get("goodness") or {}
+    if g.get("p") is None:
+        return f"<p>No test of the fit as a whole: {text(g['reason'])}.</p>" if g.get("reason") else ""
+    against = "an estimated noise (F test)" if g.get("noise_dof") else "the given noise (χ² test)"
+    verdict = "the misfit is what this noise makes" if g["p"] >= LOW else "the misfit is more than this noise makes"
+    return (
+        f"<p>All residuals together against {against}: χ² {number(g['chi2'], 4)} with {number(g['dof'], 4)} independent "
+        f"samples to spare, p = {number(g['p'], 2)}: {verdict}.</p>"
+    )
+
+
+def _row(output: str, experiment: str, line: dict[str, Any], fit: dict[str, Any]) -> list[str]:
+    quality = ((((fit.get("goodness") or {}).get("outputs") or {}).get(output)) or {}).get(experiment) or {}
+    inputs = {n: i.get("p") for n, i in (line.get("inputs") or {}).items() if i.get("p") is not None}
+    least = min(inputs, key=lambda n: inputs[n], default=None)
+    share = quality.get("r2")
+    return [
+        text(output),
+        text(experiment),
+        number(line.get("n")),
+        f"{number(100.0 * share, 5)} %" if share is not None else "–",
+        _p((line.get("ljung_box") or {}).get("p")),
+        _p((line.get("runs") or {}).get("p")),
+        _p(inputs[least]) if least is not None else "–",
+        text(least or ""),
+    ]
+
+
+def _p(value: float | None) -> str:
+    if value is None:
+        return "–"
+    shown = number(value, 2)
+    return f"<strong>{shown}</strong>" if value < LOW else shown
+
+
+SECTION = Section(order=32, title="What is left over", render=_render)
