@@ -1,0 +1,166 @@
+"""The list of the studies with their headline numbers, from each one's expected.json: studies/README.md.
+
+python studies/index.py            # writes the list
+A study without a headline here is listed by its name alone.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
+from common import paper  # noqa: E402
+from common.ending import number  # noqa: E402
+
+from hvdc_ident.files import write_text  # noqa: E402
+
+HEAD = """\
+# Studies
+
+Each folder has one command, `python studies/NAME/run.py`, its figures in `expected.json` (checked by `tests/studies`), and
+a README that says what was done, what the paper has, and why the two differ. `--pin`, where there is one, writes what was
+computed into the folder. Reference waveforms: the average-value link, which stands in for EMTP-RV. This list is written by
+`python studies/index.py`.
+
+"""
+
+
+def _mean(values: dict[str, Any], mode: str, gain: str) -> str:
+    v = np.array(values[mode][gain])
+    return f"{number(v.mean(), 3)} ± {number(v.std(ddof=1), 2)}"
+
+
+def _table_1(e: dict[str, Any]) -> str:
+    d, g = e["values"]["design"], e["values"]["gains"]
+    return f"J = {d['J']:g} s and Ts = {d['Ts']:g} s give KPVDC {g['KPVDC']:.0f}, KIVDC {g['KIVDC']:.1f} and KIP = KIQ = 30"
+
+
+def _table_2(e: dict[str, Any]) -> str:
+    own, avm = (e["values"][d]["all three"] for d in ("the link itself", "the average-value link"))
+    return (
+        f"{own['to the optimum']} of {own['starts']} starts find the true gains on the link's own waveforms, the others "
+        f"cannot be simulated or begin wrong; on the average-value link's KIVDC {number(avm['optimum']['KIVDC'], 3)}"
+    )
+
+
+def _table_3(e: dict[str, Any]) -> str:
+    v = e["values"]
+    theirs = paper.TABLE_3["KIVDC"]
+    return (
+        f"KIVDC {_mean(v, 'individual', 'KIVDC')} individually and {_mean(v, 'simultaneous', 'KIVDC')} simultaneously "
+        f"(paper {theirs['II']['mean']:.0f} ± {theirs['II']['std']:.2g}, {theirs['SI']['mean']:.0f} ± "
+        f"{theirs['SI']['std']:.2g}; true {paper.TABLE_1['KIVDC']}), KIP {_mean(v, 'individual', 'KIP')} (paper 31.49)"
+    )
+
+
+def _table_4(e: dict[str, Any]) -> str:
+    v, theirs = e["values"]["Irorder1"], paper.TABLE_4["Irorder1"]
+    return (
+        f"RMSE of Irorder1 {number(v['upper II'], 2)} with fitted gains, {number(v['EMTP'], 2)} with the true ones "
+        f"(paper {theirs['upper II']}, {theirs['EMTP']})"
+    )
+
+
+def _figure_5(e: dict[str, Any]) -> str:
+    found = e["values"]["Vdc"]["estimates"]
+    gains = ", ".join(f"{n} {number(v['value'])}" for n, v in found.items())
+    return f"four set-ups as study files; the Vdc one gives {gains}"
+
+
+def _figure_6(e: dict[str, Any]) -> str:
+    v = e["values"]["KPVDC"]
+    return f"KPVDC has two humps: {number(np.mean(v['step']))} from steps, {number(np.mean(v['ramp']))} from ramps"
+
+
+def _figure_7(e: dict[str, Any]) -> str:
+    shares = [r["upper"] / r["test"] for o in e["values"]["rmse"].values() for r in o.values()]
+    return (
+        f"with fitted gains {number(100 * min(shares), 2)} to {number(100 * max(shares), 2)} % of the test values' RMSE"
+    )
+
+
+def _figure_8(e: dict[str, Any]) -> str:
+    line = e["rmse"]["vdc-step"]
+    ours = ", ".join(str(line[k]) for k in ("550.0", "850.0", "950.0"))
+    return f"RMSE of Irorder1 {ours} at KIVDC 550, 850, 950 (paper .0053, .0033, .0036); identifiable all the same"
+
+
+def _figure_9(e: dict[str, Any]) -> str:
+    line = e["rmse"]["vdc-step"]
+    return f"RMSE {line['250.0']} at 250, {line['850.0']} at 850, {line['1500.0']} at 1500: no negligible impact"
+
+
+def _plain(e: dict[str, Any]) -> str:
+    cases = {case: ", ".join(f"{n} {v:g}" for n, v in gains.items()) for case, gains in e["gains"].items()}
+    return "; ".join(f"{case} {gains}" for case, gains in cases.items())
+
+
+def _modes(e: dict[str, Any]) -> str:
+    v = e["vsc-hvdc-avm"]
+    return f"each filtered measurement is {v['measurement_ms']} ms late; dc voltage control at {v['dc voltage control Hz']} Hz"
+
+
+def _software(e: dict[str, Any]) -> str:
+    v = e["rmse_%"]
+    return (
+        f"RMSE against Dymola {v['P2']} % (P), {v['Irorder2']} % (Id_ref), {v['Vdc1']} % (Vdc) of each signal's range"
+    )
+
+
+def _dymola(e: dict[str, Any]) -> str:
+    g = e["gains fitted"]
+    return f"KIP {g['KIP']:.2f} (true 30), KPVDC {g['KPVDC']:.2f} (9.6), KIVDC {g['KIVDC']:.1f} (293.9)"
+
+
+def _coverage(e: dict[str, Any]) -> str:
+    p = e["parameters"]
+    return f"{100 * p['KPVDC']['coverage']:.1f} % (KPVDC) and {100 * p['KIVDC']['coverage']:.1f} % (KIVDC) of {e['runs']} runs"
+
+
+HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+    "software_to_software": ("Fig. 3: is the reference to be believed?", _software),
+    "table_1": ("Table I: six gains from two numbers", _table_1),
+    "table_2": ("Table II: where the fits may go and where they begin", _table_2),
+    "figure_5": ("Fig. 5: the set-up of a fit", _figure_5),
+    "table_3": ("Table III: 30 experiments, fitted one by one and together", _table_3),
+    "figure_6": ("Fig. 6: the histograms of Table III", _figure_6),
+    "table_4": ("Table IV: errors with the fitted gains", _table_4),
+    "figure_7": ("Fig. 7: the waveforms with the fitted gains", _figure_7),
+    "figure_8": ("Fig. 8: does KIVDC matter from 550 to 950?", _figure_8),
+    "figure_9": ("Fig. 9: and from 250 to 1500?", _figure_9),
+    "plain_link_on_avm": ("What the gains do to make up for a missing delay", _plain),
+    "avm_modes": ("The modes of the average-value link", _modes),
+    "dymola_waveform": ("The phasor link on Dymola's waveforms", _dymola),
+    "profile_coverage": ("How often the profile's interval holds the truth", _coverage),
+}
+
+
+def folders() -> list[str]:
+    """The studies, those of the list first."""
+    found = sorted(p.parent.name for p in HERE.glob("*/run.py"))
+    return [n for n in HEADLINES if n in found] + [n for n in found if n not in HEADLINES]
+
+
+def text() -> str:
+    """The list as Markdown."""
+    rows = ["| study | what | headline |", "| --- | --- | --- |"]
+    for name in folders():
+        if name in HEADLINES:
+            title, headline = HEADLINES[name]
+            found = headline(json.loads((HERE / name / "expected.json").read_text(encoding="utf-8")))
+        else:
+            title, found = "see its README", ""
+        rows.append(f"| [{name}]({name}) | {title} | {found} |")
+    return HEAD + "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    write_text(HERE / "README.md", text())
+    print(text())
