@@ -6,9 +6,11 @@ archives, crashes, endless loops. They do not contain malice: load only FMUs you
 
 from __future__ import annotations
 
+import lzma
 import re
 import stat
 import zipfile
+import zlib
 from collections import Counter
 from pathlib import Path, PurePosixPath
 from xml.parsers import expat
@@ -22,6 +24,17 @@ MOST_XML = 64 * 2**20  # bytes of a model description; a hundred thousand variab
 DESCRIPTION = "modelDescription.xml"
 PARSED = (DESCRIPTION, "sources/buildDescription.xml")
 """Files that are read as XML."""
+DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    NotImplementedError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+)
+"""What reading a damaged archive raises."""
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -79,7 +92,7 @@ def unpack(path: Path, folder: Path) -> None:
                 with archive.open(entry) as source, target.open("wb") as sink:
                     while block := source.read(1 << 20):
                         sink.write(block)
-            except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError) as e:
+            except DAMAGE as e:
                 raise ModelError(f"'{entry.filename}' in the FMU cannot be unpacked: {e}", where=str(path)) from None
 
 
@@ -88,10 +101,10 @@ def _opened(path: Path) -> zipfile.ZipFile:
         return zipfile.ZipFile(path)
     except FileNotFoundError:
         raise ModelError("the model file is not there", where=str(path)) from None
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, ValueError, NotImplementedError) as e:
-        raise ModelError(f"the file is no zip archive: {e}", where=str(path), expected="an FMU") from None
     except OSError as e:
         raise ModelError(f"the file cannot be read: {(e.strerror or str(e)).lower()}", where=str(path)) from None
+    except DAMAGE as e:
+        raise ModelError(f"the file is no zip archive: {e}", where=str(path), expected="an FMU") from None
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
@@ -135,7 +148,7 @@ def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
             parser.Parse(b"", True)
     except expat.ExpatError as e:
         raise ModelError(f"the XML is not well-formed: {e}", where=where) from None
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, LookupError) as e:
+    except (*DAMAGE, LookupError) as e:
         raise ModelError(f"the XML cannot be read: {e}", where=where) from None
 
 

@@ -29,12 +29,16 @@ def run(
     seen = plant.block(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
     stepper = _Stepper(plant)
-    for k, t in enumerate(stops.tolist()):
+    jumps = (before != after).any(axis=1).tolist()
+    moves = [False, *(before[1:] != after[:-1]).any(axis=1).tolist()]
+    instants = stops.tolist()
+    for k, t in enumerate(instants):
         if k:
-            stepper.step(stops[k - 1], t, after[k - 1], before[k])
-        stepper.hold(before[k])
+            stepper.step(instants[k - 1], t, after[k - 1], before[k], moves[k])
+        if k == 0 or moves[k]:
+            stepper.hold(before[k])
         left[k] = seen.get()
-        if (before[k] != after[k]).any():
+        if jumps[k]:
             stepper.hold(after[k])
             right[k] = seen.get()
         else:
@@ -72,7 +76,7 @@ class _Stepper:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.held: Array | None = None
+        self.sloping = False
         d = plant.description
         self.follows = d.interpolates and bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
         if self.follows:
@@ -88,17 +92,16 @@ class _Stepper:
 
     def hold(self, u: Array) -> None:
         """Nothing; the inputs stand at u."""
-        if self.held is None or (self.held != u).any():
-            self.plant.inputs.set(u)
-            self.held = u.copy()
+        self.plant.inputs.set(u)
 
-    def step(self, a: float, b: float, first: Array, last: Array) -> None:
-        """Nothing; the FMU is at b, its inputs having gone from `first` to `last`."""
-        if self.follows:
+    def step(self, a: float, b: float, first: Array, last: Array, moves: bool) -> None:
+        """Nothing; the FMU is at b, its inputs having gone from `first` to `last`; moves: whether these differ."""
+        if self.follows and (moves or self.sloping):
             self.hold(first)
             self.slopes.values[:] = (last - first) / (b - a)
             self.plant.binding.set_slopes_of_inputs(self.references, self.orders, self.slopes)
-        else:
+            self.sloping = moves
+        elif moves:
             self.hold(0.5 * (first + last))
         t = a
         for _ in range(EARLY):

@@ -213,6 +213,7 @@ def _refuse_array(path: Path, v: Any) -> None:
 def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...]]:
     states: dict[str, Variable] = {}
     derivatives = []
+    first = {v.valueReference: v for v in reversed(given.modelVariables)} if given.fmiMajorVersion == 3 else {}
     for unknown in given.derivatives:
         derivative = unknown.variable
         state = derivative.derivative
@@ -220,6 +221,7 @@ def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...
             raise ModelError(
                 f"the derivative '{derivative.name}' does not say of which state it is", where=f"{path}, ModelStructure"
             )
+        state = first.get(state.valueReference, state)  # where an output has the reference too, FMPy takes the last
         _refuse_array(path, state)
         if state.name in states:
             raise ModelError(f"the state '{state.name}' has two derivatives", where=f"{path}, ModelStructure")

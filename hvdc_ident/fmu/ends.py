@@ -17,10 +17,10 @@ import numpy as np
 
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.effects.base import apply
-from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.errors import unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.expression.functions import symbol
-from hvdc_ident.fmu.grid import joined, refined, signal_of
+from hvdc_ident.fmu.grid import joined, kept_rows, refined, signal_of
 from hvdc_ident.fmu.run import bare, inputs_of, unit_of
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model, Output
@@ -160,7 +160,9 @@ class _Ends:
         inside = self._inside(inputs, own)
         raw = inside.trajectory.values
         gradients = {n: inside.gradients[:, :, k] for k, n in enumerate(own)}
-        gradients |= {n: self._entering(inputs, slopes[n]) for n in at_entrance}
+        jumps = any(np.setdiff1d(s.breaks, self.breaks).size for s in inputs.values())
+        for n in at_entrance:  # a parameter may move a jump, as a delay does: no slope says that
+            gradients[n] = self._moving(n) if jumps else self._entering(inputs, slopes[n])
         values, found = self._leave(raw, gradients, sensitivities)
         shape = (self.experiment.time.size, len(self.names), len(sensitivities))
         table = np.empty(shape)
@@ -178,32 +180,47 @@ class _Ends:
     # --- in ---
 
     def _inputs(
-        self, sensitivities: tuple[str, ...]
+        self, sensitivities: tuple[str, ...] = (), values: Mapping[str, float] | None = None
     ) -> tuple[dict[str, InputSignal], dict[str, dict[str, InputSignal]]]:
-        """What enters the FMU, by input; and how it moves by each parameter of the entrance."""
+        """What enters the FMU, by input; and how it moves by each parameter of the entrance, jumps staying in place.
+
+        values: of all parameters, where they are not this run's.
+        """
         model, e = self.model, self.experiment
         plain = inputs_of(model, e, self.given)
         if not self.enters:
             return plain, {}
         given = {f"u{k}": s for k, s in enumerate(plain.values())}
-        values = {n: self.values[n] for n in self.entrance.parameters}
+        chosen = {n: (values or self.values)[n] for n in self.entrance.parameters}
 
         def run(time: Array) -> Simulation:
             passing = Experiment("entrance", time, FrozenMap(given))
-            return engine_run(self.entrance, passing, values, sensitivities, tolerance=self.tolerance)
+            return engine_run(self.entrance, passing, chosen, sensitivities, tolerance=self.tolerance)
 
         grid = refined(lambda time: run(time).trajectory.values, e.time, self.breaks)
         found = run(grid)
-        inputs, slopes = {}, {n: {} for n in sensitivities}  # type: ignore[var-annotated]
+        inputs: dict[str, InputSignal] = {}
+        slopes: dict[str, dict[str, InputSignal]] = {n: {} for n in sensitivities}
         for k, name in enumerate(model.inputs):
             inputs[name] = signal_of(grid, found[f"y{k}"], self.breaks)
             for n, column in zip(sensitivities, found.gradient(f"y{k}").T, strict=True):
-                slopes[n][name] = signal_of(grid, column, self.breaks)
+                slopes[n][name] = InputSignal(inputs[name].times, column[kept_rows(grid, found[f"y{k}"])], np.empty(0))
         return inputs, slopes
 
     def _inside(self, inputs: Mapping[str, InputSignal], sensitivities: tuple[str, ...]) -> Simulation:
         inner = Experiment(self.experiment.name, self.time, FrozenMap(inputs))
         return bare(self.model, inner, self.given, sensitivities, self.raw, self.tolerance)
+
+    def _moving(self, name: str) -> Array:
+        """(n, raw) the derivative by a parameter of the entrance, from runs with it a hundredth of its size apart."""
+        parameter = self.model.parameters[name]
+        h = 0.01 * parameter.size
+        low, high = max(self.values[name] - h, parameter.min), min(self.values[name] + h, parameter.max)
+        ends = []
+        for value in (low, high):
+            inputs, _ = self._inputs((), {**self.values, name: value})
+            ends.append(self._inside(inputs, ()).trajectory.values)
+        return np.asarray((ends[1] - ends[0]) / (high - low))
 
     def _entering(self, inputs: Mapping[str, InputSignal], slope: Mapping[str, InputSignal]) -> Array:
         """(n, raw) change of what comes out of the FMU as its inputs move along the slopes."""
@@ -270,6 +287,4 @@ class _Ends:
 
 def _moved(signal: InputSignal, slope: InputSignal, by: float) -> InputSignal:
     """The signal moved along another on the same instants."""
-    if slope.times.size != signal.times.size:
-        raise ModelError("a signal and its slope do not fit", expected="the same instants")
     return InputSignal(signal.times, signal.values + by * slope.values, signal.breaks)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.experiment import InputSignal
 from hvdc_ident.trajectory import Array
@@ -53,13 +54,24 @@ def refined(run: Callable[[Array], Array], time: Array, breaks: Array) -> Array:
 
 def signal_of(time: Array, values: Array, breaks: Array) -> InputSignal:
     """The signal through the rows; breaks where it jumps, and at the given instants within."""
+    steep, moved = _jumps(time, values)
+    kept = kept_rows(time, values)
+    inside = breaks[(breaks >= time[0]) & (breaks <= time[-1])]
+    return InputSignal(moved[kept], values[kept], np.union1d(moved[1:][steep], inside))
+
+
+def kept_rows(time: Array, values: Array) -> NDArray[np.bool_]:
+    """Which rows a signal keeps: of three at one instant the middle one is passed through in no time."""
+    _, moved = _jumps(time, values)
+    keep = np.ones(time.size, dtype=bool)
+    keep[1:-1] = ~((moved[1:-1] == moved[:-2]) & (moved[1:-1] == moved[2:]))
+    return keep
+
+
+def _jumps(time: Array, values: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which intervals are jumps, and the instants with those intervals closed."""
     short = 1e-6 * max(float(time[-1] - time[0]), 1e-300) / FIRST
     steep = (np.diff(time) <= short) & (np.abs(np.diff(values)) > HOLDS * max(float(np.ptp(values)), 1e-300))
     moved = time.copy()
     moved[:-1][steep] = time[1:][steep]
-    own = moved[1:][steep]
-    # Three rows at one instant: the middle one is passed through in no time.
-    keep = np.ones(time.size, dtype=bool)
-    keep[1:-1] = ~((moved[1:-1] == moved[:-2]) & (moved[1:-1] == moved[2:]))
-    inside = breaks[(breaks >= time[0]) & (breaks <= time[-1])]
-    return InputSignal(moved[keep], values[keep], np.union1d(own, inside))
+    return steep, moved

@@ -49,6 +49,8 @@ class _Worker:
     said: IO[bytes]
     owner: int
     runs: int = 0
+    child: int = 0  # the process with the FMU in it, which the worker forked
+    resident: int = 0  # bytes it began with
 
 
 @dataclass(eq=False)
@@ -81,7 +83,7 @@ class Host:
             try:
                 worker.requests.send_bytes(packed(heading, arrays))
             except OSError:
-                raise self._died(worker, "before the run") from None
+                raise self._lost(worker, "before the run") from None
             answer, out = self._heard(worker, self.limits.deadline, "run")
             self.memory = int(answer.get("memory", 0))
             return answer, out
@@ -100,11 +102,15 @@ class Host:
                     )
                 message = worker.answers.recv_bytes()
             except (EOFError, OSError):
-                raise self._died(worker, f"in the {what}") from None
+                raise self._lost(worker, f"in the {what}") from None
             heading, arrays = unpacked(message)
             if "more" in heading:
+                worker.resident = int(heading.get("resident", worker.resident))
+                worker.child = int(heading.get("child", worker.child))
                 until = time.monotonic() + deadline
                 continue
+            if "ended" in heading:
+                raise self._died(worker, f"in the {what}", int(heading["ended"]), int(heading["peak"]))
             if "done" in heading:
                 return heading, arrays
             if heading.get("fatal"):
@@ -122,22 +128,22 @@ class Host:
         name = self.description.path.name
         return SimulationError(what, where=f"{name}, {where}" if where else name, got=got, hint=hint)
 
-    def _died(self, worker: _Worker, when: str) -> SimulationError:
-        """Why the process is gone, in words."""
-        until = time.monotonic() + 2.0
-        while not (ended := os.wait4(worker.process.pid, os.WNOHANG))[0]:
-            if time.monotonic() > until:  # alive, but it has closed its pipes
-                worker.process.kill()
-            time.sleep(0.002)
-        _, status, usage = ended
-        worker.process.returncode = code = os.waitstatus_to_exitcode(status)
+    def _died(self, worker: _Worker, when: str, code: int, peak: int) -> SimulationError:
+        """How the FMU ended its process, in words. peak: the most bytes it had."""
         how = _signal(-code) if code < 0 else f"it ended itself with exit code {code} and no result"
         limit = self.limits.memory
-        if limit is not None and usage.ru_maxrss * 1024 > 0.8 * limit:
+        if limit is not None and peak > worker.resident + 0.7 * limit:
             how += f"; it had used all of its {limit / 2**20:.0f} MiB of memory"
         said = self._said(worker)
         self._end(worker)
         return self._error(f"the FMU crashed {when}: {how}", got=f"the FMU said: {said}" if said else "")
+
+    def _lost(self, worker: _Worker, when: str) -> SimulationError:
+        """The worker itself is gone: it was killed from outside, or could not begin."""
+        said = self._said(worker)
+        self._end(worker)
+        code = worker.process.returncode
+        return self._error(f"the FMU's worker ended {when}, exit code {code}", got=f"it said: {said}" if said else "")
 
     def _said(self, worker: _Worker) -> str:
         """The last line the process wrote."""
@@ -191,7 +197,7 @@ class Host:
             worker.requests.send_bytes(pickle.dumps(self.description))
             self._heard(worker, self.limits.load, "loading")
         except OSError:
-            self._useless = self._died(worker, "in the loading")
+            self._useless = self._lost(worker, "in the loading")
             raise self._useless from None
         except SimulationError as e:
             self._end(worker)
@@ -224,7 +230,10 @@ def _close(worker: _Worker) -> None:
     for end in (worker.requests, worker.answers, worker.said):
         with contextlib.suppress(OSError):
             end.close()
-    if worker.owner == os.getpid() and worker.process.returncode is None:
+    if worker.owner == os.getpid() and worker.process.poll() is None:
+        if worker.child:
+            with contextlib.suppress(OSError):
+                os.kill(worker.child, signal.SIGKILL)
         worker.process.kill()
         worker.process.wait()
 

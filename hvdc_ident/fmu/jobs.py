@@ -51,7 +51,7 @@ class Jobs:
         found = {"x": point.x, "slopes": slopes, "outputs": outputs}
         if not heading["jacobian"]:
             return {}, found
-        d = point.derivatives(heading["parameters"], heading["sizes"])
+        d = point.derivatives(heading["parameters"], heading["sizes"], check=heading["check"])
         return {"error": d.error, "near": d.near}, {
             **found, "jacobian": d.matrix, "directional": d.directional.astype(float), "nominals": self.plant.nominals()
         }  # fmt: skip
@@ -122,13 +122,14 @@ class _Simulation:
     def _run(self, values: Mapping[str, float], signals: Signals | None = None) -> Array:
         """(n, outputs) of a run without derivatives, checked to be finite."""
         moved = self.signals if signals is None else signals
+        counts = self.counts if values is self.values and moved is self.signals else exchange.Counts()
         if self.plant.binding.exchange:
-            run = exchange.Run(self.plant, moved, self.time, self.names, self.tolerance, counts=self.counts)
+            run = exchange.Run(self.plant, moved, self.time, self.names, self.tolerance, counts=counts)
             run.go(values)
             outputs = run.outputs
         else:
             outputs = co_simulation.run(self.plant, values, moved, self.time, self.names, self.tolerance)
-            self.counts.segments += 1
+            counts.segments += 1
         bad = ~np.isfinite(outputs).all(axis=0)
         if bad.any():
             row = int(np.flatnonzero(~np.isfinite(outputs).all(axis=1))[0])

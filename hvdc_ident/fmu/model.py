@@ -172,6 +172,7 @@ def read_fmu(source: str | Path, *, interface: Interface | None = None, limits: 
     if None in starts.values():
         read = host.ask({"do": "starts"}, {})[1]["parameters"].tolist()
         starts = {n: s if s is not None else r for (n, s), r in zip(starts.items(), read, strict=True)}
+        host.close()  # the next worker knows the starts
         host.description = replace(
             found,
             parameters=FrozenMap({n: replace(v, start=starts[n]) for n, v in found.parameters.items()}),

@@ -35,6 +35,7 @@ class Plant:
         self._running = False
         self._first: tuple[dict[str, float], Array, float, Array] | None = None
         self.keeps: bool | None = None
+        self.agreed = False  # whether directional derivatives agreed with differences where last compared
         self.next_time: float | None = None
 
     def block(self, names: tuple[str, ...]) -> Block:

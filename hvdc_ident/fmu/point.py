@@ -44,10 +44,13 @@ def at_point(
     outputs: Sequence[str],
     parameters: Sequence[str] = (),
     time: float = 0.0,
+    *,
+    check: bool = True,
 ) -> FmuPoint:
     """The FMU at values of parameters and inputs; states None: where its own initialisation puts them.
 
-    parameters: those the Jacobian has columns for. Raises ModelError where it has no equations, SimulationError where
+    parameters: those the Jacobian has columns for. check: whether directional derivatives that once agreed with
+    differences are compared again. Raises ModelError where it has no equations, SimulationError where
     it cannot be evaluated.
     """
     if not model.has_equations:
@@ -63,6 +66,7 @@ def at_point(
         "time": time,
         "outputs": list(outputs),
         "jacobian": True,
+        "check": check,
         "parameters": list(parameters),
         "sizes": about(model, parameters)["sizes"],
     }

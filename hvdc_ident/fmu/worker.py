@@ -1,7 +1,8 @@
-"""The process that has an FMU's machine code in it: `python -m hvdc_ident.fmu.worker IN OUT`, numbers of two pipes.
+"""The processes that have to do with an FMU's machine code: `python -m hvdc_ident.fmu.worker IN OUT`, numbers of pipes.
 
-It is started and watched by `hvdc_ident.fmu.host`. Whatever the FMU prints goes to stderr, whose end the host quotes
-where the process dies.
+The one that `hvdc_ident.fmu.host` starts forks: the child loads the FMU and answers, the parent waits for its end and
+tells it with the memory it had used, which the system says of a forked process alone. Whatever the FMU prints goes to
+stderr, whose end the host quotes where it dies.
 """
 
 from __future__ import annotations
@@ -17,28 +18,45 @@ from typing import Any
 
 
 def main() -> None:
-    """Nothing; requests are answered until the pipe closes."""
+    """Nothing; requests are answered until the pipe closes or the FMU ends its process."""
     inward, outward = int(sys.argv[1]), int(sys.argv[2])
     requests = Connection(inward, writable=False)
     answers = Connection(outward, readable=False)
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(EOFError, OSError):
-        _serve(requests, answers)
+        _begin(requests, answers)
     os._exit(0)  # an FMU's library may hang in its own clean-up
 
 
-def _serve(requests: Connection, answers: Connection) -> None:
+def _begin(requests: Connection, answers: Connection) -> None:
     import pickle
 
     from hvdc_ident.fmu.messages import packed, unpacked
 
     heading, _ = unpacked(requests.recv_bytes())
-    description = pickle.loads(requests.recv_bytes())  # from the parent, which is trusted
-    _limit(heading["parent"], heading["memory"])
-    jobs = _guarded(
-        answers, lambda: _loaded(description, heading["folder"], lambda: answers.send_bytes(packed({"more": 1})))
-    )
+    description = pickle.loads(requests.recv_bytes())  # from the host, which is trusted
+    import hvdc_ident.fmu.jobs  # noqa: F401 - what is loaded later would count as the FMU's memory
+
+    if description.interface == "model-exchange":
+        import scipy.integrate  # noqa: F401
+    child = os.fork()
+    if child == 0:
+        _limit(heading["memory"])
+        answers.send_bytes(packed({"more": 1, "resident": _resident()}))
+        _serve(requests, answers, description, heading["folder"])
+        return
+    requests.close()
+    threading.Thread(target=_watch, args=(heading["parent"], child), daemon=True).start()
+    answers.send_bytes(packed({"more": 1, "child": child}))
+    _, status, usage = os.wait4(child, 0)
+    answers.send_bytes(packed({"ended": os.waitstatus_to_exitcode(status), "peak": usage.ru_maxrss * 1024}))
+
+
+def _serve(requests: Connection, answers: Connection, description: Any, folder: str) -> None:
+    from hvdc_ident.fmu.messages import packed, unpacked
+
+    jobs = _guarded(answers, lambda: _loaded(description, folder, lambda: answers.send_bytes(packed({"more": 1}))))
     if jobs is None:
         return
     answers.send_bytes(packed({"done": 1}))
@@ -89,14 +107,11 @@ def _guarded(answers: Connection, work: Any, jobs: Any = None) -> Any:
     return None
 
 
-def _limit(parent: int, memory: int | None) -> None:
-    """Nothing; the process ends with its parent and may take so many bytes more than it has now."""
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+def _limit(memory: int | None) -> None:
+    """Nothing; the process may take so many bytes more than it has now, and leaves no core file."""
     if memory is not None:
         with contextlib.suppress(ImportError, OSError, ValueError):
             import resource
-
-            import scipy.integrate  # noqa: F401 - what is loaded later would count as the FMU's
 
             with open("/proc/self/statm", encoding="ascii") as sizes:
                 now = int(sizes.read().split()[0]) * resource.getpagesize()
@@ -107,10 +122,12 @@ def _limit(parent: int, memory: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _watch(parent: int) -> None:
-    """Nothing; the process ends soon after its parent, even where the FMU hangs."""
+def _watch(parent: int, child: int) -> None:
+    """Nothing; both processes end soon after the host, even where the FMU hangs."""
     while os.getppid() == parent:
         time.sleep(1.0)
+    with contextlib.suppress(OSError):
+        os.kill(child, signal.SIGKILL)
     os._exit(0)
 
 

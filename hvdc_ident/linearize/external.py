@@ -149,7 +149,7 @@ class _Search:
         return np.concatenate([p.slopes[rows], shown]), p.jacobian[np.ix_([*rows, *lower], columns)]
 
     def _evaluate(self, values: Mapping[str, float], x: Array | None) -> FmuPoint:
-        return at_point(self.model, values, x, self.outputs, self.free_parameters, self.time)
+        return at_point(self.model, values, x, self.outputs, self.free_parameters, self.time, check=False)
 
     def _not_found(self, residual: Array, shares: Array) -> SteadyStateError:
         names = [*(f"d({n})/dt" for n in self.rest), *(f"output {n}" for n in self.wanted)]

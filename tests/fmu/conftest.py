@@ -1,0 +1,32 @@
+"""FMUs that many tests share, built once."""
+
+from __future__ import annotations
+
+import pytest
+from c_fmu import COMPILER, build
+
+from hvdc_ident.fmu.host import Limits
+from hvdc_ident.fmu.model import read_fmu
+
+QUICK = Limits(deadline=1.0, load=30.0, memory=128 * 2**20)
+"""A hang costs a second, a leak 128 MiB."""
+PATIENT = Limits(deadline=60.0, load=60.0, memory=128 * 2**20)
+"""For what ends by itself, however slowly."""
+
+
+@pytest.fixture(scope="session")
+def fmu(tmp_path_factory):
+    """load(model, version=2, interface=None, limits=None): the model of an FMU written in C, loaded once."""
+    if COMPILER is None:
+        pytest.skip("no C compiler here: FMUs written in C cannot be built")
+    folder, kept = tmp_path_factory.mktemp("fmus"), {}
+
+    def load(model, version=2, interface=None, limits=None):
+        key = (model.name, version, interface, limits)
+        if key not in kept:
+            kept[key] = read_fmu(build(model, folder, version), interface=interface, limits=limits or Limits())
+        return kept[key]
+
+    yield load
+    for model in kept.values():
+        model.host.close()

@@ -1,0 +1,202 @@
+/* The calls of FMI 2.0 or 3.0 around a small model. The model defines, before this file is included:
+   NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
+   faults AT_INSTANTIATE, AT_STEP, AT_SLOPES, AT_RESET. States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+typedef void *Instance;
+typedef struct { double r[NR]; double t, next; int timed; void (*log)(); void *env; } Model;
+#define M ((Model *)c)
+#define N (NX > 0 ? NX : 1)
+
+static void fresh(Model *m) {
+    m->t = 0; m->timed = 0; m->next = 0;
+    memset(m->r, 0, sizeof m->r);
+    start(m->r);
+}
+static void slopes(Model *m) { equations(m->r, m->t); }
+static int get(Model *m, const unsigned *v, size_t n, double *x) {
+    slopes(m);
+    for (size_t i = 0; i < n; i++) x[i] = m->r[v[i]];
+    return 0;
+}
+static int set(Model *m, const unsigned *v, size_t n, const double *x) {
+    for (size_t i = 0; i < n; i++) m->r[v[i]] = x[i];
+    return 0;
+}
+static int update(Model *m, int *changed, int *timed, double *next) {
+    *changed = 0;
+#ifdef EVENT
+    slopes(m);
+    *changed = EVENT(m->r, m->t, &m->next, &m->timed);
+#endif
+    *timed = m->timed; *next = m->next;
+    return 0;
+}
+/* Directional derivatives by complex-free central differences of exact code: tiny models, so h can be generous. */
+static int directional(Model *m, const unsigned *un, size_t nu, const unsigned *kn, size_t nk, const double *seed, double *out) {
+#ifdef DIRECTIONAL
+    return DIRECTIONAL(m, un, nu, kn, nk, seed, out);
+#else
+    return 3;
+#endif
+}
+static int substeps(Model *m, double h) { /* classical Runge-Kutta, 20 substeps; a crossing is settled at its end */
+    double x[N], k[4][N]; int n = 20; double d = h / n;
+#ifdef AT_STEP
+    AT_STEP(m->r);
+#endif
+    for (int s = 0; s < n; s++) {
+        memcpy(x, m->r, sizeof(double) * NX);
+        for (int j = 0; j < 4; j++) {
+            slopes(m);
+            for (int i = 0; i < NX; i++) k[j][i] = m->r[NX + i];
+            double w = j < 2 ? d / 2 : d;
+            if (j < 3) { for (int i = 0; i < NX; i++) m->r[i] = x[i] + w * k[j][i]; if (j != 1) m->t += d / 2; }
+        }
+        for (int i = 0; i < NX; i++) m->r[i] = x[i] + d / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+#ifdef EVENT
+        int timed, changed; double next; update(m, &changed, &timed, &next);
+#endif
+    }
+    return 0;
+}
+
+#if FMI == 2
+typedef struct { void (*logger)(); void *(*allocate)(); void (*release)(); void *finished; void *env; } Calls;
+typedef struct { int again, end, nominals, values, defined; double next; } Info;
+const char *fmi2GetTypesPlatform(void) { return "default"; }
+const char *fmi2GetVersion(void) { return "2.0"; }
+int fmi2SetDebugLogging(Instance c, int on, size_t n, const char *const *k) { return 0; }
+Instance fmi2Instantiate(const char *name, int type, const char *guid, const char *where, const Calls *f, int visible, int log) {
+    if (strcmp(guid, "{token}")) { f->logger(f->env, name, 3, "error", "the GUID is not that of this model"); return 0; }
+#ifdef AT_INSTANTIATE
+    AT_INSTANTIATE;
+#endif
+    Model *m = malloc(sizeof *m); m->log = f->logger; m->env = f->env; fresh(m); return m;
+}
+void fmi2FreeInstance(Instance c) { free(c); }
+int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double end) { M->t = t; return 0; }
+int fmi2EnterInitializationMode(Instance c) { return 0; }
+int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
+int fmi2Terminate(Instance c) { return 0; }
+int fmi2Reset(Instance c) {
+#ifdef AT_RESET
+    AT_RESET;
+#endif
+    fresh(M); return 0;
+}
+int fmi2GetReal(Instance c, const unsigned *v, size_t n, double *x) { return get(M, v, n, x); }
+int fmi2SetReal(Instance c, const unsigned *v, size_t n, const double *x) { return set(M, v, n, x); }
+int fmi2GetInteger(Instance c, const unsigned *v, size_t n, int *x) { for (size_t i = 0; i < n; i++) x[i] = (int)M->r[v[i]]; return 0; }
+int fmi2SetInteger(Instance c, const unsigned *v, size_t n, const int *x) { for (size_t i = 0; i < n; i++) M->r[v[i]] = x[i]; return 0; }
+int fmi2GetBoolean(Instance c, const unsigned *v, size_t n, int *x) { return fmi2GetInteger(c, v, n, x); }
+int fmi2SetBoolean(Instance c, const unsigned *v, size_t n, const int *x) { return fmi2SetInteger(c, v, n, x); }
+int fmi2EnterEventMode(Instance c) { return 0; }
+int fmi2NewDiscreteStates(Instance c, Info *e) {
+    memset(e, 0, sizeof *e);
+    update(M, &e->values, &e->defined, &e->next);
+#ifdef AGAIN
+    e->again = AGAIN(M->r);
+#endif
+    return 0;
+}
+int fmi2EnterContinuousTimeMode(Instance c) { return 0; }
+int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { *e = 0; *end = 0; return 0; }
+int fmi2SetTime(Instance c, double t) { M->t = t; return 0; }
+int fmi2SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
+int fmi2GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
+int fmi2GetDerivatives(Instance c, double *x, size_t n) {
+#ifdef AT_SLOPES
+    AT_SLOPES(M->r);
+#endif
+    slopes(M); memcpy(x, M->r + NX, n * sizeof(double)); return 0;
+}
+int fmi2GetEventIndicators(Instance c, double *z, size_t n) {
+#ifdef INDICATORS
+    slopes(M); INDICATORS(M->r, M->t, z);
+#endif
+    return 0;
+}
+int fmi2GetNominalsOfContinuousStates(Instance c, double *x, size_t n) {
+    for (size_t i = 0; i < n; i++) x[i] = NOMINAL; return 0; }
+int fmi2GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const unsigned *k, size_t nk, const double *s, double *o) {
+    return directional(M, u, nu, k, nk, s, o); }
+int fmi2DoStep(Instance c, double t, double h, int p) { M->t = t; int s = substeps(M, h); M->t = t + h; return s; }
+int fmi2SetRealInputDerivatives(Instance c, const unsigned *v, size_t n, const int *o, const double *x) { return 3; }
+#define UNUSED(f) int f(void) { return 3; }
+UNUSED(fmi2GetString) UNUSED(fmi2SetString) UNUSED(fmi2GetFMUstate) UNUSED(fmi2SetFMUstate) UNUSED(fmi2FreeFMUstate)
+UNUSED(fmi2SerializedFMUstateSize) UNUSED(fmi2SerializeFMUstate) UNUSED(fmi2DeSerializeFMUstate)
+UNUSED(fmi2GetRealOutputDerivatives) UNUSED(fmi2CancelStep) UNUSED(fmi2GetStatus) UNUSED(fmi2GetRealStatus)
+UNUSED(fmi2GetIntegerStatus) UNUSED(fmi2GetBooleanStatus) UNUSED(fmi2GetStringStatus)
+#else
+#include <stdbool.h>
+const char *fmi3GetVersion(void) { return "3.0"; }
+int fmi3SetDebugLogging(Instance c, bool on, size_t n, const char *const *k) { return 0; }
+static Instance made(const char *token, void *env, void (*log)()) {
+    if (strcmp(token, "{token}")) { ((void (*)(void *, int, const char *, const char *))log)(env, 3, "error", "the token is not that of this model"); return 0; }
+#ifdef AT_INSTANTIATE
+    AT_INSTANTIATE;
+#endif
+    Model *m = malloc(sizeof *m); m->log = log; m->env = env; fresh(m); return m;
+}
+Instance fmi3InstantiateModelExchange(const char *n, const char *token, const char *p, bool v, bool l, void *env, void (*log)()) { return made(token, env, log); }
+Instance fmi3InstantiateCoSimulation(const char *n, const char *token, const char *p, bool v, bool l, bool e, bool r, const unsigned *q, size_t nq, void *env, void (*log)(), void (*i)()) { return made(token, env, log); }
+void fmi3FreeInstance(Instance c) { free(c); }
+int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { M->t = t; return 0; }
+int fmi3ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
+int fmi3EnterEventMode(Instance c) { return 0; }
+int fmi3Terminate(Instance c) { return 0; }
+int fmi3Reset(Instance c) { fresh(M); return 0; }
+int fmi3GetFloat64(Instance c, const unsigned *v, size_t n, double *x, size_t m) { return get(M, v, n, x); }
+int fmi3SetFloat64(Instance c, const unsigned *v, size_t n, const double *x, size_t m) { return set(M, v, n, x); }
+int fmi3GetInt32(Instance c, const unsigned *v, size_t n, int *x, size_t m) { for (size_t i = 0; i < n; i++) x[i] = (int)M->r[v[i]]; return 0; }
+int fmi3SetInt32(Instance c, const unsigned *v, size_t n, const int *x, size_t m) { for (size_t i = 0; i < n; i++) M->r[v[i]] = x[i]; return 0; }
+int fmi3GetBoolean(Instance c, const unsigned *v, size_t n, bool *x, size_t m) { for (size_t i = 0; i < n; i++) x[i] = M->r[v[i]] != 0; return 0; }
+int fmi3SetBoolean(Instance c, const unsigned *v, size_t n, const bool *x, size_t m) { for (size_t i = 0; i < n; i++) M->r[v[i]] = x[i]; return 0; }
+int fmi3UpdateDiscreteStates(Instance c, bool *again, bool *end, bool *nominals, bool *values, bool *defined, double *next) {
+    int changed, timed; update(M, &changed, &timed, next);
+    *again = *end = *nominals = false; *values = changed; *defined = timed; return 0;
+}
+int fmi3EnterContinuousTimeMode(Instance c) { return 0; }
+int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { *e = *end = false; return 0; }
+int fmi3SetTime(Instance c, double t) { M->t = t; return 0; }
+int fmi3SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
+int fmi3GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
+int fmi3GetContinuousStateDerivatives(Instance c, double *x, size_t n) {
+#ifdef AT_SLOPES
+    AT_SLOPES(M->r);
+#endif
+    slopes(M); memcpy(x, M->r + NX, n * sizeof(double)); return 0;
+}
+int fmi3GetEventIndicators(Instance c, double *z, size_t n) {
+#ifdef INDICATORS
+    slopes(M); INDICATORS(M->r, M->t, z);
+#endif
+    return 0;
+}
+int fmi3GetNominalsOfContinuousStates(Instance c, double *x, size_t n) { for (size_t i = 0; i < n; i++) x[i] = NOMINAL; return 0; }
+int fmi3GetNumberOfEventIndicators(Instance c, size_t *n) { *n = NZ; return 0; }
+int fmi3GetNumberOfContinuousStates(Instance c, size_t *n) { *n = NX; return 0; }
+int fmi3GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const unsigned *k, size_t nk, const double *s, size_t ns, double *o, size_t no) {
+    return directional(M, u, nu, k, nk, s, o); }
+int fmi3EnterStepMode(Instance c) { return 0; }
+int fmi3DoStep(Instance c, double t, double h, bool p, bool *event, bool *end, bool *early, double *reached) {
+    M->t = t; int s = substeps(M, h); M->t = t + h; *event = *end = *early = false; *reached = t + h; return s; }
+#define UNUSED(f) int f(void) { return 3; }
+UNUSED(fmi3InstantiateScheduledExecution) UNUSED(fmi3GetFloat32) UNUSED(fmi3GetInt8) UNUSED(fmi3GetUInt8)
+UNUSED(fmi3GetInt16) UNUSED(fmi3GetUInt16) UNUSED(fmi3GetUInt32) UNUSED(fmi3GetInt64) UNUSED(fmi3GetUInt64)
+UNUSED(fmi3GetString) UNUSED(fmi3GetBinary) UNUSED(fmi3GetClock) UNUSED(fmi3SetFloat32) UNUSED(fmi3SetInt8)
+UNUSED(fmi3SetUInt8) UNUSED(fmi3SetInt16) UNUSED(fmi3SetUInt16) UNUSED(fmi3SetUInt32) UNUSED(fmi3SetInt64)
+UNUSED(fmi3SetUInt64) UNUSED(fmi3SetString) UNUSED(fmi3SetBinary) UNUSED(fmi3SetClock)
+UNUSED(fmi3GetNumberOfVariableDependencies) UNUSED(fmi3GetVariableDependencies) UNUSED(fmi3GetFMUState)
+UNUSED(fmi3SetFMUState) UNUSED(fmi3FreeFMUState) UNUSED(fmi3SerializedFMUStateSize) UNUSED(fmi3SerializeFMUState)
+UNUSED(fmi3DeserializeFMUState) UNUSED(fmi3GetAdjointDerivative) UNUSED(fmi3EnterConfigurationMode)
+UNUSED(fmi3ExitConfigurationMode) UNUSED(fmi3GetIntervalDecimal) UNUSED(fmi3GetIntervalFraction)
+UNUSED(fmi3GetShiftDecimal) UNUSED(fmi3GetShiftFraction) UNUSED(fmi3SetIntervalDecimal) UNUSED(fmi3SetIntervalFraction)
+UNUSED(fmi3SetShiftDecimal) UNUSED(fmi3SetShiftFraction) UNUSED(fmi3EvaluateDiscreteStates)
+UNUSED(fmi3GetOutputDerivatives) UNUSED(fmi3ActivateModelPartition)
+#endif

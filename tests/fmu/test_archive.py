@@ -1,0 +1,196 @@
+"""Archives and descriptions that are refused before anything of them is unpacked or run."""
+
+from __future__ import annotations
+
+import stat
+import zipfile
+
+import pytest
+from c_fmu import CModel, Var, description
+from fmpy import platform, platform_tuple, sharedLibraryExtension
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hvdc_ident import load_model
+from hvdc_ident.errors import InputError, ModelError
+from hvdc_ident.fmu import archive as checks
+from hvdc_ident.fmu.description import read_description
+
+PLAIN = CModel(
+    "lag",
+    "",
+    (
+        Var("x", 0),
+        Var("der(x)", 1, more=(("derivative", "x"),)),
+        Var("T", 2, "parameter", "tunable", (("start", "0.1"),)),
+        Var("u", 3, "input", more=(("start", "0"),)),
+        Var("y", 0, "output"),
+    ),
+)
+
+
+def binary(version=2, name="lag"):
+    folder = platform if version == 2 else platform_tuple
+    return f"binaries/{folder}/{name}{sharedLibraryExtension}"
+
+
+def written(path, text=None, *, version=2, entries=(), name="lag"):
+    """An FMU whose binary is no library; entries: further (ZipInfo or name, bytes)."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as z:
+        if text is not False:
+            z.writestr("modelDescription.xml", text if text is not None else description(PLAIN, version))
+        z.writestr(binary(version, name), b"no library")
+        for entry, content in entries:
+            z.writestr(entry, content)
+    return path
+
+
+def link():
+    entry = zipfile.ZipInfo("resources/link")
+    entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+    return entry
+
+
+def pipe():
+    entry = zipfile.ZipInfo("resources/pipe")
+    entry.external_attr = (stat.S_IFIFO | 0o600) << 16
+    return entry
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("../escape.txt", "leads out of it"),
+        ("resources/../../escape.txt", "leads out of it"),
+        ("/etc/escape", "leads out of it"),
+        ("C:/escape", "leads out of it"),
+        ("resources\\..\\..\\escape", "leads out of it"),
+        (link(), "is a link"),
+        (pipe(), "neither a file nor a folder"),
+    ],
+)
+def test_entries_that_are_refused(tmp_path, entry, message):
+    path = written(tmp_path / "a.fmu", entries=[(entry, b"x")])
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ModelError, match=message):
+        load_model(path)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_sizes_that_are_refused(tmp_path, monkeypatch):
+    bomb = written(tmp_path / "bomb.fmu", entries=[("resources/zeros", bytes(8 * 2**20))])
+    with pytest.raises(ModelError, match="zip bomb"):
+        load_model(bomb)
+    monkeypatch.setattr(checks, "MOST_BYTES", 1000)
+    with pytest.raises(ModelError, match="unpacks to too much"):
+        load_model(written(tmp_path / "big.fmu"))
+    monkeypatch.undo()
+    many = written(tmp_path / "many.fmu", entries=[(f"resources/{k}", b"") for k in range(checks.MOST_ENTRIES)])
+    with pytest.raises(ModelError, match="too many files"):
+        load_model(many)
+    assert (checks.MOST_BYTES, checks.MOST_RATIO, checks.MOST_ENTRIES) == (2**30, 200, 10_000)
+
+
+def test_the_xml_is_well_formed_and_has_no_doctype(tmp_path):
+    bomb = '<?xml version="1.0"?><!DOCTYPE b [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><fmiModelDescription>&b;</fmiModelDescription>'
+    outer = '<?xml version="1.0"?><!DOCTYPE x SYSTEM "file:///etc/passwd"><fmiModelDescription/>'
+    for text in (bomb, outer, bomb.encode("utf-16").decode("utf-16").encode("utf-16")):
+        with pytest.raises(ModelError, match="DOCTYPE"):
+            load_model(written(tmp_path / "a.fmu", text))
+    with pytest.raises(ModelError, match="not well-formed"):
+        load_model(written(tmp_path / "b.fmu", "<fmiModelDescription>"))
+    built = written(tmp_path / "c.fmu", version=3, entries=[("sources/buildDescription.xml", bomb)])
+    with pytest.raises(ModelError, match=r"buildDescription.*DOCTYPE"):
+        load_model(built)
+
+
+@pytest.mark.parametrize("name", ["../lag", "a/b", "", "9lag", "lag.so", "la g", "..\\lag"])
+def test_the_model_identifier_is_an_identifier(tmp_path, name):
+    text = description(PLAIN, 2).replace('modelIdentifier="lag"', f'modelIdentifier="{name}"')
+    with pytest.raises(ModelError, match="model identifier"):
+        load_model(written(tmp_path / "a.fmu", text))
+
+
+def test_files_that_are_no_fmu(tmp_path):
+    with pytest.raises(ModelError, match="not there"):
+        load_model(tmp_path / "none.fmu")
+    (tmp_path / "text.fmu").write_text("no archive")
+    with pytest.raises(ModelError, match="no zip archive"):
+        load_model(tmp_path / "text.fmu")
+    with pytest.raises(ModelError, match="no FMU"):
+        load_model(written(tmp_path / "a.fmu", False))
+    whole = written(tmp_path / "b.fmu").read_bytes()
+    (tmp_path / "cut.fmu").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ModelError, match="no zip archive"):
+        load_model(tmp_path / "cut.fmu")
+    with pytest.raises(ModelError, match="two files of one name"), pytest.warns(UserWarning, match="Duplicate"):
+        load_model(written(tmp_path / "c.fmu", entries=[(binary(), b"again")]))
+
+
+def test_binaries_that_are_not_there(tmp_path):
+    with pytest.raises(ModelError, match=r"no binary for this machine.*got win64"):
+        path = tmp_path / "a.fmu"
+        with zipfile.ZipFile(path, "w") as z:
+            z.writestr("modelDescription.xml", description(PLAIN, 2))
+            z.writestr("binaries/win64/lag.dll", b"")
+        load_model(path)
+    with pytest.raises(ModelError, match=r"got C sources only.*compiled for this machine"):
+        path = tmp_path / "b.fmu"
+        with zipfile.ZipFile(path, "w") as z:
+            z.writestr("modelDescription.xml", description(PLAIN, 2))
+            z.writestr("sources/lag.c", b"")
+        load_model(path)
+
+
+def test_what_fmi_has_and_this_has_not(tmp_path):
+    three = description(PLAIN, 3)
+    array = three.replace('start="0.1"/>', 'start="1 2"><Dimension start="2"/></Float64>').replace(
+        '<Float64 name="T"', '<Float64 name="T"'
+    )
+    with pytest.raises(ModelError, match=r"variable 'T': the FMU has an array.*scalar"):
+        load_model(written(tmp_path / "a.fmu", array, version=3))
+    clock = three.replace(
+        "</ModelVariables>",
+        '<Clock name="tick" valueReference="77" causality="input" variability="discrete" intervalVariability="constant"/></ModelVariables>',
+    )
+    with pytest.raises(ModelError, match=r"'tick': the FMU has clocks"):
+        load_model(written(tmp_path / "b.fmu", clock, version=3))
+    one = description(PLAIN, 2).replace('fmiVersion="2.0"', 'fmiVersion="1.0"')
+    with pytest.raises(ModelError, match=r"FMI 2\.0 or 3\.0|cannot be used|makes no sense"):
+        load_model(written(tmp_path / "c.fmu", one))
+    only = description(PLAIN, 2).replace(
+        '<CoSimulation modelIdentifier="lag" canHandleVariableCommunicationStepSize="true"/>', ""
+    )
+    with pytest.raises(ModelError, match="does not offer"):
+        load_model(written(tmp_path / "d.fmu", only), interface="co-simulation")
+    stray = description(PLAIN, 2).replace(' derivative="1"', "")
+    with pytest.raises(ModelError, match="of which state"):
+        load_model(
+            written(
+                tmp_path / "e.fmu",
+                stray.replace("<Derivatives></Derivatives>", '<Derivatives><Unknown index="2"/></Derivatives>'),
+            )
+        )
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_what_is_read(tmp_path, version):
+    found = read_description(written(tmp_path / "a.fmu", version=version))
+    assert (found.version, found.interface, found.identifier) == (version, "model-exchange", "lag")
+    assert list(found.states) == ["x"] and found.derivatives == (1,)
+    assert found.parameters["T"].start == 0.1 and found.parameters["T"].tunable
+    assert list(found.outputs) == ["y"] and list(found.inputs) == ["u"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(place=st.integers(0, 10_000), byte=st.integers(0, 255), cut=st.booleans())
+def test_a_damaged_file_is_read_or_refused_with_a_reason(tmp_path_factory, place, byte, cut):
+    path = tmp_path_factory.mktemp("f") / "a.fmu"
+    whole = bytearray(written(path).read_bytes())
+    at = place % len(whole)
+    whole[at] = byte
+    path.write_bytes(whole[: at + 1] if cut else whole)
+    try:
+        load_model(path)
+    except InputError as e:
+        assert str(path) in str(e)

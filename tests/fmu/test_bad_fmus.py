@@ -1,0 +1,147 @@
+"""FMUs that crash, hang, leave, lie or eat: each is one clear error, and a sweep keeps every other point."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from c_fmu import FOLDER, build, needs_compiler
+from c_models import FAULTS, FAULTY, FAULTY_VARIABLES, broken
+from conftest import PATIENT, QUICK
+
+from hvdc_ident import load_model, simulate, sweep
+from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fmu.model import read_fmu
+
+pytestmark = needs_compiler
+
+TIME = np.linspace(0.0, 0.5, 26)
+STEP = experiment("step", TIME, {"u": InputSignal.step(0.1, 0.0, 1.0)})
+REASONS = {
+    1: r"crashed in the run: its process was ended by SIGSEGV",
+    2: r"hangs: no result of the run after 1 s",
+    3: r"crashed in the run: it ended itself with exit code 0 and no result",
+    4: r"used all of its 128 MiB of memory",
+    5: r"output 'out' is not finite",
+    6: r"(fmi2DoStep|fmi2GetDerivatives) returned error",
+    7: r"crashed in the run: its process was ended by SIGABRT",
+    8: r"(fmi2DoStep|fmi2GetDerivatives) returned fatal",
+}
+
+
+def answer(t, lag=0.1):
+    return np.where(t < 0.1, 0.0, 1.0 - np.exp(-(t - 0.1) / lag))
+
+
+@pytest.mark.parametrize("interface", ["model-exchange", "co-simulation"])
+@pytest.mark.parametrize("fault", FAULTS, ids=list(FAULTS.values()))
+def test_a_run_that_goes_wrong_says_why_and_the_next_goes_right(fmu, fault, interface):
+    model = fmu(FAULTY, 2, interface, QUICK if FAULTS[fault] == "hang" else PATIENT)
+    with pytest.raises(SimulationError, match=REASONS[fault]) as told:
+        simulate(model, STEP, {"fault": fault})
+    assert "faulty2.fmu" in str(told.value) and "\n" not in str(told.value)
+    assert np.abs(simulate(model, STEP)["out"] - answer(TIME)).max() < 1e-6
+
+
+def test_a_sweep_over_faults_keeps_every_other_point(fmu):
+    model = fmu(FAULTY, 2, "co-simulation", QUICK)
+    lags = [0.05, 0.1]
+    found = sweep(model, [STEP], {"fault": range(9), "T": lags}, against="base", outputs=["out"])
+    rows = list(found.rows())
+    assert len(rows) == 18
+    for row in rows:
+        fault, lag = int(row["values"]["fault"]), row["values"]["T"]
+        if fault:
+            assert row["status"] == "failed" and row["reason"]
+        else:
+            expected = np.sqrt(np.mean((answer(TIME, lag) - answer(TIME)) ** 2))
+            assert row["rmse"]["out"]["step"] == pytest.approx(expected, abs=1e-6)
+    reasons = {int(r["values"]["fault"]): r["reason"] for r in rows if r["values"]["T"] == 0.05}
+    for fault in FAULTS:  # on a busy computer the memory may not be full before the deadline
+        wanted = REASONS[fault] + (f"|{REASONS[2]}" if FAULTS[fault] == "endless memory" else "")
+        assert re.search(wanted, reasons[fault])
+
+
+def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
+    """Files that cannot be loaded: by name the path and what the error says."""
+    whole = build(FAULTY, folder)
+    library = f"binaries__{FOLDER[2]}__"
+
+    def made(name, model, **files):
+        return build(model, folder, 2, **files)
+
+    good = broken("whole")
+    from c_fmu import library as compiled
+
+    code = compiled(good.code, 2, 1, 0, ())
+    return {
+        "segfault": (made("segfault", broken("segfault", "*(volatile int *)0 = 1")), "SIGSEGV"),
+        "hang": (made("hang", broken("hang", "for (;;) usleep(1000)")), "hangs: no result of the loading"),
+        "exit": (made("exit", broken("leaves", "exit(0)")), "exit code 0 and no result"),
+        "abort": (made("abort", broken("aborts", "abort()")), "SIGABRT"),
+        "memory": (made("memory", broken("eats", "eat()")), "all of its 128 MiB of memory"),
+        "guid": (made("guid", broken("foreign", token="{other}")), "no instance: the GUID is not that of this model"),
+        "truncated": (
+            made("cut", broken("cut"), **{f"{library}cut.so": code[: len(code) // 3]}),
+            "load shared|SIGBUS",
+        ),
+        "no library": (made("text", broken("text"), **{f"{library}text.so": b"no library"}), "load shared"),
+        "no functions": (
+            made("empty", broken("empty"), **{f"{library}empty.so": compiled("", 0, 0, 0, ())}),
+            "undefined symbol",
+        ),
+        "null": (made("null", broken("null", "return 0")), "gave no instance"),
+    } | {"good": (whole, "")}
+
+
+def test_every_bad_file_is_one_error_and_those_after_it_run(tmp_path):
+    """A campaign over files, the good one last: what went before has left nothing behind."""
+    for name, (path, message) in bad_files(tmp_path).items():
+        model = read_fmu(path, interface="co-simulation", limits=replace(PATIENT, load=4.0 if name == "hang" else 60.0))
+        if name == "good":
+            assert np.abs(simulate(model, STEP)["out"] - answer(TIME)).max() < 1e-6
+            continue
+        with pytest.raises(ComputationError, match=message) as told:
+            simulate(model, STEP)
+        assert path.name in str(told.value)
+        with pytest.raises(ComputationError) as again:  # known by now: no second process is spent on it
+            simulate(model, STEP)
+        assert str(again.value) == str(told.value) and model.host.started == 1
+
+
+def test_wrong_names_and_values_are_wrong_input(fmu):
+    model = fmu(FAULTY, 2, "co-simulation", QUICK)
+    with pytest.raises(InputError, match=r"no parameter or input 'TT'.*did you mean 'T'"):
+        simulate(model, STEP, {"TT": 1.0})
+    with pytest.raises(InputError, match="no output 'nothing'"):
+        simulate(model, STEP, outputs=["nothing"])
+    with pytest.raises(ModelError, match="not finite"):
+        simulate(model, STEP, {"T": np.inf})
+    with pytest.raises(ModelError, match="outside its own bounds"):
+        model.with_values({"T": 0.0})
+    with pytest.raises(InputError, match="no parameterisation"):
+        model.parameterised("physical")
+    with pytest.raises(InputError, match="cannot be driven"):
+        simulate(model, STEP.with_(drive=("out",)))
+    assert FAULTY_VARIABLES[2].name == "T"
+
+
+def test_nothing_of_a_worker_stays(tmp_path):
+    """Its process, its folder and its pipes go with the model."""
+    model = load_model(build(FAULTY, tmp_path))
+    simulate(model, STEP)
+    host = model.host
+    process, folder = host._worker.process, host._folder
+    assert folder.is_dir() and process.poll() is None
+    before = len(os.listdir("/proc/self/fd"))
+    del model, host
+    import gc
+
+    gc.collect()
+    assert process.poll() is not None and not folder.exists()
+    assert len(os.listdir("/proc/self/fd")) < before

@@ -1,0 +1,98 @@
+"""Effects at the ends of an FMU against the same effects on the same model written in equations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from c_fmu import needs_compiler
+from c_models import FAULTY, spring
+
+from hvdc_ident import Model, simulate
+from hvdc_ident.errors import ModelError, UnknownNameError
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.frozen import FrozenMap
+
+pytestmark = needs_compiler
+
+TIME = np.linspace(0.0, 4.0, 201)
+RUN = experiment("run", TIME, {"u": InputSignal.corners([(0, 0.0), (1, 0.0), (1, 1.0), (2, 1.0), (2.5, -0.5)])})
+TWIN = Model(
+    name="twin",
+    parameters={"m": 2.0, "d": 0.5, "k": 8.0, "b": 0.25},
+    inputs={"u": 0.0},
+    states={"x": "v", "v": "(k*u - d*v - k*x)/m"},
+    outputs={"y": "x", "twice": "2*v + b"},
+)
+CASES = [
+    ([{"effect": "lag", "at": "u", "parameters": {"T": 0.2}}], ["lag_u_T"]),
+    ([{"effect": "lag", "at": "y", "parameters": {"T": 0.2}}], ["lag_y_T"]),
+    ([{"effect": "gain", "at": "y", "parameters": {"k": 1.1}}], ["gain_y_k"]),
+    ([{"effect": "offset", "at": "u", "parameters": {"c": 0.1}}], ["offset_u_c"]),
+    ([{"effect": "delay", "at": "u", "parameters": {"T": 0.13}}], ["delay_u_T"]),
+    ([{"effect": "delay", "at": ["y", "twice"], "parameters": {"T": 0.13}}], ["delay_y_T"]),
+    ([{"effect": "limit", "at": "u", "parameters": {"level": 0.6}}], ["limit_u_level"]),
+    ([{"effect": "second-order", "at": "y", "parameters": {"wn": 20.0, "zeta": 0.5}}], ["second_order_y_wn"]),
+    ([{"effect": "window-mean", "at": "y", "parameters": {"T": 0.1}}], ["window_mean_y_T"]),
+    (
+        [
+            {"effect": "lag", "at": ["u", "y"], "parameters": {"T": 0.1}},
+            {"effect": "gain", "at": "twice", "parameters": {"k": 0.9}},
+        ],
+        ["lag_u_T", "gain_twice_k"],
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("uses", "names"), CASES, ids=lambda c: "+".join(x["effect"] for x in c) if isinstance(c[0], dict) else ""
+)
+def test_runs_and_derivatives_agree_with_the_twin(fmu, uses, names):
+    model, twin = fmu(spring()).with_effects(uses), TWIN.with_effects(uses)
+    assert [n for n in model.parameters if n not in TWIN.parameters] == names[:1] + [
+        n for n in twin.parameters if n not in TWIN.parameters
+    ][1:]
+    found = simulate(model, RUN, {"d": 0.6}, ["k", *names])
+    wanted = simulate(twin, RUN, {"d": 0.6}, ["k", *names], rtol=1e-10)
+    for output in ("y", "twice"):
+        scale = np.ptp(wanted[output])
+        assert np.abs(found[output] - wanted[output]).max() < 2e-4 * scale
+        for j, name in enumerate(["k", *names]):
+            a, b = found.gradient(output)[:, j], wanted.gradient(output)[:, j]
+            assert np.sqrt(np.mean((a - b) ** 2)) < 5e-3 * np.sqrt(np.mean(b**2)) + 1e-6, name
+
+
+def test_a_recording_chain_is_an_effect_at_the_output(fmu):
+    chain = RUN.with_(instrument=FrozenMap({"y": FrozenMap({"window-mean": 0.1, "delay": 0.02})}))
+    found, wanted = simulate(fmu(spring()), chain), simulate(TWIN, chain)
+    assert np.abs(found["y"] - wanted["y"]).max() < 2e-4
+    assert np.abs(found["twice"] - wanted["twice"]).max() < 1e-6
+
+
+def test_an_offset_of_an_input_and_its_derivative(fmu):
+    moved = RUN.with_(offsets=FrozenMap({"u": 0.05}))
+    for interface in ("model-exchange", "co-simulation"):
+        found, wanted = simulate(fmu(spring(), 2, interface), moved, {}, ["u"]), simulate(TWIN, moved, {}, ["u"])
+        assert np.abs(found["y"] - wanted["y"]).max() < 3e-4  # co-simulation holds a ramp's mean over a row
+        assert np.abs(found.gradient("y") - wanted.gradient("y")).max() < 1e-4
+
+
+def test_neutral_effects_leave_the_model_as_it_is(fmu):
+    model = fmu(spring())
+    assert model.with_effects([{"effect": "lag", "at": "u", "parameters": {"T": 0.0}}]) is model
+
+
+def test_two_of_a_kind_have_names_of_their_own(fmu):
+    twice = [{"effect": "gain", "at": "y", "parameters": {"k": 1.1}}] * 2
+    model = fmu(spring()).with_effects(twice)
+    assert [n for n in model.parameters if n.startswith("gain")] == ["gain_y_k", "gain_y_2_k"]
+    plain = simulate(fmu(spring()), RUN)["y"]
+    assert simulate(model, RUN)["y"] == pytest.approx(1.21 * plain, abs=1e-5)
+
+
+def test_places_that_are_none(fmu):
+    with pytest.raises(UnknownNameError, match="closed inside: no slot 'x'"):
+        fmu(FAULTY).with_effects([{"effect": "lag", "at": "x"}])
+    with pytest.raises(UnknownNameError, match="no effect 'lagg'"):
+        fmu(spring()).with_effects([{"effect": "lagg", "at": "y"}])
+    with pytest.raises((ModelError, UnknownNameError)):
+        fmu(spring()).with_effects([{"effect": "lag", "at": "y", "parameters": {"TT": 1.0}}])

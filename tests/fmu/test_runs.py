@@ -1,0 +1,157 @@
+"""Runs against answers in closed form."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from c_fmu import build, needs_compiler
+from c_models import BALL, COUNTER, FAULTY, TRIANGLE, spring
+from scipy.signal import lsim
+
+from hvdc_ident import load_model, simulate
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fmu.host import Limits
+from hvdc_ident.fmu.model import read_fmu
+
+pytestmark = needs_compiler
+
+TIME = np.linspace(0.0, 5.0, 251)
+STEP = experiment("step", TIME, {"u": InputSignal.step(1.0, 0.0, 1.0)})
+BOTH = ["model-exchange", "co-simulation"]
+
+
+def response(t, m=2.0, d=0.5, k=8.0):
+    """The spring's step response from the step on."""
+    wn, zeta = np.sqrt(k / m), d / (2 * np.sqrt(k * m))
+    wd = wn * np.sqrt(1 - zeta**2)
+    s = np.maximum(t - 1.0, 0.0)
+    return np.where(t < 1.0, 0.0, 1 - np.exp(-zeta * wn * s) * (np.cos(wd * s) + zeta * wn / wd * np.sin(wd * s)))
+
+
+@pytest.mark.parametrize("interface", BOTH)
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_step_response(fmu, version, interface):
+    model = fmu(spring(), version, interface)
+    found = simulate(model, STEP)
+    assert np.abs(found["y"] - response(TIME)).max() < 2e-7
+    moved = simulate(model, STEP, {"m": 1.0, "d": 0.2, "k": 9.0})
+    assert np.abs(moved["y"] - response(TIME, 1.0, 0.2, 9.0)).max() < 2e-7
+    assert np.array_equal(simulate(model, STEP)["y"], found["y"])
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_what_is_taken_over(fmu, version):
+    model = fmu(spring(), version)
+    assert model.values == {"m": 2.0, "d": 0.5, "k": 8.0, "b": 0.25}  # k has no start: it is read from the FMU
+    assert model.parameters["m"].min == 0.1 and model.parameters["m"].unit == "kg"
+    assert model.parameters["k"].description == "(also stiffness)"
+    assert list(model.states) == ["x", "v"] and model.states["x"].nominal == 1.0  # 0 as it is given
+    assert model.slots == ("u", "y", "twice")
+    with pytest.raises(Exception, match="'stiffness' is another name of 'k'"):
+        model.with_values({"stiffness": 1.0})
+
+
+@pytest.mark.parametrize("interface", BOTH)
+def test_inputs_that_ramp_and_jump(fmu, interface):
+    """Against scipy's linear simulation on a grid of the same lines."""
+    model = fmu(spring(), 2, interface)
+    corners = [(0.0, 0.5), (1.0, 0.5), (2.0, 1.5), (2.5, 1.5), (2.5, -0.5), (4.0, -0.5)]
+    u = InputSignal.corners(corners)
+    found = simulate(model, experiment("corners", TIME, {"u": u}))
+    a, b = np.array([[0.0, 1.0], [-4.0, -0.25]]), np.array([[0.0], [4.0]])
+    state, rows = np.array([0.5, 0.0]), np.empty(TIME.size)
+    rows[0] = 0.5
+    for i in range(1, TIME.size):  # a jump lies on a row: each interval has one line
+        ends = np.array([u(TIME[i - 1]), u(np.nextafter(TIME[i], 0))], dtype=float)
+        state = lsim((a, b, np.eye(2), np.zeros((2, 1))), ends[:, None], TIME[i - 1 : i + 1] - TIME[i - 1], state)[2][
+            -1
+        ]
+        rows[i] = state[0]
+    assert np.abs(found["y"] - rows).max() < (1e-7 if interface == "model-exchange" else 1e-4)
+
+
+@pytest.mark.parametrize("interface", BOTH)
+def test_two_rows_at_one_instant_are_before_and_after_a_jump(fmu, interface):
+    model = fmu(FAULTY, 2, interface)
+    time = np.array([0.0, 0.1, 0.1, 0.3])
+    u = InputSignal.step(0.1, 0.0, 1.0)
+    found = simulate(model, experiment("jump", time, {"u": u}), outputs=["out"])
+    assert found["out"] == pytest.approx([0.0, 0.0, 0.0, 1 - np.exp(-2.0)], abs=1e-6)
+    start = simulate(model, experiment("at once", np.array([0.1, 0.2]), {"u": u}))
+    assert start["out"] == pytest.approx([0.0, 1 - np.exp(-1.0)], abs=1e-6)  # begins as before the jump
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_ball_bounces(fmu, version):
+    time = np.linspace(0.0, 2.0, 401)
+    found = simulate(fmu(BALL, version, "model-exchange"), experiment("fall", time))
+    t, v, begin, expected = np.sqrt(2 / 9.81), np.sqrt(2 * 9.81), None, np.empty(time.size)
+    expected[time <= t] = 1 - 9.81 / 2 * time[time <= t] ** 2
+    while t < time[-1]:
+        begin, v = t, 0.7 * v
+        t = begin + 2 * v / 9.81
+        fly = (time > begin) & (time <= t)
+        expected[fly] = v * (time[fly] - begin) - 9.81 / 2 * (time[fly] - begin) ** 2
+    assert np.abs(found["height"] - expected).max() < 1e-8
+    assert found.statistics.events >= 4
+
+
+def test_five_hundred_events(fmu):
+    time = np.linspace(0.0, 1000.0, 2001)
+    found = simulate(fmu(TRIANGLE, 2, "model-exchange"), experiment("long", time))
+    assert np.abs(found["y"] - 2 / np.pi * np.arcsin(np.sin(np.pi / 2 * time))).max() < 1e-9
+    assert found.statistics.events == 500
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_time_events_without_a_state(fmu, version):
+    time = np.array([0.0, 0.1, 0.25, 0.6, 1.0, 1.1])
+    model = fmu(COUNTER, version)
+    assert simulate(model, experiment("count", time))["count"].tolist() == [0, 0, 1, 2, 4, 4]
+    assert simulate(model, experiment("count", time), {"period": 0.5})["count"].tolist() == [0, 0, 0, 1, 2, 2]
+
+
+def test_a_nominal_of_zero_is_floored(fmu):
+    found = simulate(fmu(spring("nothing", nominal="0.0"), 2, "model-exchange"), STEP)
+    assert np.abs(found["y"] - response(TIME)).max() < 2e-7
+
+
+def test_a_worker_is_replaced_when_it_is_old_and_results_do_not_change(tmp_path):
+    model = read_fmu(build(FAULTY, tmp_path), interface="co-simulation", limits=Limits(runs=3))
+    rows = [simulate(model, experiment("s", TIME))["out"] for _ in range(7)]
+    assert model.host.started == 3 and all(np.array_equal(r, rows[0]) for r in rows)
+
+
+def test_a_model_travels_without_its_worker(fmu):
+    model = fmu(spring())
+    here = simulate(model, STEP)["y"]
+    there = pickle.loads(pickle.dumps(model))
+    assert there.host._worker is None
+    assert np.array_equal(simulate(there, STEP)["y"], here)
+    there.host.close()
+
+
+def test_an_instance_that_forgets_to_reset_is_made_anew(tmp_path):
+    """Its reset leaves the parameters as they were set."""
+    from dataclasses import replace
+
+    lazy = replace(spring("lazy"), code=spring().code + "#define AT_RESET return 0\n")
+    model = load_model(build(lazy, tmp_path))
+    for values in ({"k": 20.0}, {}, {"k": 20.0}, {}):
+        k = values.get("k", 8.0)
+        assert np.abs(simulate(model, STEP, values)["y"] - response(TIME, k=k)).max() < 2e-7
+    model.host.close()
+
+
+def test_five_hundred_runs_leave_nothing_behind(fmu):
+    model = read_fmu(fmu(FAULTY, 2, "co-simulation").fmu.path, interface="co-simulation")
+    run = experiment("s", np.linspace(0.0, 0.2, 21), {"u": InputSignal.step(0.1, 0.0, 1.0)})
+    sizes = []
+    for k in range(500):
+        simulate(model, run, {"T": 0.05 + 1e-4 * k})
+        sizes.append(model.host.memory)
+    assert model.host.started == 1
+    assert sizes[-1] - sizes[49] < 2**20
+    model.host.close()
