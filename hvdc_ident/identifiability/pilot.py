@@ -98,7 +98,11 @@ class Optimum:
         """The same where it is more than chance allows with so many independent samples, else 1; 1 without noise."""
         effective = max(sum(self.uncertainty.effective.values()), 1.0)
         given = all(source_of(self.problem.fitted_experiments, o) == GIVEN for o in self.problem.outputs)
-        return self.misfit if given and self.misfit > 1.0 + 4.0 * np.sqrt(2.0 / effective) else 1.0
+        return (
+            self.misfit
+            if given and self.misfit > 1.0 + 4.0 * np.sqrt(2.0 / effective + 2.0 / self.problem.noise_dof)
+            else 1.0
+        )
 
     def value(self, name: str) -> float:
         """The value of an unknown, in its unit."""

@@ -53,13 +53,13 @@ def _windows(fit: dict[str, Any]) -> str:
         for name, about in line.items():
             if about.get("event") is None:
                 continue
-            cells = [text(output), text(name)]
             for window in ("before", "during", "after"):
-                cells += [_error(about[window], kind) for kind in ("max", "mean", "mean_absolute")]
-            rows.append([*cells, text(units.get(output, ""))])
+                w = about[window]
+                span = f"{number(w['from'])} … {number(w['to'])}" if w["n"] else "–"
+                errors = [_error(w, kind) for kind in ("max", "mean", "mean_absolute")]
+                rows.append([text(output), text(name), window, span, *errors, text(units.get(output, ""))])
     if not rows:
         return ""
-    kinds = [f"{w}: {k}" for w in ("before", "during", "after") for k in ("max", "mean", "mean abs.")]
     end = {a.get("end_from") for line in found["errors"].values() for a in line.values()}
     steps = " A step counts as over where its record has settled." if "settling" in end else ""
     told = (
@@ -67,8 +67,8 @@ def _windows(fit: dict[str, Any]) -> str:
         f"{text(profile.get('version', ''))}: {text(profile.get('title', ''))}; {text(profile.get('source', ''))}. "
         f"An error above its limit is marked with its limit.{steps} {text(profile.get('notes', ''))}</p>"
     )
-    head = ["output", "experiment", *kinds, "unit"]
-    return "<h3>Before, during and after the event</h3>" + table(head, rows, words=(0, 1, len(head) - 1)) + told
+    head = ["output", "experiment", "window", "s", "largest", "mean", "mean absolute", "unit"]
+    return "<h3>Before, during and after the event</h3>" + table(head, rows, words=(0, 1, 2, 7)) + told
 
 
 def _error(window: dict[str, Any], kind: str) -> str:
