@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import io
+import re
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-POINTS = 2000
+_LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(\.\d\d)\d+")  # hundredths of a point are not seen
+POINTS = 1200
 MEASURED, BEFORE, AFTER, MARK = "#222222", "#d08020", "#1f5fa8", "#999999"
 
 
@@ -34,18 +37,23 @@ def svg(fig: Figure, label: str) -> str:
     stream = io.StringIO()
     with matplotlib.rc_context(style):
         fig.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    drawn = stream.getvalue()
+    drawn = _LINE.sub(lambda line: _DIGITS.sub(r"\1", line[0]), stream.getvalue())
     return drawn[drawn.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{text(label)}"', 1)
 
 
 def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
     """At most about so many points that draw the same line: the smallest and the largest of each stretch, in order."""
-    if time.size <= points:
-        return time, values
-    edges = np.linspace(0, time.size, points // 2 + 1).astype(int)
-    keep = []
+    rows = visible_rows(values, points)
+    return time[rows], values[rows]
+
+
+def visible_rows(values: Array, points: int = POINTS) -> NDArray[np.intp]:
+    """The rows of these points."""
+    if values.size <= points:
+        return np.arange(values.size)
+    edges = np.linspace(0, values.size, points // 2 + 1).astype(int)
+    keep = [0, values.size - 1]
     for start, end in pairwise(edges):
         part = values[start:end]
-        keep += sorted({start + int(np.argmin(part)), start + int(np.argmax(part))})
-    chosen = np.unique([0, *keep, time.size - 1])
-    return time[chosen], values[chosen]
+        keep += [start + int(np.argmin(part)), start + int(np.argmax(part))]
+    return np.unique(keep)

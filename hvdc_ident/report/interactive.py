@@ -6,29 +6,42 @@ import base64
 import gzip
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
-from typing import Any
 
 from hvdc_ident.report.html import text
 from hvdc_ident.trajectory import Array
 
-DIGITS = 6
+
+@dataclass(frozen=True)
+class Curve:
+    """A curve of a figure that zooms: columns by name. minus: a column taken off y. lower: in the strip below."""
+
+    name: str
+    color: str
+    y: str
+    minus: str = ""
+    lower: bool = False
 
 
-def zoomable(drawn: str, label: str, traces: list[dict[str, Any]], layout: dict[str, Any]) -> str:
+def zoomable(
+    drawn: str, label: str, columns: Mapping[str, Array], curves: Sequence[Curve], titles: tuple[str, str, str]
+) -> str:
     """A `<figure>` with the drawing, which a button turns into an interactive one of the same curves.
 
-    traces, layout: as plotly takes them, numbers as lists.
+    columns: of one length; `x` is the abscissa of all. titles: of the abscissa, the figure and the strip below it.
     """
-    data = json.dumps({"traces": traces, "layout": layout}, allow_nan=False).replace("<", "\\u003c")
-    script = f'<script type="application/json">{data}</script>'
+    data = {
+        "columns": {
+            name: base64.b64encode(values.astype("<f4").tobytes()).decode() for name, values in columns.items()
+        },
+        "curves": [asdict(curve) | {"name": text(curve.name)} for curve in curves],
+        "titles": [text(title) for title in titles],
+    }
+    script = f'<script type="application/json">{json.dumps(data)}</script>'
     return f'<figure data-zoom="{text(label)}">{drawn}{script}</figure>'
-
-
-def numbers(values: Array) -> list[float]:
-    """The values with the digits that can be seen."""
-    return [float(f"{v:.{DIGITS}g}") for v in values.tolist()]
 
 
 def scripts(body: str) -> tuple[str, str]:

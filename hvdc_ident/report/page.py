@@ -32,7 +32,7 @@ code { font: .8rem ui-monospace, "Cascadia Mono", Menlo, Consolas, monospace; }
 sup { line-height: 0; font-size: .75em; }
 code { color: var(--soft); overflow-wrap: anywhere; }
 button, input[type=range] { font: inherit; } figure { position: relative; }
-figure > button { position: absolute; right: 0; top: 0; font-size: .8rem; padding: .1rem .5rem; color: var(--accent);
+figure > button { position: absolute; right: 0; bottom: 0; font-size: .8rem; padding: .1rem .5rem; color: var(--accent);
   background: #fff; border: 1px solid var(--accent); border-radius: .3rem; cursor: pointer; }
 button:focus-visible, input:focus-visible, a:focus-visible, [tabindex]:focus-visible { outline: 3px solid #e69f00; }
 .letter { border: 1px solid var(--line); padding: 1rem 1.4rem; border-radius: .4rem; } .letter p { margin: .5rem 0; }

@@ -14,8 +14,23 @@
     await new Promise((done, failed) => { script.onload = done; script.onerror = failed; document.head.append(script); });
   })();
 
+  const numbers = (text) => {
+    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    return Array.from(new Float32Array(bytes.buffer));
+  };
+
+  const traces = (data) => {
+    const columns = Object.fromEntries(Object.entries(data.columns).map(([name, text]) => [name, numbers(text)]));
+    return data.curves.map((curve) => ({
+      type: "scatter", mode: "lines", name: curve.name, line: { color: curve.color, width: 1.3 }, x: columns.x,
+      y: curve.minus ? columns[curve.y].map((v, n) => v - columns[curve.minus][n]) : columns[curve.y],
+      yaxis: curve.lower ? "y2" : "y",
+    }));
+  };
+
   const enlarge = async (figure, button) => {
     const data = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
+    const [x, upper, lower] = data.titles;
     button.disabled = true;
     button.textContent = "…";
     await loaded();
@@ -23,8 +38,11 @@
     place.style.height = "26rem";
     figure.querySelector("svg").replaceWith(place);
     button.remove();
-    await Plotly.newPlot(place, data.traces, { ...data.layout, margin: { t: 30, r: 10, b: 45, l: 65 }, showlegend: true,
-      legend: { orientation: "h", y: 1.12 }, hovermode: "x unified" }, { responsive: true, displaylogo: false });
+    await Plotly.newPlot(place, traces(data), {
+      xaxis: { title: { text: x }, anchor: "y2" }, yaxis: { title: { text: upper }, domain: [0.3, 1] },
+      yaxis2: { title: { text: lower }, domain: [0, 0.24] }, margin: { t: 30, r: 10, b: 45, l: 65 },
+      legend: { orientation: "h", y: 1.12 }, hovermode: "x unified",
+    }, { responsive: true, displaylogo: false });
     place.tabIndex = 0;
     place.focus();
   };

@@ -9,7 +9,7 @@ from hvdc_ident.report.html import text
 from hvdc_ident.report.interactive import zoomable
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
-from hvdc_ident.report.waveforms import traces, waveforms
+from hvdc_ident.report.waveforms import curves, waveforms
 from hvdc_ident.trajectory import Trajectory
 
 MOST = 60
@@ -46,7 +46,7 @@ def _figure(
     window = about.get("window")
     fig = waveforms(output, unit, tables[0], tables[1], about.get("event"), tuple(window) if window else None)
     label = f"{output} in {name}: measured and simulated"
-    return zoomable(svg(fig, label), label, *traces(output, unit, tables[0], tables[1]))
+    return zoomable(svg(fig, label), label, *curves(output, unit, tables[0], tables[1]))
 
 
 SECTION = Section(order=40, title="Waveforms", render=_render)
