@@ -260,3 +260,46 @@ def test_slow_residuals_widen_the_interval():
     assert result.rho["y"] > 0.4
     assert result.effective_samples["y"] < 0.5 * T.size
     assert result.estimates["a"].std > 1.2 * result.estimates["a"].std_raw
+
+
+def test_a_method_that_stops_short_is_refined_before_anything_is_said():
+    """A simplex stopped after 60 evaluations is far off; the result stands at the optimum and says how it got there."""
+    from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
+
+    alone = NelderMead(max_evaluations=30).run(decaying(), decaying().start)
+    assert alone.status == "max-evaluations"
+    result, reference = fit(decaying(), optimiser=NelderMead(max_evaluations=30), starts=1), fit(decaying(), starts=1)
+    assert result.status == "converged"
+    assert result.values == pytest.approx(dict(reference.values), rel=1e-7)
+    assert "then least squares lowered the cost by" in result.starts[0].message
+    assert alone.cost > result.cost + 1e-6
+
+
+def test_an_optimiser_may_be_named_and_global_ones_begin_once():
+    assert len(fit(decaying(), optimiser="differential-evolution").starts) == 1
+    assert len(fit(decaying(), optimiser="l-bfgs-b").starts) == 8
+    assert len(fit(decaying(), optimiser="differential-evolution", starts=2).starts) == 2
+
+
+@pytest.mark.parametrize("status", ["not-converged", "at-bound", "two-optima", "failed"])
+def test_the_report_says_first_what_became_of_the_fit(status):
+    from hvdc_ident.report.sections.gains import STATUS, _outcome
+
+    words = _outcome({"status": status, "message": "why <it> is so"})
+    assert STATUS[status] in words and f"({status})" in words
+    assert "why &lt;it&gt; is so" in words
+    assert "converged" not in words.replace("not-converged", "").replace("did not converge", "")
+
+
+def test_individual_groups_are_no_better_than_their_worst():
+    from hvdc_ident.fit import Group, fit_individually
+    from hvdc_ident.fit.optimisers.trust_region import TrustRegion
+
+    simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
+    e = recorded("e", T, {"y": 0.01}, y=2.0 * np.exp(-1.5 * T))
+    problem = Problem(simulator, (e,), (Free("a", 1.0, 0.1, 10), Free("k", 1.0, 0.0, 1.2)))
+    groups = [Group(("a",)), Group(("k",))]
+    assert fit_individually(problem, groups, starts=1).status == "at-bound"
+    assert (
+        fit_individually(problem, groups, starts=1, optimiser=TrustRegion(max_evaluations=1)).status == "not-converged"
+    )
