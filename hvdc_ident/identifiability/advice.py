@@ -30,6 +30,8 @@ def advice(
         )
     told = ", ".join(_told(n, now[n], then[n], units.get(n, "")) for n in gains[:NAMED])
     text = f"{_made(best, units)}: {told}."
+    if best.new:
+        text += f" That takes the noise of {_listed(best.new)} to be like that of the signals recorded."
     open_ = [n for n, half in then.items() if half is None]
     if open_:
         text += f" {_listed(open_)} would stay open: only together with others, or not at all, do they show."
