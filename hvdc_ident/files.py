@@ -131,7 +131,14 @@ def _rows(rows: Rows) -> Iterator[str]:
 
 
 def _dumped(value: Any, indent: int | None = None) -> str:
-    return json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
+    return json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False, default=_listed)
+
+
+def _listed(value: Any) -> list[Any]:
+    """Rows that stand deeper than the outermost mapping, as the list they are."""
+    if isinstance(value, Rows):
+        return [plain(row) for row in value]
+    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def _cannot_write(path: Path, error: OSError) -> InputError:
