@@ -291,6 +291,32 @@ for _stage in stages():
 
 @app.command()
 @guarded
+def letter(
+    study: StudyFile,
+    out: Out = None,
+    workers: Workers = 1,
+    executor: Where = "",
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+    trust: Trust = False,
+) -> None:
+    """One page for the owner of the model: what it misses, why, and what is attached."""
+    from hvdc_ident.study.letter import letter as write
+    from hvdc_ident.study.progress import progress
+    from hvdc_ident.study.study import load_study
+
+    loaded = load_study(study, trust)
+    folder = out or loaded.folder
+    with progress(quiet or json) as told:
+        page, done = write(loaded, folder, Options(workers, seed, told, executor=executor))
+    if json:
+        _print_json({"schema": 1, "file": page.as_posix(), "verdict": done.data.get("verdict")})
+    _say(f"letter: {page}", json=json, quiet=quiet)
+
+
+@app.command()
+@guarded
 def report(
     source: Annotated[
         Path, typer.Argument(metavar="STUDY|DIR", help="A study, or a folder of results.", show_default=False)

@@ -45,6 +45,12 @@ def run_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
         return _run(study, wanted, folder, options, earlier)
 
 
+def have_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
+    """The stage's result, run only where the folder does not hold it for the same study, software and seed."""
+    with exclusive(folder):
+        return _kept_or_run(study, stage(name), folder, options)
+
+
 def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
     """Every stage the study asks for, in order, written to the folder; those that stand there unchanged are kept.
 

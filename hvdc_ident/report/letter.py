@@ -1,0 +1,209 @@
+"""The letter: one page to the owner of a model, made from the results alone.
+
+What is missed, what that is consistent with, whether the gains are to blame, what adding the effect gains on data it
+was not fitted to, what to record to be sure, and what is attached.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.errors import InputError
+from hvdc_ident.files import write_text
+from hvdc_ident.report.drawing import AFTER, MEASURED, figure, svg, visible_rows
+from hvdc_ident.report.html import text
+from hvdc_ident.report.results import Results
+
+FILE = "letter.html"
+STAGE = "discrepancy"
+
+
+@dataclass(frozen=True)
+class Letter:
+    """The letter's sentences, in order, as plain text, and the curves of its slider, if any."""
+
+    sentences: tuple[str, ...]
+    attached: tuple[str, ...]
+    sizes: dict[str, Any] | None
+
+
+def letter_of(results: Results) -> Letter:
+    """The letter of a folder of results. Raises InputError where no diagnosis has run."""
+    found = results.get(STAGE)
+    if not found or "verdict" not in found:
+        raise InputError(
+            "there is no diagnosis to write a letter about",
+            where=str(results.folder),
+            expected=f"{STAGE}.json",
+            hint="hvdc-ident diagnose STUDY",
+        )
+    sentences = (_missed(results, found), _consistent(found), _gains(found), _gained(found), _next(found))
+    return Letter(tuple(s for s in sentences if s), tuple(_attached(results, found)), found.get("sizes"))
+
+
+def letter_body(letter: Letter) -> str:
+    """The letter as HTML: its sentences, the figure with its slider, what is attached."""
+    told = "".join(f"<p>{text(s)}</p>" for s in letter.sentences)
+    attached = f"<p>Attached: {text(', '.join(letter.attached))}.</p>" if letter.attached else ""
+    return f'<div class="letter">{told}{_slider(letter.sizes)}{attached}</div>'
+
+
+def write_letter(folder: Path) -> Path:
+    """The path of letter.html in a folder of results, written from what the folder holds."""
+    from hvdc_ident.report.page import document
+
+    results = Results(folder)
+    heading = results.get(STAGE) or results.heading
+    title = f"Model {heading.get('model', '')}: what the recordings say"
+    letter = letter_of(results)
+    return write_text(folder / FILE, document(title, str(heading.get("study", "")), letter_body(letter)))
+
+
+def _missed(results: Results, found: dict[str, Any]) -> str:
+    """How far the model, with the gains it came with, is off at most, as a share of what the signal does."""
+    nominal = (found.get("gap") or {}).get("nominal") or {}
+    worst: tuple[float, str, str, float] | None = None
+    for line in (found["gap"].get("nominal") or {}).values() if nominal else ():
+        for output, errors in line.items():
+            for experiment, rmse in errors.items():
+                swing = _swing(results, output, experiment)
+                if rmse is not None and swing and (worst is None or rmse / swing > worst[0]):
+                    worst = rmse / swing, output, experiment, rmse
+    if worst is None:
+        return f"The model was compared with the recordings; the verdict is {found['verdict']}."
+    share, output, experiment, rmse = worst
+    unit = (results.get("simulation").get("units") or {}).get(output, "")
+    return (
+        f"With the gains it came with, your model misses {output} in experiment '{experiment}' by "
+        f"{100 * share:.2g} % of what that signal does (RMSE {rmse:.3g} {unit}), the most of all recorded signals."
+    ).replace(" )", ")")
+
+
+def _swing(results: Results, output: str, experiment: str) -> float | None:
+    table = results.table(f"simulation.{experiment}.csv")
+    if table is None or f"{output}.measured" not in table:
+        return None
+    return float(np.ptp(table[f"{output}.measured"]))
+
+
+def _consistent(found: dict[str, Any]) -> str:
+    """What the difference is consistent with: the effect that was named, and those the data cannot tell from it."""
+    verdict, effects = found["verdict"], found.get("effects") or []
+    if verdict == "no-evidence":
+        return f"Beyond the gains nothing is missing that these recordings could show. {found.get('text', '')}".strip()
+    if not effects:
+        return str(found.get("text", ""))
+    told = [" ".join([e["text"].rstrip("."), _interval(e)]).strip() for e in effects]
+    first = f"The difference is what this would make: {'; and '.join(told)}."
+    rivals = [r for group in found.get("ambiguity") or [] for r in group[1:]]
+    if not rivals:
+        return first + " No other effect of the catalogue, and no other place, explains the recordings as well."
+    names = list(dict.fromkeys(f"{r['effect']} at {' and '.join(r['at'])}" for r in rivals))
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}."
+
+
+def _interval(effect: dict[str, Any]) -> str:
+    parts = []
+    for name, size in effect["parameters"].items():
+        low, high = size.get("ci95") or (None, None)
+        if low is not None and high is not None:
+            parts.append(f"{name} between {low:.3g} and {high:.3g} {size.get('unit', '')}".rstrip())
+    return f"({', '.join(parts)}, 95 %)" if parts else ""
+
+
+def _gains(found: dict[str, Any]) -> str:
+    """Whether the gains are to blame: how far a fit moves them without the effect, and how far with it."""
+    given, without, after = (found.get(f"parameters_{k}") or {} for k in ("before", "refitted", "after"))
+    moved = {
+        n: (without[n] / g - 1.0, after[n] / g - 1.0) for n, g in given.items() if g and n in without and n in after
+    }
+    if not moved:
+        return ""
+    name = max(moved, key=lambda n: abs(moved[n][0]))
+    alone, with_it = moved[name]
+    if not found.get("effects"):
+        if abs(alone) < 0.02:
+            return "Your gains are not to blame: a fit leaves them within 2 % of what you gave."
+        return f"Your gains are to blame: fitted, {name} moves by {100 * alone:+.1f} %, and that closes the gap as far as it closes."
+    if abs(with_it) < 0.5 * abs(alone):
+        return (
+            f"Your gains are not to blame: fitted without the effect {name} would be bent by {100 * alone:+.1f} %, "
+            f"with it the same fit leaves {100 * with_it:+.1f} %."
+        )
+    return (
+        f"Your gains move too: {name} by {100 * alone:+.1f} % when fitted without the effect and by "
+        f"{100 * with_it:+.1f} % with it."
+    )
+
+
+def _gained(found: dict[str, Any]) -> str:
+    gap = found.get("gap") or {}
+    shrink = gap.get("shrink_holdout")
+    if shrink is None or not found.get("effects"):
+        return ""
+    pooled = (gap.get("pooled") or {}).get("augmented") or {}
+    left = pooled.get("holdout")
+    rest = f"; what is left is {left:.3g} times the noise" if isinstance(left, int | float) else ""
+    against = gap.get("held_out", "experiments")
+    where = "experiments that no fit has seen" if against == "experiments" else against
+    return (
+        f"Adding it shrinks the error on {where} by {100 * shrink:.0f} %, "
+        f"measured against the same model with its gains fitted and nothing added{rest}."
+    )
+
+
+def _next(found: dict[str, Any]) -> str:
+    advice = (found.get("separating_experiment") or {}).get("text")
+    if not advice:
+        return ""
+    start = "To tell them apart" if found.get("ambiguity") else "What would show more"
+    return f"{start}: {advice}" + ("" if advice.endswith(".") else ".")
+
+
+def _attached(results: Results, found: dict[str, Any]) -> list[str]:
+    card = found.get("augmented_model")
+    names = [str(card), Path(str(card)).with_suffix(".fmu").name] if card else []
+    return [n for n in names if (results.folder / n).is_file()]
+
+
+def _slider(sizes: dict[str, Any] | None) -> str:
+    """The curves at several sizes in one drawing, of which a slider shows one."""
+    if not sizes or not sizes.get("curves"):
+        return ""
+    time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
+    chosen = sizes.get("chosen") or 0
+    fig = figure(7.4, 2.8)
+    axes = fig.subplots()
+    keep = visible_rows(measured, 600)
+    axes.plot(time[keep], measured[keep], color=MEASURED, linewidth=1.0, label="recorded")
+    for k, curve in enumerate(sizes["curves"]):
+        values = np.asarray(curve, dtype=float)
+        rows = visible_rows(values, 600)
+        (line,) = axes.plot(
+            time[rows], values[rows], color=AFTER, linewidth=1.5, label="model" if k == chosen else None
+        )
+        line.set_gid(f"size-{k}")
+    unit = sizes.get("output_unit") or ""
+    axes.set_xlabel("time, s")
+    axes.set_ylabel(f"{sizes['output']}, {unit}" if unit else str(sizes["output"]))
+    axes.grid(True, color="#e4e4e4", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
+    for k in range(len(sizes["curves"])):
+        hidden = "" if k == chosen else ' style="display: none"'
+        drawn = drawn.replace(f'<g id="size-{k}">', f'<g class="size"{hidden}>', 1)
+    data = json.dumps({"labels": sizes["labels"]}).replace("<", "\\u003c")
+    label = f"size of the effect, {sizes['effect']} at {' and '.join(sizes['at'])}"
+    return (
+        f'<div data-sizes="1"><figure>{drawn}</figure><p class="small"><label>{text(label)}: '
+        f'<input type="range" hidden min="0" max="{len(sizes["curves"]) - 1}" value="{chosen}" aria-label="{text(label)}">'
+        f"</label> <output>{text(sizes['labels'][chosen])}</output></p>"
+        f'<script type="application/json">{data}</script></div>'
+    )

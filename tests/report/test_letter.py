@@ -1,0 +1,114 @@
+"""The letter says what the results say, and no more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import InputError
+from hvdc_ident.report.letter import letter_of, write_letter
+from hvdc_ident.report.results import Results
+
+HEADING = {"schema": 1, "study": "s", "model": "m", "software": "hvdc_ident 0", "seed": 0, "sources": {}}
+
+
+def diagnosis(**changes: Any) -> dict[str, Any]:
+    lag = {
+        "effect": "lag",
+        "at": ["P2_m"],
+        "parameters": {"T": {"value": 0.0016, "ci95": [0.0014, 0.0018], "unit": "s"}},
+        "text": "P2_m follows with a lag of 0.0016 s",
+        "chosen_from": 5,
+    }
+    gap = {
+        "nominal": {"fit": {"P2": {"step": 0.02}}, "holdout": {}},
+        "refitted": {"fit": {"P2": {"step": 0.004}}, "holdout": {"P2": {"ramp": 0.004}}},
+        "augmented": {"fit": {"P2": {"step": 0.001}}, "holdout": {"P2": {"ramp": 0.001}}},
+        "noise_floor": {"P2": 0.001},
+        "pooled": {"augmented": {"holdout": 1.05}},
+        "shrink_holdout": 0.75,
+        "held_out": "experiments",
+    }
+    sizes = {
+        "effect": "lag",
+        "at": ["P2_m"],
+        "parameter": "T",
+        "unit": "s",
+        "experiment": "ramp",
+        "output": "P2",
+        "output_unit": "pu",
+        "time": [0.0, 0.1, 0.2],
+        "measured": [0.0, 0.5, 1.0],
+        "sizes": [None, 0.0016],
+        "shares": [0.0, 1.0],
+        "labels": ["without it", "T = 0.0016 s"],
+        "curves": [[0.0, 0.6, 1.0], [0.0, 0.5, 1.0]],
+        "chosen": 1,
+    }
+    return {
+        **HEADING,
+        "verdict": "ambiguous",
+        "text": "",
+        "effects": [lag],
+        "ambiguity": [
+            [
+                {"effect": "lag", "at": ["P2_m"], "delta_bic": 0.0},
+                {"effect": "delay", "at": ["P2_m"], "delta_bic": 2.0},
+            ]
+        ],
+        "separating_experiment": {"text": "Record P2 at 1 kHz"},
+        "gap": gap,
+        "parameters_before": {"KIP": 30.0},
+        "parameters_refitted": {"KIP": 31.5},
+        "parameters_after": {"KIP": 30.1},
+        "augmented_model": "augmented-model.toml",
+        "sizes": sizes,
+        **changes,
+    }
+
+
+def folder_with(path: Path, found: dict[str, Any]) -> Path:
+    path.mkdir(exist_ok=True)
+    (path / "discrepancy.json").write_text(json.dumps(found))
+    (path / "simulation.json").write_text(json.dumps({**HEADING, "units": {"P2": "pu"}}))
+    rows = "".join(f"{t:g},{0.9 * t:g},{t:g}\n" for t in np.linspace(0, 0.1, 5))
+    (path / "simulation.step.csv").write_text("time,P2,P2.measured\n" + rows)
+    return path
+
+
+def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
+    (tmp_path / "augmented-model.toml").touch()
+    letter = letter_of(Results(folder_with(tmp_path, diagnosis())))
+    missed, consistent, gains, gained, following = letter.sentences
+    assert "misses P2 in experiment 'step' by 20 %" in missed
+    assert "lag of 0.0016 s" in consistent and "0.0014 and 0.0018 s" in consistent and "delay at P2_m" in consistent
+    assert "not to blame" in gains and "+5.0 %" in gains and "+0.3 %" in gains
+    assert "75 %" in gained and "1.05 times the noise" in gained
+    assert following == "To tell them apart: Record P2 at 1 kHz."
+    assert letter.attached == ("augmented-model.toml",)
+
+
+def test_without_evidence_nothing_is_named_and_the_gains_are_judged(tmp_path: Path) -> None:
+    found = diagnosis(verdict="no-evidence", effects=[], ambiguity=[], text="Nothing stands out.", sizes=None)
+    letter = letter_of(Results(folder_with(tmp_path, found)))
+    told = " ".join(letter.sentences)
+    assert "nothing is missing" in told and "Your gains are to blame: fitted, KIP moves by +5.0 %" in told
+    assert "lag" not in told and "shrinks" not in told
+
+
+def test_the_page_has_one_curve_to_see_and_a_slider_for_the_others(tmp_path: Path) -> None:
+    text = write_letter(folder_with(tmp_path, diagnosis())).read_text("utf-8")
+    assert text.count('class="size"') == 2 and text.count('class="size" style="display: none"') == 1
+    assert 'type="range"' in text and "plotly" not in text.split("<script>")[0]
+    assert len(text) < 200_000
+
+
+def test_without_a_diagnosis_there_is_no_letter(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, diagnosis())
+    (folder / "discrepancy.json").unlink()
+    with pytest.raises(InputError, match="hvdc-ident diagnose"):
+        write_letter(folder)
