@@ -90,10 +90,12 @@ class Run:
             if due is not None and due <= t:
                 y = self._state_event(t, y)
                 continue
-            self.segment_end = stop if due is None else min(due, stop)
+            # Two instants that differ by rounding alone are one: no integrator can step from one to the other.
+            apart = 1e-12 * max(1.0, abs(stop))
+            self.segment_end = stop if due is None or abs(due - stop) <= apart else min(due, stop)
             t, y = self._segment(t, y, self.segment_end)
             if t >= self.segment_end:
-                y = self._arrive(t, y, stops, timed=due is not None and due <= t)
+                y = self._arrive(t, y, stops, timed=due is not None and due <= t + apart)
 
     # --- between stops ---
 
