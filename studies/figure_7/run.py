@@ -26,7 +26,7 @@ OTHERS = Campaign(source=paper.REFERENCE, count=2, noise=Noise(0.0), sample=pape
 WHY = {
     "Irorder2": "a larger floor there (Table IV)",
     "Iiorder1": "more is missing there in Q than a delay (Table IV)",
-    "Irorder1": "a larger floor there; ours is the delay and the dc-side inductance",
+    "Irorder1": "a larger floor there; ours is the delay and the inner current loop",
 }
 
 

@@ -1,0 +1,196 @@
+"""Why Table III's gains are off Table I: what a missing delay does to them, and which part of the reference does what.
+
+python studies/why_table_3_is_biased/run.py [--quick] [--pin]
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+from common import ending, paper  # noqa: E402
+from common.ending import markdown, number  # noqa: E402
+
+from hvdc_ident.experiment import Experiment, InputSignal, experiment  # noqa: E402
+from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
+from hvdc_ident.frozen import FrozenMap  # noqa: E402
+from hvdc_ident.model.definition import Model  # noqa: E402
+from hvdc_ident.models import load_model, vsc_hvdc_avm  # noqa: E402
+from hvdc_ident.simulate import simulate  # noqa: E402
+from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402
+
+LAG = 1.6e-3  # s, planted
+LAGGED = {"effect": "lag", "at": ["Ir1", "Ii1", "Ir2", "Ii2"], "parameters": {"T": LAG}}
+LAG_NAME = "lag_Ir1_T"  # what the model calls it
+PLANTED = {  # experiment: set-point, its course; the ramps take 0.1 s
+    "vdc-step": ("Vdcref1", InputSignal.step(0.1, 1.0, 1.019)),
+    "vdc-ramp": ("Vdcref1", InputSignal.ramp(0.1, 1.0, 0.2, 1.019)),
+    "p-step": ("Pref2", InputSignal.step(0.1, 0.4, 0.5)),
+    "p-ramp": ("Pref2", InputSignal.ramp(0.1, 0.4, 0.2, 0.5)),
+    "q-step": ("Qref1", InputSignal.step(0.1, 0.0, 0.1)),
+}
+MOVED = ("KIP", "KIVDC", "KPVDC", "KIQ")
+KNOWN = {"KIP": 31.3, "KIVDC": 896.0, "KPVDC": 25.3}  # independent computation, other window and sampling
+
+FILTERED = ("P", "Q", "Vdc")
+FEWER = (
+    10.0  # a tenth of the reactances and ten times the integral gain: the loop ten times as fast, its voltages as large
+)
+FAST = 100.0  # a part that is made so many times faster or smaller is as good as not there
+PARTS: dict[str, dict[str, float]] = {  # part of the average-value link: by what its parameters are multiplied
+    "dc-side inductance": {"Ls": 1 / FAST},
+    "inner current loop's time": {"XT": 1 / FEWER, "XA": 1 / FEWER, "KX": 1 / FEWER, "KII": FEWER},
+    "lag of the voltage feed-forward": {"FF": FAST},
+    "Bessel filter on the ac voltage": {"FV": FAST},
+    "PLL's window of a cycle": {"Tpll": 1 / FAST},
+    "losses": {"RT": 1 / FAST, "Rs": 1 / FAST},
+}
+
+
+def main(parts: Sequence[str] = tuple(PARTS)) -> dict[str, Any]:
+    """What a planted lag does to the gains, and the gains by what is switched off in the average-value link."""
+    filters = {name: vsc_hvdc_avm.model(chosen) for name, chosen in filter_choices().items()}
+    return {
+        "planted": planted(),
+        "filters": {name: fitted(model) for name, model in filters.items()},
+        "parts off, with filters": switched_off(filters["P, Q, Vdc"], parts),
+        "parts off, without filters": switched_off(filters["none"], parts),
+    }
+
+
+def planted() -> dict[str, Any]:
+    """Gains of the plain link, and of the link with a lag, fitted to the link with a lag of 1.6 ms on all currents."""
+    lagged = load_model(paper.LINK).with_effects([LAGGED])
+    experiments = [recorded(lagged, name) for name in PLANTED]
+    plain = fit(Problem(paper.link(), tuple(experiments), paper.free(MOVED)), starts=4)
+    begun = (*paper.free(MOVED), Free(LAG_NAME, 5e-4, 1e-5, 1e-2))
+    whole = fit(Problem(ModelSimulator(lagged), tuple(experiments), begun), starts=4)
+    return {
+        "plain link": {n: plain.values[n] for n in MOVED} | {"status": plain.status},
+        "with the lag": {n: whole.values[n] for n in (*MOVED, LAG_NAME)} | {"status": whole.status},
+    }
+
+
+def recorded(model: Model, name: str) -> Experiment:
+    """One of the planted experiments, 0.9 s every 0.5 ms, all three outputs weighed alike."""
+    setpoint, course = PLANTED[name]
+    time = np.round(np.arange(round(paper.END / paper.SAMPLE) + 1) * paper.SAMPLE, 9)
+    plain = experiment(name, time, {setpoint: course}, event=paper.EVENT)
+    alike = FrozenMap(dict.fromkeys(paper.OUTPUTS, paper.EQUAL))
+    return plain.with_(measured=simulate(model, plain, outputs=paper.OUTPUTS).trajectory, noise=alike)
+
+
+def filter_choices() -> dict[str, tuple[Any, ...]]:
+    """Sets of filtered measurements: all, each left out, none."""
+    left_out = {f"without {m}'s": tuple(k for k in FILTERED if k != m) for m in FILTERED}
+    return {", ".join(FILTERED): FILTERED, **left_out, "none": ()}
+
+
+def switched_off(model: Model, parts: Sequence[str]) -> dict[str, dict[str, float]]:
+    """The fitted gains with each part of the average-value link switched off by itself, and with all of them."""
+    found = {}
+    for part in parts:
+        found[part] = fitted(without(model, PARTS[part]))
+    if len(parts) == len(PARTS):
+        found["all of these"] = fitted(without(model, {n: by for part in PARTS.values() for n, by in part.items()}))
+    return found
+
+
+def without(model: Model, factors: Mapping[str, float]) -> Model:
+    """The model with some parameters multiplied."""
+    return model.with_values({n: model.values[n] * by for n, by in factors.items()})
+
+
+def fitted(model: Model) -> dict[str, float]:
+    """The phasor link's gains, each controller by itself on its own output in one step of its set-point."""
+    found: dict[str, float] = {}
+    for kind, c in paper.CONTROLLERS.items():
+        problem = Problem(paper.link(), (paper.step(kind, model, [c.output]),), wide(c.gains))
+        result = fit(problem, starts=2)
+        if result.status not in ("converged", "at-bound"):
+            raise RuntimeError(f"the fit of {kind} ended without an estimate: {result.message}")
+        found |= {n: result.values[n] for n in c.gains}
+    return found
+
+
+def wide(names: Sequence[str]) -> tuple[Free, ...]:
+    """Table II's starts with bounds that no result here touches."""
+    return tuple(Free(n, paper.TABLE_2[n][2], 0.0, 4.0 * paper.TABLE_2[n][1]) for n in names)
+
+
+def tables(values: Mapping[str, Any]) -> dict[str, str]:
+    """The README's tables."""
+    p = values["planted"]
+    plant = [
+        [
+            n,
+            number(paper.TABLE_1[n]),
+            number(paper.TABLE_3[n]["II"]["mean"]),
+            number(KNOWN[n], 3) if n in KNOWN else "-",
+            number(p["plain link"][n]),
+            number(p["with the lag"][n], 5),
+        ]
+        for n in MOVED
+    ]
+    plant.append(["lag, ms", number(1e3 * LAG), "-", "-", "-", number(1e3 * p["with the lag"][LAG_NAME], 5)])
+    head = [
+        "",
+        "planted",
+        "paper, Table III",
+        "plain link, computed elsewhere",
+        "plain link",
+        "lag added, all refitted",
+    ]
+    rows = [[name, *row(v)] for name, v in cases(values).items()]
+    return {
+        "planted": markdown(head, plant),
+        "parts": markdown(["average-value link", *MOVED, *(f"bias of {n}, %" for n in MOVED[:3])], rows),
+    }
+
+
+def cases(values: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
+    """The fitted gains by what the average-value link was, in words."""
+    found = {f"filters: {n}": v for n, v in values["filters"].items()}
+    for base in ("with filters", "without filters"):
+        for part, v in values[f"parts off, {base}"].items():
+            found[f"{base}, {part} off" if part.startswith("all") else f"{base}, no {part}"] = v
+    return found
+
+
+def row(v: Mapping[str, float]) -> list[str]:
+    """The gains and their bias."""
+    bias = [f"{100 * (v[n] / paper.TABLE_1[n] - 1):+.1f}" for n in MOVED[:3]]
+    return [*(number(v[n]) for n in MOVED), *bias]
+
+
+def draw(values: Mapping[str, Any]) -> Any:
+    """The bias of each gain by what is switched off."""
+    from hvdc_ident.report.drawing import figure
+
+    by_case = cases(values)
+    fig = figure(11, 5.5)
+    places = np.arange(len(by_case))
+    grid = fig.subplots(1, 3, sharey=True)
+    for axes, n in zip(grid, MOVED[:3], strict=True):
+        bias = [100 * (v[n] / paper.TABLE_1[n] - 1) for v in by_case.values()]
+        axes.barh(places, bias, color=["#1f5fa8" if b > 0 else "#9cc3e6" for b in bias])
+        paper_s = 100 * (paper.TABLE_3[n]["II"]["mean"] / paper.TABLE_1[n] - 1)
+        axes.axvline(paper_s, color="#d08020", label="the paper (Table III)")
+        axes.axvline(0, color="black", lw=0.8)
+        axes.set(xlabel=f"bias of {n}, %", yticks=places, yticklabels=list(by_case))
+        axes.tick_params(axis="y", labelsize=8)
+    grid[0].invert_yaxis()
+    grid[0].legend(fontsize=8, loc="lower right")
+    return fig
+
+
+if __name__ == "__main__":
+    args = ending.arguments(__doc__, quick="without most of the parts of the average-value link")
+    found = main(tuple(PARTS)[:1]) if args.quick else main()
+    sys.exit(ending.ended(HERE, found, tables, draw, pin=args.pin, whole=not args.quick))
