@@ -204,9 +204,9 @@ def _status(
     if lower and lower[0].status == "failed":
         return "not-converged", f"a run that failed had reached a lower cost: {lower[0].message}"
     if not arrived and not any(r.status == "converged" for r in runs):
-        return "not-converged", "no run reached an optimum; the best was stopped by its evaluations"
+        return "not-converged", f"no run reached an optimum: {_words_of_best(runs)}"
     if not arrived and len(problem.outputs) == 1:
-        return "not-converged", "the best run was stopped by its evaluations"
+        return "not-converged", f"the best run did not reach an optimum: {_words_of_best(runs)}"
     near = [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
     if near:
         theta = ", ".join(f"{n} = {v:.6g}" for n, v in zip(problem.names, near[0].theta, strict=True))
@@ -216,6 +216,11 @@ def _status(
         return "at-bound", f"on a bound: {', '.join(at_bound)}"
     count = sum(o.status == "converged" for o in outcomes)
     return "converged", f"{count} of {len(outcomes)} runs converged, {len(arrived)} to this optimum"
+
+
+def _words_of_best(runs: Sequence[OptimiserResult]) -> str:
+    """Why the run with the lowest cost ended."""
+    return min((r for r in runs if r.cost is not None), key=lambda r: r.cost or 0.0).message
 
 
 def _held(problem: Problem) -> FrozenMap[str]:

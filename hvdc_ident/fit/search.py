@@ -7,7 +7,7 @@ the library returns, and the budget is kept here too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -138,18 +138,18 @@ class Search:
             return OptimiserResult(
                 self.start, None, "failed", f"no point could be simulated: {self.failure}", self.evaluations
             )
-        status: Outcome = "converged" if converged else "max-evaluations"
+        status: Outcome = "converged" if converged else "stopped"
         more = f"; {self.failures} of {self.evaluations} points could not be simulated" if self.failures else ""
         return OptimiserResult(self.best, self.cost, status, message + more, self.evaluations)
 
     def spent(self) -> OptimiserResult:
         """The result where the evaluations were used up."""
-        return self.ended(False, f"no optimum within {self.limit} evaluations")
+        end = self.ended(False, f"no optimum within {self.limit} evaluations")
+        return end if end.status == "failed" else replace(end, status="max-evaluations")
 
     def refused(self, message: str) -> OptimiserResult:
         """The result where the method gave up."""
-        end = self.ended(False, message)
-        return OptimiserResult(end.theta, end.cost, "failed", end.message, end.evaluations)
+        return replace(self.ended(False, message), status="failed")
 
 
 def generator(seed: int, start: Array) -> np.random.Generator:
