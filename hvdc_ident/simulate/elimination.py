@@ -7,7 +7,7 @@ partial pivoting to fall back on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hvdc_ident.simulate.graph import Graph
@@ -29,7 +29,7 @@ class Elimination:
 
     @property
     def count(self) -> int:
-        """Number of factors."""
+        """Number of factors. The place after them holds `growth`."""
         return len(self.places)
 
 
@@ -80,13 +80,38 @@ def eliminate(entries: Mapping[tuple[int, int], float | None], n: int, nx: int) 
     for key in factors:
         if key[0] != key[1]:
             places[key] = len(places)
-    function = Function("lu", [(places[key], node) for key, node in factors.items()], hot=True)
+    stored = [(places[key], node) for key, node in factors.items()]
+    function = Function("lu", [*stored, (len(places), _growth(graph, entries, factors, shift, n, nx))], hot=True)
     return Elimination(tuple(order), places, lower, upper, graph, function)
 
 
-def solve_text(elimination: Elimination, symbol: str, width: int) -> str:
-    """LLVM IR of `symbol`: solves in place for `out` (n, width) with the factors in `p`; width 0: out is (n,)."""
-    kind = f"<{width} x double>" if width else "double"
+def _growth(
+    graph: Graph,
+    entries: Mapping[tuple[int, int], float | None],
+    factors: Mapping[tuple[int, int], int],
+    shift: int,
+    n: int,
+    nx: int,
+) -> int:
+    """The node that tells how small pivots are against their rows: the sum of |row| / |pivot|, not finite where one is 0."""
+    total = graph.zero
+    for i in range(n):
+        size = shift if i < nx else graph.zero
+        for (row, j), constant in entries.items():
+            if row == i:
+                entry = graph.leaf("y", i * n + j) if constant is None else graph.constant(constant)
+                size = graph.add(size, graph.call("fabs", entry))
+        total = graph.add(total, graph.mul(graph.call("fabs", factors[i, i]), size))
+    return total
+
+
+def solve_text(elimination: Elimination, symbol: str, width: int, second: Sequence[tuple[int, int]] = ()) -> str:
+    """LLVM IR of `symbol`: solves in place for the flat vector in `out` with the factors in `p`, rows of `width` included.
+
+    First `y` is added to `out`; after the n leading elements are solved, the rows get second derivatives times these:
+    `yd` holds one row for each (equation, unknown) in `second`.
+    """
+    kind = "double"
     lines: list[str] = []
     count = 0
 
@@ -99,24 +124,43 @@ def solve_text(elimination: Elimination, symbol: str, width: int) -> str:
     def element(argument: str, offset: int) -> str:
         return f"%{argument}" if offset == 0 else emit(f"getelementptr double, ptr %{argument}, i64 {offset}")
 
-    def factor(i: int, j: int) -> str:
-        value = emit(f"load double, ptr {element('p', elimination.places[i, j])}, align 8")
-        if not width:
+    def load(argument: str, offset: int) -> str:
+        return emit(f"load {kind}, ptr {element(argument, offset)}, align 8")
+
+    def splat(value: str) -> str:
+        if kind == "double":
             return value
         one = emit(f"insertelement {kind} undef, double {value}, i32 0")
         return emit(f"shufflevector {kind} {one}, {kind} undef, <{width} x i32> zeroinitializer")
 
-    places = {k: element("out", k * max(width, 1)) for k in elimination.order}
-    x = {k: emit(f"load {kind}, ptr {places[k]}, align 8") for k in elimination.order}
-    for k in elimination.order:
-        for i in elimination.lower[k]:
-            product = emit(f"fmul contract {kind} {factor(i, k)}, {x[k]}")
-            x[i] = emit(f"fsub contract {kind} {x[i]}, {product}")
-    for k in reversed(elimination.order):
-        for j in elimination.upper[k]:
-            product = emit(f"fmul contract {kind} {factor(k, j)}, {x[j]}")
-            x[k] = emit(f"fsub contract {kind} {x[k]}, {product}")
-        x[k] = emit(f"fmul contract {kind} {x[k]}, {factor(k, k)}")
-        lines.append(f"  store {kind} {x[k]}, ptr {places[k]}, align 8")
+    def factor(i: int, j: int) -> str:
+        return splat(emit(f"load double, ptr {element('p', elimination.places[i, j])}, align 8"))
+
+    def solve(x: dict[int, str], at: int, step: int) -> None:
+        for k in elimination.order:
+            for i in elimination.lower[k]:
+                product = emit(f"fmul contract {kind} {factor(i, k)}, {x[k]}")
+                x[i] = emit(f"fsub contract {kind} {x[i]}, {product}")
+        for k in reversed(elimination.order):
+            for j in elimination.upper[k]:
+                product = emit(f"fmul contract {kind} {factor(k, j)}, {x[j]}")
+                x[k] = emit(f"fsub contract {kind} {x[k]}, {product}")
+            x[k] = emit(f"fmul contract {kind} {x[k]}, {factor(k, k)}")
+            lines.append(f"  store {kind} {x[k]}, ptr {element('out', at + step * k)}, align 8")
+
+    def start(at: int, step: int) -> dict[int, str]:
+        places = {k: at + step * k for k in elimination.order}
+        return {k: emit(f"fadd contract {kind} {load('out', q)}, {load('y', q)}") for k, q in places.items()}
+
+    values = start(0, 1)
+    solve(values, 0, 1)
+    if width:
+        n = len(elimination.order)
+        kind = f"<{width} x double>"
+        rows = start(n, width)
+        for k, (i, j) in enumerate(second):
+            product = emit(f"fmul contract {kind} {load('yd', k * width)}, {splat(values[j])}")
+            rows[i] = emit(f"fadd contract {kind} {rows[i]}, {product}")
+        solve(rows, n, width)
     arguments = ", ".join(f"ptr %{a}" if a != "out" else "ptr noalias %out" for a in ARGUMENTS)
     return f"define void @{symbol}({arguments}) nounwind {{\n" + "\n".join(lines) + "\n  ret void\n}"

@@ -18,18 +18,15 @@ from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.result import Simulation, Statistics
-from hvdc_ident.simulate.structure import NAMES, Structure
+from hvdc_ident.simulate.status import HINTS
+from hvdc_ident.simulate.status import NAMES as STATUS
+from hvdc_ident.simulate.structure import NAMES, Structure, padded
 from hvdc_ident.trajectory import Array, Trajectory
 
 Method = Literal["auto", "explicit", "rosenbrock"]
-STATUS = ("converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff")
-HINTS = {
-    "step-limit": "raise max_steps, loosen rtol, or look for a very fast part of the model",
-    "not-finite": "a value grew without bound or left a function's domain: check parameter values and limits",
-    "chatter": "a limit switches on and off without end: add a hysteresis or a small lag where it acts",
-    "inconsistent": "the algebraic loop has no solution there: check the operating point, or give the unknown another start",
-    "stiff": "use the Rosenbrock method",
-}
+
+
+_COUNTED = ["accepted", "rejected", "events", "evaluations", "segments", "forced_steps"]
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,6 @@ class Engine:
         self._code = self.structure.compile()
         self._late: Code | None = None
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
-        factors = self.structure.elimination.count if self.structure.elimination else 0
         self._dims = np.array(
             [
                 s.nx,
@@ -62,9 +58,6 @@ class Engine:
                 s.no,
                 s.np,
                 s.width,
-                s.n_hess,
-                self.structure.moves_by_itself,
-                factors,
             ],
             dtype=np.int64,
         )
@@ -72,6 +65,7 @@ class Engine:
         self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
         self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
         self._explicit: bool | None = None
+        self._states: dict[bool, tuple[Any, int]] = {}
 
     # --- the start ---
 
@@ -108,13 +102,11 @@ class Engine:
 
     def constants(self, p: Array) -> Array:
         """Delay times, sampling periods and compute times, with their rows over the parameters."""
-        from hvdc_ident.simulate.steps import CONST
-
         s = self.structure.sizes
         count = s.nd + 2 * s.nq
         values = np.zeros(count * (1 + s.width) + 1)
         if count:
-            evaluate(self._address[CONST], np.zeros(1), np.zeros(1), p, np.zeros(1), values)
+            evaluate(self._address[NAMES.index("const")], np.zeros(1), np.zeros(1), p, np.zeros(1), values)
             m = self.structure.model
             names = [*m.delays, *m.sampled]
             for k, name in enumerate(names):
@@ -153,7 +145,7 @@ class Engine:
 
         inputs: one InputSignal an input. first: where the run starts, s (default: the first time).
         """
-        from hvdc_ident.simulate.driver import EXPLICIT, ROSENBROCK, integrate
+        from hvdc_ident.simulate.driver import integrate
 
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
@@ -170,25 +162,25 @@ class Engine:
         times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
         values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
         breaks = np.array(sorted({b for i in inputs if i.breaks.size for b in i.breaks.tolist() if begin < b < end}))
-        out = np.zeros((time.size, max(s.no * (1 + s.width), 1)))
+        out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else scale
         tol = tolerance
-        kind = EXPLICIT if self._is_explicit(method, p, y, w, end - begin) else ROSENBROCK
+        t_out = time if time.flags.carray else time.copy()
+        explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
-            if kind == ROSENBROCK:
-                self._compile_late()
-            counts, modes = np.zeros(6, dtype=np.int64), np.zeros(max(s.ns, 1))
-            status, reached = integrate(
-                self._address, self._dims, self._hess_row, self._hess_column, kind, p, y.copy(), w.copy(), np.zeros_like(w), constants,
-                begin, end, breaks, pointer, times, values, time, out, sizes, tol.rtol, tol.atol, tol.max_steps, counts, modes,
+            state, work = self._state(not explicit)
+            run = state[0]
+            run["start"], run["end"], run["rtol"], run["atol"], run["max_steps"] = begin, end, tol.rtol, tol.atol, tol.max_steps
+            status = integrate(
+                state, work, y, w, p, constants, breaks, pointer, times, values, t_out, out, sizes,
+                self._hess_row, self._hess_column,
             )  # fmt: skip
             if STATUS[status] == "stiff" and method == "auto":
-                self._explicit, kind = False, ROSENBROCK
+                self._explicit = explicit = False
                 continue
             break
-        statistics = Statistics(
-            STATUS[status], "explicit" if kind == EXPLICIT else "rosenbrock", *(int(c) for c in counts)
-        )
+        reached = float(run["t"])
+        statistics = Statistics(STATUS[status], "explicit" if explicit else "rosenbrock", *run[_COUNTED].item())
         if status:
             raise SimulationError(
                 f"the simulation of model '{self.structure.model.name}' stopped: {STATUS[status]}",
@@ -198,12 +190,46 @@ class Engine:
             )
         return out, statistics
 
-    def _compile_late(self) -> None:
-        """Nothing; the code that only the Rosenbrock method needs is there."""
-        if self._late is None:
+    def _state(self, rosenbrock: bool) -> tuple[Any, Array]:
+        """A new run's record, (1,), with sizes and addresses, and its workspace.
+
+        The code that only the Rosenbrock method needs is there afterwards.
+        """
+        if rosenbrock and self._late is None:
             self._late = self.structure.compile_late()
             for name, address in self._late.address.items():
                 self._address[NAMES.index(name)] = address
+            self._states.clear()
+        if rosenbrock not in self._states:
+            self._states[rosenbrock] = self._template(rosenbrock)
+        template, room = self._states[rosenbrock]
+        return template.copy(), np.zeros(room)
+
+    def _template(self, rosenbrock: bool) -> tuple[Any, int]:
+        """The record before a run, and how many doubles of workspace a run takes."""
+        from hvdc_ident.simulate.driver import room
+        from hvdc_ident.simulate.state import RUN
+
+        s = self.structure.sizes
+        n, address = s.nx + s.nz, dict(zip(NAMES, self._address.tolist(), strict=True))
+        given = {k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")} | {
+            "n": n,
+            "size": n * (1 + s.width),
+            "stride": padded(n * (1 + s.width)),
+            "nw": 1 + s.nu + s.nd + s.nq,
+            "hessians": s.n_hess if rosenbrock else 0,
+            "factors": self.structure.elimination.count if rosenbrock and self.structure.elimination else 0,
+            "timed": self.structure.moves_by_itself,
+            "rosenbrock": rosenbrock,
+            **{f"do_{k}": v for k, v in address.items()},
+            "do_rhs": address["fs" if s.width else "f"],
+            "do_observe": address["outs" if s.width else "out"],
+            "do_sources": address["srcs" if s.width else "src"],
+        }
+        state = np.zeros(1, RUN)
+        for name, value in given.items():
+            state[name] = value
+        return state, int(room(state.copy()))
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """Whether the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
@@ -226,13 +252,11 @@ class Engine:
 
     def jacobian(self, p: Array, y: Array, w: Array) -> Array:
         """d[f; g]/d[x; z], (n, n), at y and w with modes as the values say."""
-        from hvdc_ident.simulate.steps import JAC, MODES
-
         s = self.structure.sizes
         n = s.nx + s.nz
         m, jac = np.zeros(max(s.ns, 1)), np.zeros((n, n))
-        evaluate(self._address[MODES], y, w, p, m, m)
-        evaluate(self._address[JAC], y, w, p, m, jac.reshape(-1))
+        evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
+        evaluate(self._address[NAMES.index("jac")], y, w, p, m, jac.reshape(-1))
         return jac
 
 

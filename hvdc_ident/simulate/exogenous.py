@@ -5,37 +5,55 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-NODES = 5  # a delayed signal is kept as a quartic in each step, through five equidistant values
+from hvdc_ident.simulate.memory import indices, table, vector
+from hvdc_ident.simulate.state import NODES
 
 
 @njit(cache=True, error_model="numpy")
-def enter_segment(t, tb, pointer, times, values, at):  # type: ignore[no-untyped-def]
-    """Moves every input's place `at` to the piece right of t; says whether that piece reaches to tb for all of them."""
+def outside(r, t, ta):  # type: ignore[no-untyped-def]
+    """Writes all that comes from outside at t, within the segment from ta to r.tb, into w and wd."""
+    vector(r.w, 1)[0] = t
+    if r.quiet:
+        return
+    if not r.still:
+        _inputs(r, t)
+    if r.nd:
+        _delayed(r, t, ta)
+
+
+@njit(cache=True, error_model="numpy")
+def enter_segment(r):  # type: ignore[no-untyped-def]
+    """Moves every input's place to the piece right of r.t; says whether that piece reaches to r.tb for all of them."""
+    pointer, at = indices(r.pointer, r.nu + 1), indices(r.at, r.nu)
+    times = vector(r.times, pointer[r.nu])
     whole = True
-    for i in range(at.size):
+    for i in range(r.nu):
         first, last = pointer[i], pointer[i + 1]
         k = at[i]
-        while k + 1 < last and times[k + 1] <= t:
+        while k + 1 < last and times[k + 1] <= r.t:
             k += 1
-        while k > first and times[k] > t:
+        while k > first and times[k] > r.t:
             k -= 1
         at[i] = k
         end = times[k + 1] if k + 1 < last else np.inf
-        if times[k] > t:  # before the first point
+        if times[k] > r.t:  # before the first point
             end = times[k]
-        whole = whole and end >= tb
+        whole = whole and end >= r.tb
     return whole
 
 
 @njit(cache=True, error_model="numpy")
-def inputs(t, tb, pointer, times, values, at, w, wd):  # type: ignore[no-untyped-def]
-    """Writes the inputs and their slopes at t into w and wd: at tb, the segment's end, the values before a jump."""
-    for i in range(at.size):
+def _inputs(r, t):  # type: ignore[no-untyped-def]
+    """Writes the inputs and their slopes at t into w and wd: at r.tb, the segment's end, the values before a jump."""
+    pointer, at = indices(r.pointer, r.nu + 1), indices(r.at, r.nu)
+    times, values = vector(r.times, pointer[r.nu]), vector(r.values, pointer[r.nu])
+    w, wd = vector(r.w, r.nw), vector(r.wd, r.nw)
+    for i in range(r.nu):
         first, last = pointer[i], pointer[i + 1]
         k = at[i]
-        while k + 1 < last and (times[k + 1] < t or (times[k + 1] == t and t < tb)):
+        while k + 1 < last and (times[k + 1] < t or (times[k + 1] == t and t < r.tb)):
             k += 1
-        while k > first and (times[k] > t or (times[k] == t and t >= tb and k > first)):
+        while k > first and (times[k] > t or (times[k] == t and t >= r.tb and k > first)):
             k -= 1
         if k + 1 < last and t >= times[k] and times[k + 1] > times[k]:
             slope = (values[k + 1] - values[k]) / (times[k + 1] - times[k])
@@ -47,42 +65,48 @@ def inputs(t, tb, pointer, times, values, at, w, wd):  # type: ignore[no-untyped
 
 
 @njit(cache=True, error_model="numpy")
-def delayed(t, ta, tb, start, count, h_t, h_h, h_c, before, lag, slope_p, width, first, total, w, wd):  # type: ignore[no-untyped-def]
+def _delayed(r, t, ta):  # type: ignore[no-untyped-def]
     """Writes the delayed signals, their rates and their rows over the parameters at t into w and wd.
 
-    The history is (count) steps from h_t of length h_h with polynomials h_c (step, delay, 5, 1 + width). Before the start
-    the signals are constant: `before` (delay, 1 + width). `lag` (delay,) s; slope_p (delay, width): its derivatives.
-    Instants are kept just inside the segment [ta, tb], so that a jump at its ends is seen from the inside.
+    The history has one row a step: its instant, its length, then polynomials (delay, 5, 1 + width). Before the start the
+    signals are constant. Instants are kept just inside the segment, so that a jump at its ends is seen from the inside.
     """
-    inside = 1e-13 * max(1.0, abs(tb))
-    for i in range(lag.size):
-        s = min(max(t, ta + inside), tb - inside) - lag[i]
-        value_row, rate_row = total + i * width, total + i * width
-        if s <= start or count == 0:
-            w[first + i] = before[i, 0]
-            wd[first + i] = 0.0
-            for c in range(width):
-                w[value_row + c] = before[i, 1 + c]
-                wd[rate_row + c] = 0.0
+    nd, width, first = r.nd, r.width, 1 + r.nu
+    rows = 1 + width
+    line = 2 + nd * NODES * rows
+    history, before = table(r.history, r.kept, line), table(r.before, nd, rows)
+    lag, lag_p = vector(r.lag, nd), table(r.lag_p, nd, width)
+    w, wd = vector(r.w, r.nw + nd * width), vector(r.wd, r.nw + nd * width)
+    inside = 1e-13 * max(1.0, abs(r.tb))
+    for i in range(nd):
+        s = min(max(t, ta + inside), r.tb - inside) - lag[i]
+        row = r.nw + i * width
+        if s <= r.start or r.kept == 0:
+            w[first + i], wd[first + i] = before[i, 0], 0.0
+            for k in range(width):
+                w[row + k], wd[row + k] = before[i, 1 + k], 0.0
             continue
-        low, high = 0, count - 1
+        low, high = 0, r.kept - 1
         while low < high:
             middle = (low + high + 1) // 2
-            if h_t[middle] <= s:
+            if history[middle, 0] <= s:
                 low = middle
             else:
                 high = middle - 1
-        x = (s - h_t[low]) / h_h[low]
-        c = h_c[low, i]
-        scale = 1.0 / h_h[low]
-        w[first + i] = c[0, 0] + x * (c[1, 0] + x * (c[2, 0] + x * (c[3, 0] + x * c[4, 0])))
-        rate = scale * (c[1, 0] + x * (2 * c[2, 0] + x * (3 * c[3, 0] + x * 4 * c[4, 0])))
-        bend = scale * scale * (2 * c[2, 0] + x * (6 * c[3, 0] + x * 12 * c[4, 0]))
-        wd[first + i] = rate
-        for k in range(width):
-            j = 1 + k
-            w[value_row + k] = c[0, j] + x * (c[1, j] + x * (c[2, j] + x * (c[3, j] + x * c[4, j]))) - rate * slope_p[i, k]
-            wd[rate_row + k] = scale * (c[1, j] + x * (2 * c[2, j] + x * (3 * c[3, j] + x * 4 * c[4, j]))) - bend * slope_p[i, k]
+        scale = 1.0 / history[low, 1]
+        x = (s - history[low, 0]) / history[low, 1]
+        c = table(r.history + 8 * (low * line + 2 + i * NODES * rows), NODES, rows)
+        rate, bend = 0.0, 0.0
+        for j in range(rows):
+            value = c[0, j] + x * (c[1, j] + x * (c[2, j] + x * (c[3, j] + x * c[4, j])))
+            slope = scale * (c[1, j] + x * (2 * c[2, j] + x * (3 * c[3, j] + x * 4 * c[4, j])))
+            if j == 0:
+                rate = slope
+                bend = scale * scale * (2 * c[2, 0] + x * (6 * c[3, 0] + x * 12 * c[4, 0]))
+                w[first + i], wd[first + i] = value, slope
+            else:  # the delay itself may depend on the parameter
+                w[row + j - 1] = value - rate * lag_p[i, j - 1]
+                wd[row + j - 1] = slope - bend * lag_p[i, j - 1]
 
 
 @njit(cache=True, error_model="numpy")

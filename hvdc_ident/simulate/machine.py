@@ -1,6 +1,6 @@
 """Machine code from graph nodes: LLVM IR written straight from the graph, compiled in a fraction of a second.
 
-Every function has the one signature `void f(y, w, wd, p, m, out)` of pointers to doubles (`ARGUMENTS`), so that an
+Every function has the one signature `void f(y, yd, w, wd, p, m, out)` of pointers to doubles (`ARGUMENTS`), so that an
 integrator compiled once can call the functions of any model by address. A matrix row over the sensitivity parameters is
 one LLVM vector, which the compiler turns into the machine's own vector instructions.
 """
@@ -22,7 +22,8 @@ from hvdc_ident.trajectory import Array
 
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
 _LIBM = ("tan", "tanh", "asin", "acos", "atan", "atan2")
-_INTRINSIC = ("sqrt", "exp", "log", "sin", "cos")
+_INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs")
+LANES = 4  # instants that a function over several of them takes at once
 _serial = itertools.count()
 
 
@@ -45,6 +46,7 @@ class Function:
     nodes: Sequence[tuple[int, int]] = ()  # (place, node)
     rows: Sequence[tuple[int, Row]] = ()  # (place, row)
     live: bool = False  # conditions by comparison instead of by frozen mode
+    stride: tuple[int, int] | None = None  # of y and out between instants, doubles: all four of them in one call
     hot: bool = False  # called in every step: worth the compiler's full effort
 
 
@@ -69,7 +71,7 @@ class Code:
             text = "\n".join(
                 [
                     *_declarations(),
-                    *(_Emitter(graph, f, names[f.name], width).text() for f in chosen),
+                    *(function_text(graph, f, names[f.name], width) for f in chosen),
                     *(t(names[n]) for n, t in written.items() if hot),
                 ]
             )
@@ -89,6 +91,7 @@ def _close(engines: list[llvm.ExecutionEngine]) -> None:
 def _declarations() -> list[str]:
     lines = [f"declare double @llvm.{f}.f64(double)" for f in _INTRINSIC]
     lines += ["declare double @llvm.pow.f64(double, double)", "declare double @atan2(double, double)"]
+    lines += [f"declare <{LANES} x double> @llvm.sqrt.v{LANES}f64(<{LANES} x double>)"]
     return lines + [f"declare double @{f}(double)" for f in _LIBM if f != "atan2"]
 
 
@@ -120,11 +123,14 @@ def _number(value: float) -> str:
 
 def function_text(graph: Graph, function: Function, symbol: str, width: int) -> str:
     """LLVM IR of one function of the graph under the given symbol."""
-    return _Emitter(graph, function, symbol, width).text()
+    emitter = _LanesEmitter if function.stride else _Emitter
+    return emitter(graph, function, symbol, width).text()
 
 
 class _Emitter:
     """Writes one function."""
+
+    kind, bit = "double", "i1"
 
     def __init__(self, graph: Graph, function: Function, symbol: str, width: int) -> None:
         self.graph, self.function, self.symbol, self.width = graph, function, symbol, width
@@ -136,9 +142,9 @@ class _Emitter:
     def text(self) -> str:
         f = self.function
         for place, node in f.nodes:
-            self._store("double", self._value(node), place)
+            self._node(place, self._value(node))
         for place, row in f.rows:
-            self._store(f"<{self.width} x double>", self._row(row), place)
+            self._row(place, row)
         arguments = ", ".join(f"ptr noalias %{a}" if a == "out" else f"ptr readonly %{a}" for a in ARGUMENTS)
         return f"define void @{self.symbol}({arguments}) nounwind {{\n" + "\n".join(self.lines) + "\n  ret void\n}"
 
@@ -155,24 +161,33 @@ class _Emitter:
         pointer = self._pointer("out", place)
         self.lines.append(f"  store {kind} {value}, ptr {pointer}, align 8")
 
-    def _row(self, row: Row) -> str:
+    def _node(self, place: int, value: str) -> None:
+        """Stores a node's value."""
+        self._store("double", value, place)
+
+    def _row(self, place: int, row: Row) -> None:
+        """Stores a row."""
         kind = f"<{self.width} x double>"
         total = "zeroinitializer"
         for column, node in row.scalars.items():
             total = self._emit(f"insertelement {kind} {total}, double {self._value(node)}, i32 {column}")
         for node, argument, offset in row.products:
-            key = (argument, offset)
-            if key not in self.vectors:
-                self.vectors[key] = self._emit(f"load {kind}, ptr {self._pointer(argument, offset)}, align 8")
-            factor = self._value(node)
-            if self.graph.value(node) == 1.0:
-                product = self.vectors[key]
-            else:
+            vector, factor = self._vector(argument, offset), self._value(node)
+            product = vector
+            if self.graph.value(node) != 1.0:
                 one = self._emit(f"insertelement {kind} undef, double {factor}, i32 0")
                 splat = self._emit(f"shufflevector {kind} {one}, {kind} undef, <{self.width} x i32> zeroinitializer")
-                product = self._emit(f"fmul contract {kind} {splat}, {self.vectors[key]}")
+                product = self._emit(f"fmul contract {kind} {splat}, {vector}")
             total = product if total == "zeroinitializer" else self._emit(f"fadd contract {kind} {total}, {product}")
-        return total
+        self._store(kind, total, place)
+
+    def _vector(self, argument: str, offset: int) -> str:
+        """The register of a row of an argument."""
+        key = (argument, offset)
+        if key not in self.vectors:
+            pointer = self._pointer(argument, offset)
+            self.vectors[key] = self._emit(f"load <{self.width} x double>, ptr {pointer}, align 8")
+        return self.vectors[key]
 
     def _value(self, node: int) -> str:
         """The register or constant of a node, whatever it needs emitted first: iterative, for deep graphs."""
@@ -196,42 +211,118 @@ class _Emitter:
             return (self.graph.switches[key[1]],) if self.function.live else ()
         return self.graph.arguments(n)
 
+    def _constant(self, value: float) -> str:
+        return _number(value)
+
+    def _leaf(self, argument: str, index: int) -> str:
+        return self._emit(f"load double, ptr {self._pointer(argument, index)}, align 8")
+
+    def _function(self, op: str, x: list[str]) -> str:
+        name = f"llvm.{op}.f64" if op in _INTRINSIC or op == "pow" else op
+        return self._emit(f"call double @{name}(" + ", ".join(f"double {v}" for v in x) + ")")
+
     def _instruction(self, n: int) -> str:
         op, *a = self.graph.nodes[n]
+        kind, bit = self.kind, self.bit
         if op == "const":
-            return _number(a[0])
+            return self._constant(a[0])
         if op == "bool":
-            return "true" if a[0] else "false"
+            return self._truth(bool(a[0]))
         if op == "leaf":
-            return self._emit(f"load double, ptr {self._pointer(a[0], a[1])}, align 8")
+            return self._leaf(a[0], a[1])
         if op == "switch":
             if self.function.live:
-                return self._emit(f"fcmp olt double {self.names[self.graph.switches[a[0]]]}, {_number(0.0)}")
-            mode = self._emit(f"load double, ptr {self._pointer('m', a[0])}, align 8")
-            return self._emit(f"fcmp ogt double {mode}, {_number(0.5)}")
+                return self._emit(f"fcmp olt {kind} {self.names[self.graph.switches[a[0]]]}, {self._constant(0.0)}")
+            return self._emit(f"fcmp ogt {kind} {self._leaf('m', a[0])}, {self._constant(0.5)}")
         x = [self.names[k] for k in a]
         if op in ("add", "sub", "mul", "div"):
-            return self._emit(f"f{op} contract double {x[0]}, {x[1]}")
+            return self._emit(f"f{op} contract {kind} {x[0]}, {x[1]}")
         if op == "inverse":  # 1/x, and 0 where x is 0
-            quotient = self._emit(f"fdiv double {_number(1.0)}, {x[0]}")
-            zero = self._emit(f"fcmp oeq double {x[0]}, {_number(0.0)}")
-            return self._emit(f"select i1 {zero}, double {_number(0.0)}, double {quotient}")
+            quotient = self._emit(f"fdiv {kind} {self._constant(1.0)}, {x[0]}")
+            zero = self._emit(f"fcmp oeq {kind} {x[0]}, {self._constant(0.0)}")
+            return self._emit(f"select {bit} {zero}, {kind} {self._constant(0.0)}, {kind} {quotient}")
         if op == "sqrt0":  # the root of max(x, 0)
-            positive = self._emit(f"fcmp ogt double {x[0]}, {_number(0.0)}")
-            cut = self._emit(f"select i1 {positive}, double {x[0]}, double {_number(0.0)}")
-            return self._emit(f"call double @llvm.sqrt.f64(double {cut})")
+            positive = self._emit(f"fcmp ogt {kind} {x[0]}, {self._constant(0.0)}")
+            cut = self._emit(f"select {bit} {positive}, {kind} {x[0]}, {kind} {self._constant(0.0)}")
+            return self._function("sqrt", [cut])
         if op == "neg":
-            return self._emit(f"fneg double {x[0]}")
+            return self._emit(f"fneg {kind} {x[0]}")
         if op == "select":
-            return self._emit(f"select i1 {x[0]}, double {x[1]}, double {x[2]}")
+            return self._emit(f"select {bit} {x[0]}, {kind} {x[1]}, {kind} {x[2]}")
         if op == "not":
-            return self._emit(f"xor i1 {x[0]}, true")
+            return self._emit(f"xor {bit} {x[0]}, {self._truth(True)}")
         if op in ("and", "or"):
-            return self._emit(f"{op} i1 {x[0]}, {x[1]}")
-        if op == "pow":
-            return self._emit(f"call double @llvm.pow.f64(double {x[0]}, double {x[1]})")
-        name = f"llvm.{op}.f64" if op in _INTRINSIC else op
-        return self._emit(f"call double @{name}(" + ", ".join(f"double {v}" for v in x) + ")")
+            return self._emit(f"{op} {bit} {x[0]}, {x[1]}")
+        return self._function(op, x)
+
+    def _truth(self, value: bool) -> str:
+        return "true" if value else "false"
+
+
+class _LanesEmitter(_Emitter):
+    """Writes a function that works on several instants at once, one a lane.
+
+    `y` holds a flat vector and `out` a result for every instant, `stride` doubles apart; `yd` holds the instants. All
+    else (inputs, delayed and sampled signals, parameters, modes) is the same for all of them.
+    """
+
+    kind, bit = f"<{LANES} x double>", f"<{LANES} x i1>"
+
+    def __init__(self, graph: Graph, function: Function, symbol: str, width: int) -> None:
+        super().__init__(graph, function, symbol, width)
+        assert function.stride is not None
+        self.stride = function.stride
+
+    def _node(self, place: int, value: str) -> None:
+        for lane in range(LANES):
+            self._store("double", self._lane(value, lane), place + lane * self.stride[1])
+
+    def _row(self, place: int, row: Row) -> None:
+        kind = f"<{self.width} x double>"
+        scalars = {c: self._value(node) for c, node in row.scalars.items()}
+        factors = [self._value(node) for node, _, _ in row.products]
+        for lane in range(LANES):
+            total = "zeroinitializer"
+            for column, value in scalars.items():
+                total = self._emit(f"insertelement {kind} {total}, double {self._lane(value, lane)}, i32 {column}")
+            for (node, argument, offset), factor in zip(row.products, factors, strict=True):
+                vector = self._vector(argument, offset + (lane * self.stride[0] if argument == "y" else 0))
+                product = vector
+                if self.graph.value(node) != 1.0:
+                    mask = f"<{self.width} x i32> <" + ", ".join([f"i32 {lane}"] * self.width) + ">"
+                    splat = self._emit(f"shufflevector {self.kind} {factor}, {self.kind} undef, {mask}")
+                    product = self._emit(f"fmul contract {kind} {splat}, {vector}")
+                total = product if total == "zeroinitializer" else self._emit(f"fadd contract {kind} {total}, {product}")
+            self._store(kind, total, place + lane * self.stride[1])
+
+    def _lane(self, value: str, lane: int) -> str:
+        return self._emit(f"extractelement {self.kind} {value}, i32 {lane}")
+
+    def _constant(self, value: float) -> str:
+        return "<" + ", ".join([f"double {_number(value)}"] * LANES) + ">"
+
+    def _truth(self, value: bool) -> str:
+        return "<" + ", ".join([f"i1 {'true' if value else 'false'}"] * LANES) + ">"
+
+    def _leaf(self, argument: str, index: int) -> str:
+        if argument == "w" and index == 0:
+            return self._emit(f"load {self.kind}, ptr %yd, align 8")
+        if argument == "y":
+            return self._gather([super(_LanesEmitter, self)._leaf("y", index + k * self.stride[0]) for k in range(LANES)])
+        one = self._emit(f"insertelement {self.kind} undef, double {super()._leaf(argument, index)}, i32 0")
+        return self._emit(f"shufflevector {self.kind} {one}, {self.kind} undef, <{LANES} x i32> zeroinitializer")
+
+    def _gather(self, values: list[str]) -> str:
+        total = "undef"
+        for lane, value in enumerate(values):
+            total = self._emit(f"insertelement {self.kind} {total}, double {value}, i32 {lane}")
+        return total
+
+    def _function(self, op: str, x: list[str]) -> str:
+        if op == "sqrt":
+            return self._emit(f"call {self.kind} @llvm.sqrt.v{LANES}f64({self.kind} {x[0]})")
+        call = super()._function
+        return self._gather([call(op, [self._lane(v, lane) for v in x]) for lane in range(LANES)])
 
 
 def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:

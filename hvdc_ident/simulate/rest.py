@@ -7,9 +7,10 @@ from numba import njit
 
 from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.linear import lu, solve, solve_rows
-from hvdc_ident.simulate.steps import MODES, REST, REST_JAC, REST_P
+from hvdc_ident.simulate.structure import NAMES
 
 FOUND, SINGULAR, NOT_FOUND = range(3)
+MODES, REST, REST_JAC, REST_P = (NAMES.index(n) for n in ("modes", "rest", "rest_jac", "rest_p"))
 
 
 @njit(cache=True, error_model="numpy")

@@ -20,7 +20,7 @@ def fallback(
 ) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
     from hvdc_ident.simulate.machine import evaluate
-    from hvdc_ident.simulate.steps import MODES, REST, REST_JAC, REST_P
+    from hvdc_ident.simulate.rest import MODES, REST, REST_JAC, REST_P
 
     s = structure.sizes
     inner, extra = s.nx + s.nz, s.nd + s.nq

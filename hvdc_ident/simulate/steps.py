@@ -6,7 +6,10 @@ import numpy as np
 from numba import njit
 
 from hvdc_ident.simulate.call import call
+from hvdc_ident.simulate.exogenous import outside
+from hvdc_ident.simulate.lanes import column_sums, elementwise, weighted
 from hvdc_ident.simulate.linear import lu, solve, solve_rows
+from hvdc_ident.simulate.memory import indices, table, vector
 from hvdc_ident.simulate.tableaus import (
     DOPRI_A,
     DOPRI_DENSE,
@@ -20,202 +23,320 @@ from hvdc_ident.simulate.tableaus import (
     RODAS_TIME,
 )
 
-# Addresses, in the order of structure.NAMES.
-F, FS, JAC, HESS, FT, SW, SWS, SWD, MODES, OUT, OUTS, SRC, SRCS, SRCD, REST, REST_JAC, REST_P, CONST, LU, SOLVE, SOLVES = range(21)
+# --- both methods ---
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def error_norm(e, y, yn, n, rows, width, count, rtol, atol, scale, totals, floors):  # type: ignore[no-untyped-def]
-    """The largest weighted RMS error over the first `rows` of the n unknowns and of each parameter's sensitivities; > 1 is a rejection."""
+@njit(cache=True, error_model="numpy")
+def evaluate(r, function, y, out):  # type: ignore[no-untyped-def]
+    """Calls a generated function at the flat vector y; all are addresses."""
+    call(function, y, r.yd, r.w, r.wd, r.p, r.m, out)
+
+
+@elementwise
+def _horner(y, a, b, c, d, x):  # type: ignore[no-untyped-def]
+    return (y + x * (a + x * (b + x * (c + x * d))),)
+
+
+@elementwise
+def _horner_four(y, a, b, c, d, x0, x1, x2, x3):  # type: ignore[no-untyped-def]
+    return tuple(y + x * (a + x * (b + x * (c + x * d))) for x in (x0, x1, x2, x3))
+
+
+@elementwise
+def copy(x):  # type: ignore[no-untyped-def]
+    return (x,)
+
+
+@elementwise
+def _difference(a, b):  # type: ignore[no-untyped-def]
+    return (a - b,)
+
+
+@elementwise
+def _sum(a, b):  # type: ignore[no-untyped-def]
+    return (a + b,)
+
+
+@njit(cache=True, error_model="numpy")
+def interpolate(r, x, count, out):  # type: ignore[no-untyped-def]
+    """Writes the first `count` elements (and up to three more) of the step's quartic at x in 0..1 to the address out."""
+    line = 8 * r.stride
+    d = r.dense
+    _horner((count + 3) // 4 * 4, (r.y, d, d + line, d + 2 * line, d + 3 * line), (out,), (x,))
+
+
+@njit(cache=True, error_model="numpy")
+def interpolate_four(r, x0, x1, x2, x3):  # type: ignore[no-untyped-def]
+    """Writes the step's quartic at four places to the rows of r.block."""
+    line = 8 * r.stride
+    d, b = r.dense, r.block
+    places = (b, b + line, b + 2 * line, b + 3 * line)
+    _horner_four(r.stride, (r.y, d, d + line, d + 2 * line, d + 3 * line), places, (x0, x1, x2, x3))
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def error_norm(r, e, rows):  # type: ignore[no-untyped-def]
+    """The largest weighted RMS of the error e (address) over the first `rows` unknowns and each parameter's rows of these.
+
+    More than 1 is a rejection; infinite where something is no number.
+    """
     if rows == 0:
         return 0.0
-    total = 0.0
-    for k in range(rows):
-        r = e[k] / (atol + rtol * max(abs(y[k]), abs(yn[k])))
-        total += r * r
-    worst = total
-    if width:
-        es, ys, yns = e[n:].reshape(n, width), y[n:].reshape(n, width), yn[n:].reshape(n, width)
-        for c in range(width):
-            totals[c] = 0.0
-            floors[c] = atol / scale[c] if c < count else np.inf
-        for i in range(rows):
-            for c in range(width):
-                a, b = abs(ys[i, c]), abs(yns[i, c])
-                r = es[i, c] / (floors[c] + rtol * (a if a > b else b))
-                totals[c] += r * r
-        for c in range(count):
-            if not totals[c] <= worst:
-                worst = totals[c]
-    return np.sqrt(worst / rows)
+    y, yn, errors = vector(r.y, rows), vector(r.yn, rows), vector(e, rows)
+    rtol, atol = r.rtol, r.atol
+    worst = 0.0
+    for i in range(rows):
+        a, b = abs(y[i]), abs(yn[i])
+        share = errors[i] / (atol + rtol * (a if a > b else b))
+        worst += share * share
+    if r.width:
+        head = 8 * r.n
+        column_sums(rows, r.width, e + head, r.y + head, r.yn + head, r.floors, rtol, r.totals)
+        totals = vector(r.totals, r.width)
+        check = worst
+        for c in range(r.np):
+            check += totals[c]
+            worst = max(worst, totals[c])
+        if not check < np.inf:
+            return np.inf
+    return np.sqrt(worst / rows) if worst < np.inf else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def attempt(r):  # type: ignore[no-untyped-def]
+    """One step of length r.hs from (r.t, r.y) into r.yn; r.error says how good it is."""
+    # An unknown may have an infinite slope for an instant, as sqrt(1.1^2 - i^2) where i meets its limit. The
+    # states pass it; very short steps are judged by them alone.
+    rows = r.n if r.hs > 1e-6 * (r.end - r.start) or r.nx == 0 else r.nx
+    r.error = _rodas(r, rows) if r.rosenbrock else _dopri(r, rows)
+
+
+@njit(cache=True, error_model="numpy")
+def make_dense(r):  # type: ignore[no-untyped-def]
+    """Writes the quartic of the step that ended in r.yn into r.dense."""
+    if r.rosenbrock:
+        _rodas_dense(r)
+    else:
+        _dopri_dense(r)
+
+
+# --- RODAS5P ---
+
+
+def _rodas_point(stage):  # type: ignore[no-untyped-def]
+    """What a stage needs before its right-hand side: where it is taken (from stage 5 on, relative to the stage before)
+    and what is added to it."""
+
+    @elementwise
+    def point(base, mass, ft, *rest):  # type: ignore[no-untyped-def]
+        k, (inverse, push) = rest[:stage], rest[stage:]
+        weights = RODAS_A[stage, :stage] if stage < 6 else [0.0] * (stage - 1) + [1.0]
+        return base + weighted(weights, k), mass * (inverse * weighted(RODAS_C[stage, :stage], k)) + push * ft
+
+    return point
+
+
+@elementwise
+def _rodas_point_0(ft, push):  # type: ignore[no-untyped-def]
+    return (push * ft,)
+
+
+_rodas_point_1, _rodas_point_2, _rodas_point_3, _rodas_point_4 = (_rodas_point(s) for s in (1, 2, 3, 4))
+_rodas_point_5, _rodas_point_6, _rodas_point_7 = (_rodas_point(s) for s in (5, 6, 7))
+
+
+@elementwise
+def _rodas_quartic(y, yn, *k):  # type: ignore[no-untyped-def]
+    change = yn - y
+    a, b, c = (weighted(row, k) for row in RODAS_H)
+    return change + a, b - a, c - b, c * -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _rodas_prepare(r, stage):  # type: ignore[no-untyped-def]
+    """Writes r.u, where the stage's right-hand side is taken (r.y at stage 0), and r.add, what is added to it."""
+    n, line = r.stride, 8 * r.stride
+    k0 = r.k
+    k1, k2, k3, k4, k5, k6 = k0 + line, k0 + 2 * line, k0 + 3 * line, k0 + 4 * line, k0 + 5 * line, k0 + 6 * line
+    push = r.hs * RODAS_D[stage]
+    out, scalars = (r.u, r.add), (1.0 / r.hs, push)
+    if stage == 0:
+        _rodas_point_0(n, (r.ft,), (r.add,), (push,))
+    elif stage == 1:
+        _rodas_point_1(n, (r.y, r.mass, r.ft, k0), out, scalars)
+    elif stage == 2:
+        _rodas_point_2(n, (r.y, r.mass, r.ft, k0, k1), out, scalars)
+    elif stage == 3:
+        _rodas_point_3(n, (r.y, r.mass, r.ft, k0, k1, k2), out, scalars)
+    elif stage == 4:
+        _rodas_point_4(n, (r.y, r.mass, r.ft, k0, k1, k2, k3), out, scalars)
+    elif stage == 5:
+        _rodas_point_5(n, (r.y, r.mass, r.ft, k0, k1, k2, k3, k4), out, scalars)
+    elif stage == 6:
+        _rodas_point_6(n, (r.u, r.mass, r.ft, k0, k1, k2, k3, k4, k5), out, scalars)
+    else:
+        _rodas_point_7(n, (r.u, r.mass, r.ft, k0, k1, k2, k3, k4, k5, k6), out, scalars)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def interpolate(y, dense, x, size, u):  # type: ignore[no-untyped-def]
-    """Writes the first `size` elements of y + x (c1 + x (c2 + x (c3 + x c4))), the rows of dense, into u."""
-    a, b, c, d = dense[0], dense[1], dense[2], dense[3]
-    for k in range(size):
-        u[k] = y[k] + x * (a[k] + x * (b[k] + x * (c[k] + x * d[k])))
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def rodas_point(stage, y, k, u):  # type: ignore[no-untyped-def]
-    """Writes y + sum a_ij k_j of the stage into u; stages 6 and 7 add to what stage 5 left there."""
-    if stage >= 6:
-        for q in range(u.size):
-            u[q] += k[stage - 1, q]
-        return
-    for q in range(u.size):
-        u[q] = y[q]
-    for j in range(0, stage - 1, 2):  # two at a time: half the traffic
-        a, b = RODAS_A[stage, j], RODAS_A[stage, j + 1]
-        for q in range(u.size):
-            u[q] += a * k[j, q] + b * k[j + 1, q]
-    if stage % 2:
-        a = RODAS_A[stage, stage - 1]
-        for q in range(u.size):
-            u[q] += a * k[stage - 1, q]
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def rodas_matrix(address, factor_count, h, nx, jac, factors, shift, yd, m, matrix, pivots):  # type: ignore[no-untyped-def]
-    """Factors M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting into `matrix`, 0 if it is singular.
+def _rodas_matrix(r):  # type: ignore[no-untyped-def]
+    """Factors M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
 
     The generated one takes its pivots as they come: it is trusted where none is small against its row.
     """
-    n = jac.shape[0]
-    shift[0] = 1.0 / (h * RODAS_GAMMA)
-    if factor_count:
-        call(address[LU], jac, yd, shift, yd, yd, m, factors)
-        trusted = True
-        for i in range(n):
-            largest = shift[0] if i < nx else 0.0
-            for j in range(n):
-                largest = max(largest, abs(jac[i, j]))
-            trusted = trusted and abs(factors[i]) * largest < 1e7
-        if trusted:
+    shift = 1.0 / (r.hs * RODAS_GAMMA)
+    vector(r.shift, 1)[0] = shift
+    if r.factors:
+        call(r.do_lu, r.jac, r.yd, r.shift, r.yd, r.yd, r.m, r.factor)
+        if vector(r.factor, r.factors + 1)[r.factors] < 1e7:
             return 1
+    n = r.n
+    jac, matrix = table(r.jac, n, n), table(r.matrix, n, n)
     for i in range(n):
         for j in range(n):
             matrix[i, j] = -jac[i, j]
-    for i in range(nx):
-        matrix[i, i] += shift[0]
-    return 2 if lu(matrix, pivots) else 0
+    for i in range(r.nx):
+        matrix[i, i] += shift
+    return 2 if lu(matrix, indices(r.pivots, n)) else 0
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def rodas_stage(address, stage, h, forced, n, width, mass, hess_row, hess_column, hess, ft, kind, factors, matrix, pivots, u, k, c, yd, w, wd, p, m):  # type: ignore[no-untyped-def]
-    """Computes k[stage] from the stage's values u, with w set for the stage's time; mass is 1 where a row has a derivative."""
-    row = k[stage]
-    call(address[FS if width else F], u, yd, w, wd, p, m, row)
-    if stage > 0:
-        inverse = 1.0 / h
-        for q in range(c.size):
-            c[q] = 0.0
-        for j in range(0, stage - 1, 2):
-            a, b = RODAS_C[stage, j], RODAS_C[stage, j + 1]
-            for q in range(c.size):
-                c[q] += a * k[j, q] + b * k[j + 1, q]
-        if stage % 2:
-            a = RODAS_C[stage, stage - 1]
-            for q in range(c.size):
-                c[q] += a * k[stage - 1, q]
-        for q in range(c.size):
-            k[stage, q] += inverse * mass[q] * c[q]
-    if forced and RODAS_D[stage] != 0.0:
-        factor = h * RODAS_D[stage]
-        for q in range(c.size):
-            k[stage, q] += factor * ft[q]
-    if kind == 1:
-        call(address[SOLVE], yd, yd, w, wd, factors, m, row)
-    else:
-        solve(matrix, pivots, row[:n])
+def _rodas_solve(r, k):  # type: ignore[no-untyped-def]
+    """What the generated solve does, by dense linear algebra: from the right-hand side at the address k to the stage."""
+    n, width = r.n, r.width
+    _sum(r.stride, (k, r.add), (k,), ())
+    matrix, pivots, head = table(r.matrix, n, n), indices(r.pivots, n), vector(k, n)
+    solve(matrix, pivots, head)
     if width:
-        rows = row[n:].reshape(n, width)
-        for q in range(hess_row.size):
-            value = row[hess_column[q]]
-            if value != 0.0:
-                i = hess_row[q]
-                for r in range(width):
-                    rows[i, r] += hess[q, r] * value
-        if kind == 1:
-            call(address[SOLVES], yd, yd, w, wd, factors, m, rows)
-        else:
-            solve_rows(matrix, pivots, rows)
+        rows, hessian = table(k + 8 * n, n, width), table(r.hessian, r.hessians, width)
+        row, column = indices(r.hess_row, r.hessians), indices(r.hess_column, r.hessians)
+        for q in range(r.hessians):
+            for c in range(width):
+                rows[row[q], c] += hessian[q, c] * head[column[q]]
+        solve_rows(matrix, pivots, rows)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def rodas_stages(address, h, forced, n, width, mass, hess_row, hess_column, hess, ft, kind, factors, matrix, pivots, y, u, k, c, yd, w, wd, p, m, t, step_end):  # type: ignore[no-untyped-def]
-    """All stages of a step over which nothing comes from outside but time."""
+@njit(cache=True, error_model="numpy")
+def _rodas(r, rows):  # type: ignore[no-untyped-def]
+    outside(r, r.t, r.t)
+    if not r.again:
+        evaluate(r, r.do_jac, r.y, r.jac)
+        if r.forced:
+            evaluate(r, r.do_ft, r.y, r.ft)
+        if r.hessians:
+            evaluate(r, r.do_hess, r.y, r.hessian)
+    kind = _rodas_matrix(r)
+    if kind == 0:
+        return np.inf
+    r.evaluations += 8
     for stage in range(8):
-        w[0] = step_end if RODAS_TIME[stage] == 1.0 else t + RODAS_TIME[stage] * h
-        rodas_point(stage, y, k, u)
-        rodas_stage(address, stage, h, forced, n, width, mass, hess_row, hess_column, hess, ft, kind, factors, matrix, pivots, u, k, c, yd, w, wd, p, m)
+        if 0 < stage < 6:  # the later ones are taken at the same instant as 5
+            outside(r, r.step_end if stage == 5 else r.t + RODAS_TIME[stage] * r.hs, r.t)
+        _rodas_prepare(r, stage)
+        k = r.k + 8 * r.stride * stage
+        evaluate(r, r.do_rhs, r.u if stage else r.y, k)
+        if kind == 1:
+            call(r.do_solve, r.add, r.hessian, r.w, r.wd, r.factor, r.m, k)
+        else:
+            _rodas_solve(r, k)
+    error = r.k + 8 * r.stride * 7
+    _sum(r.stride, (r.u, error), (r.yn,), ())
+    return error_norm(r, error, rows)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def rodas_dense(k, y, yn, dense):  # type: ignore[no-untyped-def]
-    """Writes the four rows of the step's quartic."""
-    size = y.size
-    for q in range(size):
-        dense[0, q] = yn[q] - y[q]
-        dense[1, q] = 0.0
-        dense[2, q] = 0.0
-        dense[3, q] = 0.0
-    d0, d1, d2, d3 = dense[0], dense[1], dense[2], dense[3]
-    for s in range(8):
-        a, b, c = RODAS_H[0, s], RODAS_H[1, s], RODAS_H[2, s]
-        ks = k[s]
-        for q in range(size):
-            v = ks[q]
-            d0[q] += a * v
-            d1[q] += (b - a) * v
-            d2[q] += (c - b) * v
-            d3[q] -= c * v
+@njit(cache=True, error_model="numpy")
+def _rodas_dense(r):  # type: ignore[no-untyped-def]
+    s = 8 * r.stride
+    k, d = r.k, r.dense
+    stages = (k, k + s, k + 2 * s, k + 3 * s, k + 4 * s, k + 5 * s, k + 6 * s, k + 7 * s)
+    _rodas_quartic(r.stride, (r.y, r.yn, *stages), (d, d + s, d + 2 * s, d + 3 * s), ())
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def dopri_dense(k, y, yn, h, dense):  # type: ignore[no-untyped-def]
-    """Writes the four rows of the step's quartic."""
-    for q in range(y.size):
-        change = yn[q] - y[q]
-        bend = h * k[0, q] - change
-        curl = change - h * k[6, q] - bend
-        last = 0.0
-        for s in range(7):
-            last += DOPRI_DENSE[s] * k[s, q]
-        last *= h
-        dense[0, q] = change + bend
-        dense[1, q] = -bend + curl + last
-        dense[2, q] = -curl - 2.0 * last
-        dense[3, q] = last
+# --- DOPRI5 ---
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def dopri_point(stage, h, y, k, u):  # type: ignore[no-untyped-def]
-    """Writes y + h sum a_ij k_j of the stage into u."""
-    for q in range(u.size):
-        u[q] = y[q]
-    for j in range(stage):
-        factor = h * DOPRI_A[stage, j]
-        if factor != 0.0:
-            for q in range(u.size):
-                u[q] += factor * k[j, q]
+def _dopri_point(stage):  # type: ignore[no-untyped-def]
+    @elementwise
+    def point(y, *rest):  # type: ignore[no-untyped-def]
+        return (y + rest[stage] * weighted(DOPRI_A[stage, :stage], rest[:stage]),)
+
+    return point
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def dopri_error(h, k, e):  # type: ignore[no-untyped-def]
-    """Writes the embedded error into e."""
-    for q in range(e.size):
-        e[q] = 0.0
-    for s in range(7):
-        factor = h * DOPRI_E[s]
-        if factor != 0.0:
-            for q in range(e.size):
-                e[q] += factor * k[s, q]
+_dopri_point_1, _dopri_point_2, _dopri_point_3 = (_dopri_point(s) for s in (1, 2, 3))
+_dopri_point_4, _dopri_point_5, _dopri_point_6 = (_dopri_point(s) for s in (4, 5, 6))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def stage_time(method, stage):  # type: ignore[no-untyped-def]
-    """The stage's share of the step."""
-    return RODAS_TIME[stage] if method == 1 else DOPRI_TIME[stage]
+@elementwise
+def _dopri_error(*rest):  # type: ignore[no-untyped-def]
+    return (rest[7] * weighted(DOPRI_E, rest[:7]),)
+
+
+@elementwise
+def _dopri_quartic(y, yn, *rest):  # type: ignore[no-untyped-def]
+    k, h = rest[:7], rest[7]
+    change = yn - y
+    bend = h * k[0] - change
+    curl = change - h * k[6] - bend
+    last = h * weighted(DOPRI_DENSE, k)
+    return change + bend, curl - bend + last, curl * -1.0 - last * 2.0, last
+
+
+@njit(cache=True, error_model="numpy")
+def _dopri_prepare(r, stage):  # type: ignore[no-untyped-def]
+    """Writes where the stage's right-hand side is taken into r.u, or into r.yn for the last one; returns that address."""
+    n, line = r.stride, 8 * r.stride
+    k0 = r.k
+    k1, k2, k3, k4, k5 = k0 + line, k0 + 2 * line, k0 + 3 * line, k0 + 4 * line, k0 + 5 * line
+    out, scalars = (r.u,), (r.hs,)
+    if stage == 1:
+        _dopri_point_1(n, (r.y, k0), out, scalars)
+    elif stage == 2:
+        _dopri_point_2(n, (r.y, k0, k1), out, scalars)
+    elif stage == 3:
+        _dopri_point_3(n, (r.y, k0, k1, k2), out, scalars)
+    elif stage == 4:
+        _dopri_point_4(n, (r.y, k0, k1, k2, k3), out, scalars)
+    elif stage == 5:
+        _dopri_point_5(n, (r.y, k0, k1, k2, k3, k4), out, scalars)
+    else:
+        _dopri_point_6(n, (r.y, k0, k1, k2, k3, k4, k5), (r.yn,), scalars)
+        return r.yn
+    return r.u
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def _dopri_stiffness(r):  # type: ignore[no-untyped-def]
+    """The square of h times the largest mode, as the last two stages show it (Hairer and Wanner, IV.2)."""
+    nx = r.nx
+    before, after = vector(r.k + 40 * r.stride, nx), vector(r.k + 48 * r.stride, nx)
+    u, yn = vector(r.u, nx), vector(r.yn, nx)
+    top, bottom = 0.0, 0.0
+    for i in range(nx):
+        top += (after[i] - before[i]) ** 2
+        bottom += (yn[i] - u[i]) ** 2
+    return r.hs * r.hs * top / bottom if bottom > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _dopri(r, rows):  # type: ignore[no-untyped-def]
+    line = 8 * r.stride
+    if not r.fresh:
+        copy(r.stride, (r.k + 6 * line,), (r.k,), ())
+    r.evaluations += 6
+    for stage in range(1, 7):
+        outside(r, r.t + DOPRI_TIME[stage] * r.hs if stage < 5 else r.step_end, r.t)
+        evaluate(r, r.do_rhs, _dopri_prepare(r, stage), r.k + line * stage)
+    r.stiffness = _dopri_stiffness(r)
+    k = r.k
+    stages = (k, k + line, k + 2 * line, k + 3 * line, k + 4 * line, k + 5 * line, k + 6 * line)
+    _dopri_error(r.stride, stages, (r.e,), (r.hs,))
+    return error_norm(r, r.e, rows)
+
+
+@njit(cache=True, error_model="numpy")
+def _dopri_dense(r):  # type: ignore[no-untyped-def]
+    s = 8 * r.stride
+    k, d = r.k, r.dense
+    stages = (k, k + s, k + 2 * s, k + 3 * s, k + 4 * s, k + 5 * s, k + 6 * s)
+    _dopri_quartic(r.stride, (r.y, r.yn, *stages), (d, d + s, d + 2 * s, d + 3 * s), (r.hs,))

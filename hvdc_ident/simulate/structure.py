@@ -35,6 +35,7 @@ NAMES = (
     "modes",
     "out",
     "outs",
+    "rows",
     "src",
     "srcs",
     "srcd",
@@ -44,9 +45,13 @@ NAMES = (
     "const",
     "lu",
     "solve",
-    "solves",
 )
 LATE = ("hess",)  # beside the elimination: what only the Rosenbrock method needs
+
+
+def padded(count: int) -> int:
+    """The next multiple of four: compiled loops take four doubles at once."""
+    return -(-count // 4) * 4
 
 
 def torn(model: Model) -> tuple[str, ...]:
@@ -158,7 +163,7 @@ class Structure:
     @cached_property
     def sizes(self) -> Sizes:
         m, n = self.model, len(self.sensitivities)
-        width = 0 if n == 0 else 2 if n <= 2 else -(-n // 4) * 4
+        width = padded(n)
         return Sizes(
             len(self.states),
             len(self.unknowns),
@@ -246,6 +251,13 @@ class Structure:
             plain("swd", [self.rate(v, True) for v in g.switches]),
             plain("modes", modes, live=True),
             plain("out", self.observed, hot=not width),
+            Function(
+                "rows",
+                list(enumerate(self.observed)),
+                rows(self.observed, s.no),
+                hot=True,
+                stride=(padded(n * (1 + width)), s.no * (1 + width)),
+            ),
             plain("src", self.sources),
             plain("srcd", [self.rate(v, True) for v in self.sources]),
             both("const", self.timing),
@@ -309,9 +321,8 @@ class Structure:
         written: dict[str, Callable[[str], str]] = {}
         if e is not None:
             written["lu"] = lambda symbol: function_text(e.graph, e.function, symbol, 1)
-            written["solve"] = lambda symbol: solve_text(e, symbol, 0)
-            if width:
-                written["solves"] = lambda symbol: solve_text(e, symbol, width)
+            second = [(i, j) for i, j, _ in self.second]
+            written["solve"] = lambda symbol: solve_text(e, symbol, width, second)
         return Code(self.graph, [f for f in self.functions if f.name in LATE], max(width, 1), written)
 
 

@@ -1,0 +1,106 @@
+"""What a run is made of, as one record that compiled code reads and writes.
+
+Every kernel of the integrators takes this record instead of some forty arguments: sizes, addresses of the generated
+functions (`do_...`), addresses of the vectors in the workspace, tolerances, and where the run stands. The compiler's
+time grows with the arguments of a call, and so does the run's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hvdc_ident.simulate.structure import NAMES
+
+NODES = 5  # a delayed signal is kept as a quartic in each step, through five equidistant values
+
+SIZES = (
+    "nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width",  # as in structure.Sizes
+    "n",  # unknowns of the step: states and algebraic unknowns
+    "size",  # the flat vector: the n unknowns, then their rows over the parameters
+    "stride",  # the same, rounded up for loops by four
+    "nw",  # elements of w before its rows
+    "hessians",  # second derivatives
+    "factors",  # factors of the generated elimination; 0: dense pivoting alone
+    "timed",  # whether an equation uses time itself
+    "rosenbrock",  # the method
+)  # fmt: skip
+VECTORS = (
+    "y", "yn", "u",  # flat: at the step's start, at its end, at a stage
+    "k", "e", "dense",  # stages, error, the four rows of the step's quartic
+    "add", "mass", "ft",  # what a stage adds to the right-hand side, where it has a derivative, the derivative in time
+    "f_before", "f_after",  # right-hand sides at both sides of a switch or jump
+    "yd", "w", "wd", "p", "m",  # arguments of the generated functions
+    "jac", "matrix", "small", "hessian", "factor", "shift", "pivots", "small_pivots",  # linear algebra
+    "floors", "totals", "scale",  # error weights and sums of each parameter
+    "sv", "top", "slack", "sws",  # switches: values, largest so far, tolerance, rows
+    "src", "src_rate", "src_left",  # sources of delays and samples; the delays' before the present segment
+    "lag", "lag_p", "before",  # delays, their rows, the delayed signals before the start
+    "nodes", "history", "echo",  # history of delayed signals; instants at which jumps come back
+    "tick", "publish", "ticks", "pending", "pending_p", "publish_p",  # samples
+    "jump_p",  # derivative of the present jump's instant by the parameters
+    "constants", "breaks", "at", "pointer", "times", "values",  # timing constants; inputs
+    "hess_row", "hess_column",
+    "t_out", "out", "instants", "block",  # outputs; four instants and their flat vectors
+)  # fmt: skip
+COUNTS = (
+    "accepted", "rejected", "events", "evaluations", "segments", "forced_steps", "steps", "max_steps",
+    "n_out", "i_out", "n_breaks", "i_break", "echoes", "kept", "stiff", "chatter", "last_switch", "aim",
+)  # fmt: skip
+FLAGS = (
+    "still",  # no input has a slope in this segment
+    "quiet",  # nothing comes from outside in this segment but time
+    "forced",  # the right-hand side may change with time alone
+    "first",  # the first segment
+    "fresh",  # k[0] holds the derivative at (t, y)
+    "again",  # the step before was rejected: what was computed at (t, y) stands
+    "last",  # this step ends at the segment's end
+    "echo_now", "disturbed", "published",  # what happened at the present break
+)  # fmt: skip
+INSTANTS = (
+    "start", "end", "t", "tb",  # tb: the present segment's end
+    "h", "hs", "step_end",  # the step wanted, the step taken, its end
+    "rtol", "atol", "order", "shortest", "last_event", "error", "stiffness",
+)  # fmt: skip
+
+RUN = np.dtype(
+    [(f, np.int64) for f in (*SIZES, *(f"do_{n}" for n in NAMES), "do_rhs", "do_observe", "do_sources", *VECTORS)]
+    + [(f, np.int64) for f in (*COUNTS, *FLAGS)]
+    + [(f, np.float64) for f in INSTANTS]
+    + [("free", np.int64)]
+)
+
+
+@njit(cache=True, error_model="numpy")
+def _take(r, count):  # type: ignore[no-untyped-def]
+    """The address of the next `count` doubles of the workspace, rounded up for loops by four."""
+    address = r.free
+    r.free += 8 * ((count + 3) // 4 * 4 + 4)
+    return address
+
+
+@njit(cache=True, error_model="numpy")
+def arrange(r):  # type: ignore[no-untyped-def]
+    """Gives every vector of the workspace its place from r.free on; returns the end, so that from 0 it is the size."""
+    rows = 1 + r.width
+    r.y, r.yn, r.u = _take(r, r.size), _take(r, r.size), _take(r, r.size)
+    r.k, r.e, r.dense = _take(r, 8 * r.stride), _take(r, r.size), _take(r, 4 * r.stride)
+    r.add, r.mass, r.ft = _take(r, r.size), _take(r, r.size), _take(r, r.size)
+    r.f_before, r.f_after = _take(r, r.size), _take(r, r.size)
+    r.yd, r.m = _take(r, r.n), _take(r, r.ns)
+    r.w = _take(r, r.nw + (r.nd + r.nq) * r.width)
+    r.wd = _take(r, r.nw + (r.nd + r.nq) * r.width)
+    r.jac, r.matrix, r.small = _take(r, r.n * r.n), _take(r, r.n * r.n), _take(r, r.nz * r.nz)
+    r.hessian, r.factor, r.shift = _take(r, r.hessians * r.width), _take(r, r.factors + 1), _take(r, 1)
+    r.pivots, r.small_pivots = _take(r, r.n), _take(r, r.nz)
+    r.floors, r.totals = _take(r, r.width), _take(r, r.width)
+    r.sv, r.top, r.slack, r.sws = _take(r, r.ns), _take(r, r.ns), _take(r, r.ns), _take(r, r.ns * rows)
+    r.src, r.src_rate = _take(r, (r.nd + r.nq) * rows), _take(r, r.nd + r.nq)
+    r.src_left = _take(r, r.nd + r.nq)
+    r.lag, r.lag_p, r.before = _take(r, r.nd), _take(r, r.nd * r.width), _take(r, r.nd * rows)
+    r.nodes = _take(r, NODES * r.nd * rows)
+    r.tick, r.publish, r.ticks, r.pending = _take(r, r.nq), _take(r, r.nq), _take(r, r.nq), _take(r, r.nq)
+    r.pending_p, r.publish_p = _take(r, r.nq * r.width), _take(r, r.nq * r.width)
+    r.jump_p, r.at = _take(r, r.width), _take(r, r.nu)
+    r.instants, r.block = _take(r, 4), _take(r, 4 * r.stride)
+    return r.free
