@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
 from typing import Any, TypeVar
 
 V = TypeVar("V")
@@ -28,6 +28,16 @@ class FrozenMap(Mapping[str, V]):
 
     def __contains__(self, name: object) -> bool:
         return name in self._items
+
+    # The mixin's views go through __iter__ and __getitem__ for every item.
+    def keys(self) -> KeysView[str]:
+        return self._items.keys()
+
+    def values(self) -> ValuesView[V]:
+        return self._items.values()
+
+    def items(self) -> ItemsView[str, V]:
+        return self._items.items()
 
     def __hash__(self) -> int:
         if self._hash is None:

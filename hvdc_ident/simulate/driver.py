@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hvdc_ident.simulate.memory import address_of, indices, vector
+from hvdc_ident.simulate.memory import address_of, indices, record, vector
 from hvdc_ident.simulate.outputs import remember, write_rows
 from hvdc_ident.simulate.segments import begin_segment, end_segment, prepare_segment
 from hvdc_ident.simulate.state import NODES, arrange
@@ -151,14 +151,18 @@ def _run(r):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def integrate(state, work, y, w, p, constants, breaks, pointer, times, values, t_out, out, scale, hess_row, hess_column):  # type: ignore[no-untyped-def]
+def integrate(state, work, span, tolerance, max_steps, y, w, p, constants, breaks, pointer, times, values, t_out, out, scale, hess_row, hess_column):  # type: ignore[no-untyped-def]
     """Integrates from start to end; writes the outputs and their rows into out (n_out, no (1 + width)).
 
-    state: one RUN record with sizes, functions, tolerances, method, start and end; on return it says how it went and how
-    far it came (t). work: zeros, as many doubles as `arrange` asks for. y: the flat start vector, consistent to solver
-    tolerance. constants: delay times, sampling periods and compute times with their rows. Returns a status.
+    state: a RUN record as integers, with sizes, functions and method; on return it holds the counts. work: zeros, as many
+    doubles as `arrange` asks for. span: start and end. tolerance: relative, absolute. y: the flat start vector, consistent
+    to solver tolerance. constants: delay times, sampling periods and compute times with their rows.
+    Returns a status and the time reached.
     """
-    r = state[0]
+    r = record(address_of(state))
+    r.start, r.end = span
+    r.rtol, r.atol = tolerance
+    r.max_steps = max_steps
     r.free = address_of(work)
     arrange(r)
     r.p, r.constants, r.scale = address_of(p), address_of(constants), address_of(scale)
@@ -170,12 +174,13 @@ def integrate(state, work, y, w, p, constants, breaks, pointer, times, values, t
     for i in range(r.nu):
         at[i] = pointer[i]
     _begin(r, y, w)
-    return _run(r)
+    status = _run(r)
+    return status, r.t
 
 
 @njit(cache=True, error_model="numpy")
 def room(state):  # type: ignore[no-untyped-def]
     """How many doubles of workspace a run of these sizes takes."""
-    r = state[0]
+    r = record(address_of(state))
     r.free = 0
     return arrange(r) // 8

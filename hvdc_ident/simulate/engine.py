@@ -26,9 +26,6 @@ from hvdc_ident.trajectory import Array, Trajectory
 Method = Literal["auto", "explicit", "rosenbrock"]
 
 
-_COUNTED = ["accepted", "rejected", "events", "evaluations", "segments", "forced_steps"]
-
-
 @dataclass(frozen=True)
 class Tolerance:
     """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run."""
@@ -42,6 +39,7 @@ class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
     def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
+        announce_compilation()
         self.structure = Structure(model, sensitivities, outputs)
         s = self.structure.sizes
         self._code = self.structure.compile()
@@ -77,7 +75,6 @@ class Engine:
         from hvdc_ident.simulate.rest import FOUND, rest
         from hvdc_ident.simulate.steady import fallback
 
-        announce_compilation()
         s = self.structure.sizes
         n, extra = s.nx + s.nz, s.nd + s.nq
         m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
@@ -149,19 +146,9 @@ class Engine:
 
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
-        # "At the first row" is what stood before anything happened: the value from the left.
-        u = np.array(
-            [
-                i.values[0] if i.times.size == 1 or i.times[0] >= begin else float(i(np.nextafter(begin, -np.inf)))
-                for i in inputs
-            ]
-        )
+        u, *tables = _tables(tuple(inputs), begin, end)
         y, w = self.start(p, u, begin)
         constants = self.constants(p)
-        pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
-        times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
-        values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
-        breaks = np.array(sorted({b for i in inputs if i.breaks.size for b in i.breaks.tolist() if begin < b < end}))
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else scale
         tol = tolerance
@@ -169,18 +156,16 @@ class Engine:
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
             state, work = self._state(not explicit)
-            run = state[0]
-            run["start"], run["end"], run["rtol"], run["atol"], run["max_steps"] = begin, end, tol.rtol, tol.atol, tol.max_steps
-            status = integrate(
-                state, work, y, w, p, constants, breaks, pointer, times, values, t_out, out, sizes,
-                self._hess_row, self._hess_column,
+            status, reached = integrate(
+                state, work, (begin, end), (tol.rtol, tol.atol), tol.max_steps, y, w, p, constants, *tables,
+                t_out, out, sizes, self._hess_row, self._hess_column,
             )  # fmt: skip
             if STATUS[status] == "stiff" and method == "auto":
                 self._explicit = explicit = False
                 continue
             break
-        reached = float(run["t"])
-        statistics = Statistics(STATUS[status], "explicit" if explicit else "rosenbrock", *run[_COUNTED].item())
+        counts = state[self._counted].tolist()
+        statistics = Statistics(STATUS[status], "explicit" if explicit else "rosenbrock", *counts)
         if status:
             raise SimulationError(
                 f"the simulation of model '{self.structure.model.name}' stopped: {STATUS[status]}",
@@ -191,7 +176,7 @@ class Engine:
         return out, statistics
 
     def _state(self, rosenbrock: bool) -> tuple[Any, Array]:
-        """A new run's record, (1,), with sizes and addresses, and its workspace.
+        """A new run's record as integers, with sizes and addresses, and its workspace.
 
         The code that only the Rosenbrock method needs is there afterwards.
         """
@@ -208,7 +193,7 @@ class Engine:
     def _template(self, rosenbrock: bool) -> tuple[Any, int]:
         """The record before a run, and how many doubles of workspace a run takes."""
         from hvdc_ident.simulate.driver import room
-        from hvdc_ident.simulate.state import RUN
+        from hvdc_ident.simulate.state import COUNTED, RUN, place
 
         s = self.structure.sizes
         n, address = s.nx + s.nz, dict(zip(NAMES, self._address.tolist(), strict=True))
@@ -226,9 +211,10 @@ class Engine:
             "do_observe": address["outs" if s.width else "out"],
             "do_sources": address["srcs" if s.width else "src"],
         }
-        state = np.zeros(1, RUN)
+        state = np.zeros(len(RUN.fields or ()), dtype=np.int64)
         for name, value in given.items():
-            state[name] = value
+            state[place(name)] = value
+        self._counted = [place(name) for name in COUNTED]
         return state, int(room(state.copy()))
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
@@ -274,6 +260,21 @@ def announce_compilation() -> None:
             file=sys.stderr,
             flush=True,
         )
+
+
+@lru_cache(maxsize=64)
+def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Array, ...]:
+    """What an integration reads of its inputs: start values, breaks, then the pieces of all of them and their points."""
+    # "At the first row" is what stood before anything happened: the value from the left.
+    u = [
+        float(i.values[0] if i.times.size == 1 or i.times[0] >= begin else i(np.nextafter(begin, -np.inf)))
+        for i in inputs
+    ]
+    breaks = np.array(sorted({b for i in inputs if i.breaks.size for b in i.breaks.tolist() if begin < b < end}))
+    pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
+    times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
+    values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
+    return np.array(u), breaks, pointer, times, values
 
 
 @lru_cache(maxsize=32)

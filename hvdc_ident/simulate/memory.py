@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import types
+from numba import from_dtype, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
+from hvdc_ident.simulate.state import RUN
+
+_RUN = from_dtype(RUN)
 _VECTOR = types.Array(types.float64, 1, "C")
 _TABLE = types.Array(types.float64, 2, "C")
 _INDICES = types.Array(types.int64, 1, "C")
@@ -67,3 +70,13 @@ def table(typing_context: Any, address: Any, rows: Any, columns: Any) -> Any:
         return _view(context, builder, _TABLE, arguments[0], [arguments[1], arguments[2]])
 
     return _TABLE(types.intp, types.intp, types.intp), code
+
+
+@intrinsic
+def record(typing_context: Any, address: Any) -> Any:
+    """The run's record at an address."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(_RUN))
+
+    return _RUN(types.intp), code
