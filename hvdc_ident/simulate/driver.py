@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.memory import address_of, indices, record, vector
 from hvdc_ident.simulate.outputs import remember, write_rows
 from hvdc_ident.simulate.segments import begin_segment, end_segment, prepare_segment
@@ -17,7 +18,7 @@ from hvdc_ident.simulate.steps import attempt, make_dense
 from hvdc_ident.simulate.switches import AGAIN, NONE, find_switch, switch, widen
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def longer(rows, count, room):  # type: ignore[no-untyped-def]
     """The table with room for `room` more rows than `count`."""
     if count + room <= rows.shape[0]:
@@ -29,7 +30,7 @@ def longer(rows, count, room):  # type: ignore[no-untyped-def]
     return larger
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _begin(r, y, w):  # type: ignore[no-untyped-def]
     """Fills the workspace for a run from the flat start vector y and what comes from outside, w."""
     nd, nq, width = r.nd, r.nq, r.width
@@ -65,7 +66,7 @@ def _begin(r, y, w):  # type: ignore[no-untyped-def]
     r.last_event, r.last_switch, r.aim = -np.inf, -1, NONE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _step(r):  # type: ignore[no-untyped-def]
     """Tries one step, and what follows if it is good: outputs, history, a switch at its end. Returns a status."""
     r.steps += 1
@@ -104,7 +105,7 @@ def _step(r):  # type: ignore[no-untyped-def]
     return _accept(r, factor)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _accept(r, factor):  # type: ignore[no-untyped-def]
     """What follows a good step, whose length the next one takes `factor` times. Returns a status."""
     if r.nd or r.ns or (r.i_out < r.n_out and vector(r.t_out, r.n_out)[r.i_out] <= r.step_end):
@@ -123,31 +124,6 @@ def _accept(r, factor):  # type: ignore[no-untyped-def]
     if r.ns:
         widen(r)
     return CONVERGED if event == NONE else switch(r, event)
-
-
-@njit(cache=True, error_model="numpy")
-def _run(r):  # type: ignore[no-untyped-def]
-    """From the start to the end, or to where it is impossible to go on. Returns a status."""
-    # What has no size known beforehand: steps for delayed signals to look back to, jumps that will come back.
-    history = np.empty((64 if r.nd else 1, 2 + r.nd * NODES * (1 + r.width)))
-    echo = np.empty((16, 2 + r.width))
-    r.history, r.echo = address_of(history), address_of(echo)
-    while True:
-        echo = longer(echo, r.echoes, r.nd)
-        r.echo = address_of(echo)
-        if not begin_segment(r):
-            return INCONSISTENT
-        if not r.t < r.end:
-            return CONVERGED
-        prepare_segment(r)
-        while r.t < r.tb:
-            if r.nd:
-                history, echo = longer(history, r.kept, 1), longer(echo, r.echoes, r.nd)
-                r.history, r.echo = address_of(history), address_of(echo)
-            status = _step(r)
-            if status != CONVERGED:
-                return status
-        end_segment(r)
 
 
 @njit(cache=True, error_model="numpy")
@@ -174,8 +150,26 @@ def integrate(state, work, span, tolerance, max_steps, y, w, p, constants, break
     for i in range(r.nu):
         at[i] = pointer[i]
     _begin(r, y, w)
-    status = _run(r)
-    return status, r.t
+    # What has no size known beforehand: steps for delayed signals to look back to, jumps that will come back.
+    history = np.empty((64 if r.nd else 1, 2 + r.nd * NODES * (1 + r.width)))
+    echo = np.empty((16, 2 + r.width))
+    r.history = address_of(history)
+    while True:
+        echo = longer(echo, r.echoes, r.nd)
+        r.echo = address_of(echo)
+        if not begin_segment(r):
+            return INCONSISTENT, r.t
+        if not r.t < r.end:
+            return CONVERGED, r.t
+        prepare_segment(r)
+        while r.t < r.tb:
+            if r.nd:
+                history, echo = longer(history, r.kept, 1), longer(echo, r.echoes, r.nd)
+                r.history, r.echo = address_of(history), address_of(echo)
+            status = _step(r)
+            if status != CONVERGED:
+                return status, r.t
+        end_segment(r)
 
 
 @njit(cache=True, error_model="numpy")

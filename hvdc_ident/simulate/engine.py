@@ -233,7 +233,9 @@ class Engine:
                 self._explicit = False
             else:
                 fastest = np.abs(np.linalg.eigvals(self.jacobian(p, y, w))).max(initial=0.0)
-                self._explicit = bool(fastest * span < 2e4)
+                # The explicit pair takes some fastest * span / 3 steps whatever the tolerance, each for about half the
+                # work of one of the other's, which needs some hundreds to follow a waveform.
+                self._explicit = bool(fastest * span < 3e3)
         return self._explicit
 
     def jacobian(self, p: Array, y: Array, w: Array) -> Array:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.memory import indices, table, vector
 from hvdc_ident.simulate.state import NODES
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def outside(r, t, ta):  # type: ignore[no-untyped-def]
     """Writes all that comes from outside at t, within the segment from ta to r.tb, into w and wd."""
     vector(r.w, 1)[0] = t
@@ -21,7 +21,7 @@ def outside(r, t, ta):  # type: ignore[no-untyped-def]
         _delayed(r, t, ta)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def enter_segment(r):  # type: ignore[no-untyped-def]
     """Moves every input's place to the piece right of r.t; says whether that piece reaches to r.tb for all of them."""
     pointer, at = indices(r.pointer, r.nu + 1), indices(r.at, r.nu)
@@ -42,7 +42,7 @@ def enter_segment(r):  # type: ignore[no-untyped-def]
     return whole
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _inputs(r, t):  # type: ignore[no-untyped-def]
     """Writes the inputs and their slopes at t into w and wd: at r.tb, the segment's end, the values before a jump."""
     pointer, at = indices(r.pointer, r.nu + 1), indices(r.at, r.nu)
@@ -64,7 +64,7 @@ def _inputs(r, t):  # type: ignore[no-untyped-def]
             wd[1 + i] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _delayed(r, t, ta):  # type: ignore[no-untyped-def]
     """Writes the delayed signals, their rates and their rows over the parameters at t into w and wd.
 
@@ -109,7 +109,7 @@ def _delayed(r, t, ta):  # type: ignore[no-untyped-def]
                 wd[row + j - 1] = slope - bend * lag_p[i, j - 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def quartic(v, c):  # type: ignore[no-untyped-def]
     """Writes into c (5, k) the power coefficients of the quartics through v (5, k) at 0, 1/4, 1/2, 3/4, 1."""
     for j in range(v.shape[1]):

@@ -103,7 +103,9 @@ def elementwise(body: Callable[..., tuple[Lanes, ...]]) -> Any:
 
 
 @intrinsic
-def column_sums(typing_context: Any, rows: Any, width: Any, e: Any, y: Any, yn: Any, floors: Any, rtol: Any, sums: Any) -> Any:
+def column_sums(
+    typing_context: Any, rows: Any, width: Any, e: Any, y: Any, yn: Any, floors: Any, rtol: Any, sums: Any
+) -> Any:
     """For tables (rows, width) at e, y, yn: writes sum_i (e / (floor + rtol max(|y|, |yn|)))^2 of each column to `sums`.
 
     width: a multiple of four; floors: one a column.

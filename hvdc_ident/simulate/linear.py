@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from numba import njit
+from hvdc_ident.simulate.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def lu(a, pivots):  # type: ignore[no-untyped-def]
     """Factors a (n, n) in place; pivots (n,) are the row exchanges. Returns whether it is regular."""
     n = a.shape[0]
@@ -31,7 +31,7 @@ def lu(a, pivots):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def solve(a, pivots, b):  # type: ignore[no-untyped-def]
     """Solves in place for b (n,) with the factors of `lu`, which store the diagonal's inverse."""
     n = a.shape[0]
@@ -51,7 +51,7 @@ def solve(a, pivots, b):  # type: ignore[no-untyped-def]
         b[i] = total * a[i, i]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def solve_rows(a, pivots, b):  # type: ignore[no-untyped-def]
     """Solves in place for b (n, k): k right-hand sides side by side, so that the inner loop runs along memory."""
     n, width = b.shape

@@ -292,7 +292,9 @@ class _LanesEmitter(_Emitter):
                     mask = f"<{self.width} x i32> <" + ", ".join([f"i32 {lane}"] * self.width) + ">"
                     splat = self._emit(f"shufflevector {self.kind} {factor}, {self.kind} undef, {mask}")
                     product = self._emit(f"fmul contract {kind} {splat}, {vector}")
-                total = product if total == "zeroinitializer" else self._emit(f"fadd contract {kind} {total}, {product}")
+                total = (
+                    product if total == "zeroinitializer" else self._emit(f"fadd contract {kind} {total}, {product}")
+                )
             self._store(kind, total, place + lane * self.stride[1])
 
     def _lane(self, value: str, lane: int) -> str:
@@ -308,7 +310,9 @@ class _LanesEmitter(_Emitter):
         if argument == "w" and index == 0:
             return self._emit(f"load {self.kind}, ptr %yd, align 8")
         if argument == "y":
-            return self._gather([super(_LanesEmitter, self)._leaf("y", index + k * self.stride[0]) for k in range(LANES)])
+            return self._gather(
+                [super(_LanesEmitter, self)._leaf("y", index + k * self.stride[0]) for k in range(LANES)]
+            )
         one = self._emit(f"insertelement {self.kind} undef, double {super()._leaf(argument, index)}, i32 0")
         return self._emit(f"shufflevector {self.kind} {one}, {self.kind} undef, <{LANES} x i32> zeroinitializer")
 

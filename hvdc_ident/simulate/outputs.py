@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.exogenous import outside, quartic
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.machine import LANES
 from hvdc_ident.simulate.memory import table, vector
 from hvdc_ident.simulate.state import NODES
 from hvdc_ident.simulate.steps import evaluate, interpolate, interpolate_four
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def write_row(r, y):  # type: ignore[no-untyped-def]
     """Writes the next row of outputs from the flat vector at the address y, with what comes from outside as it stands."""
     evaluate(r, r.do_observe, y, r.out + 8 * r.i_out * max(r.no * (1 + r.width), 1))
     r.i_out += 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def write_rows(r):  # type: ignore[no-untyped-def]
     """Writes the rows of outputs within the present step, from its dense output."""
     t_out = vector(r.t_out, r.n_out)
@@ -32,7 +31,7 @@ def write_rows(r):  # type: ignore[no-untyped-def]
             count += 1
         if count == 0:
             return
-        if r.quiet and r.i_out + LANES <= r.n_out:
+        if r.quiet and count > 2 and r.i_out + LANES <= r.n_out:  # four at once cost about as much as two or three
             _write_four(r, t_out, count)
         else:
             for _ in range(count):
@@ -42,7 +41,7 @@ def write_rows(r):  # type: ignore[no-untyped-def]
                 write_row(r, r.u)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _write_four(r, t_out, count):  # type: ignore[no-untyped-def]
     """Writes the next `count` rows in one go; the rows up to the fourth get the last one's values, until their turn comes."""
     instants, first, last = vector(r.instants, LANES), r.i_out, count - 1
@@ -57,7 +56,7 @@ def _write_four(r, t_out, count):  # type: ignore[no-untyped-def]
     r.i_out += count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def remember(r):  # type: ignore[no-untyped-def]
     """Adds the present step to the history of delayed signals."""
     nd, width = r.nd, r.width

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from hvdc_ident.simulate.call import call
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.linear import lu, solve, solve_rows
 from hvdc_ident.simulate.structure import NAMES
 
@@ -13,7 +14,7 @@ FOUND, SINGULAR, NOT_FOUND = range(3)
 MODES, REST, REST_JAC, REST_P = (NAMES.index(n) for n in ("modes", "rest", "rest_jac", "rest_p"))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def residual(address, y, w, wd, p, m, n, inner, first, total, r):  # type: ignore[no-untyped-def]
     """Writes the rest residual at the total unknowns into r, with modes from the values; unknowns beyond y live in w."""
     for i in range(n - inner):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hvdc_ident.simulate.exogenous import enter_segment, outside
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.memory import vector
 from hvdc_ident.simulate.outputs import write_row
 from hvdc_ident.simulate.steps import evaluate
@@ -13,7 +13,7 @@ from hvdc_ident.simulate.switches import add_echo, shift_rows
 from hvdc_ident.simulate.unknowns import consistent, rates
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def next_stop(r):  # type: ignore[no-untyped-def]
     """The next instant at which a step has to end: a break of an input, a returning jump, a sample, the end."""
     stop = r.end
@@ -32,7 +32,7 @@ def next_stop(r):  # type: ignore[no-untyped-def]
     return stop
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def begin_segment(r):  # type: ignore[no-untyped-def]
     """What happens at r.t: inputs jump, samples are taken and published, outputs are written. False: no solution there."""
     final = not r.t < r.end
@@ -63,7 +63,7 @@ def begin_segment(r):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _sample(r):  # type: ignore[no-untyped-def]
     """Takes the samples that are due: value and rows, at the instant's own dependence on the parameters."""
     nd, nq, width = r.nd, r.nq, r.width
@@ -89,7 +89,7 @@ def _sample(r):  # type: ignore[no-untyped-def]
         tick[i] = r.start + ticks[i] * constants[nd + i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _publish(r):  # type: ignore[no-untyped-def]
     """Publishes the samples that are due. False: the unknowns have no solution with them."""
     nd, nq, width = r.nd, r.nq, r.width
@@ -113,7 +113,7 @@ def _publish(r):  # type: ignore[no-untyped-def]
     return not r.published or consistent(r, False)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _echo_sources(r):  # type: ignore[no-untyped-def]
     """Jumps and corners of a delayed signal's source come back after the delay."""
     nd, rows = r.nd, 1 + r.width
@@ -126,7 +126,7 @@ def _echo_sources(r):  # type: ignore[no-untyped-def]
             add_echo(r, i, following)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def prepare_segment(r):  # type: ignore[no-untyped-def]
     """What stays the same until the segment's end, the switches' tolerances, and the first step's length."""
     r.segments += 1
@@ -154,7 +154,7 @@ def prepare_segment(r):  # type: ignore[no-untyped-def]
     r.fresh, r.again = 1, 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _first_step(r):  # type: ignore[no-untyped-def]
     """The length that changes the states by a hundredth of themselves, in the error's weights, or the last step's if shorter."""
     n, width, span = r.n, r.width, r.end - r.start
@@ -173,7 +173,7 @@ def _first_step(r):  # type: ignore[no-untyped-def]
     r.h = min(max(guess, 1e-9 * span), 0.1 * span) if r.h == 0.0 or guess < r.h else min(r.h, guess)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def end_segment(r):  # type: ignore[no-untyped-def]
     """The segment's end, seen from before its jump: outputs of the left side, what comes back now, what comes next."""
     width, line = r.width, 2 + r.width

@@ -8,8 +8,8 @@ time grows with the arguments of a call, and so does the run's.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.structure import NAMES
 
 NODES = 5  # a delayed signal is kept as a quartic in each step, through five equidistant values
@@ -80,7 +80,7 @@ def place(field: str) -> int:
     return names.index(field)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _take(r, count):  # type: ignore[no-untyped-def]
     """The address of the next `count` doubles of the workspace, rounded up for loops by four."""
     address = r.free
@@ -88,7 +88,7 @@ def _take(r, count):  # type: ignore[no-untyped-def]
     return address
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def arrange(r):  # type: ignore[no-untyped-def]
     """Gives every vector of the workspace its place from r.free on; returns the end, so that from 0 it is the size."""
     rows = 1 + r.width

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.exogenous import outside
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.lanes import column_sums, elementwise, weighted
 from hvdc_ident.simulate.linear import lu, solve, solve_rows
 from hvdc_ident.simulate.memory import indices, table, vector
@@ -26,7 +26,7 @@ from hvdc_ident.simulate.tableaus import (
 # --- both methods ---
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def evaluate(r, function, y, out):  # type: ignore[no-untyped-def]
     """Calls a generated function at the flat vector y; all are addresses."""
     call(function, y, r.yd, r.w, r.wd, r.p, r.m, out)
@@ -57,7 +57,7 @@ def _sum(a, b):  # type: ignore[no-untyped-def]
     return (a + b,)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def interpolate(r, x, count, out):  # type: ignore[no-untyped-def]
     """Writes the first `count` elements (and up to three more) of the step's quartic at x in 0..1 to the address out."""
     line = 8 * r.stride
@@ -65,7 +65,7 @@ def interpolate(r, x, count, out):  # type: ignore[no-untyped-def]
     _horner((count + 3) // 4 * 4, (r.y, d, d + line, d + 2 * line, d + 3 * line), (out,), (x,))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def interpolate_four(r, x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     """Writes the step's quartic at four places to the rows of r.block."""
     line = 8 * r.stride
@@ -74,7 +74,7 @@ def interpolate_four(r, x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     _horner_four(r.stride, (r.y, d, d + line, d + 2 * line, d + 3 * line), places, (x0, x1, x2, x3))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel(fastmath={"contract", "reassoc"})
 def error_norm(r, e, rows):  # type: ignore[no-untyped-def]
     """The largest weighted RMS of the error e (address) over the first `rows` unknowns and each parameter's rows of these.
 
@@ -102,7 +102,7 @@ def error_norm(r, e, rows):  # type: ignore[no-untyped-def]
     return np.sqrt(worst / rows) if worst < np.inf else np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def attempt(r):  # type: ignore[no-untyped-def]
     """One step of length r.hs from (r.t, r.y) into r.yn; r.error says how good it is."""
     # An unknown may have an infinite slope for an instant, as sqrt(1.1^2 - i^2) where i meets its limit. The
@@ -111,7 +111,7 @@ def attempt(r):  # type: ignore[no-untyped-def]
     r.error = _rodas(r, rows) if r.rosenbrock else _dopri(r, rows)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def make_dense(r):  # type: ignore[no-untyped-def]
     """Writes the quartic of the step that ended in r.yn into r.dense."""
     if r.rosenbrock:
@@ -152,7 +152,7 @@ def _rodas_quartic(y, yn, *k):  # type: ignore[no-untyped-def]
     return change + a, b - a, c - b, c * -1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _rodas_prepare(r, stage):  # type: ignore[no-untyped-def]
     """Writes r.u, where the stage's right-hand side is taken (r.y at stage 0), and r.add, what is added to it."""
     n, line = r.stride, 8 * r.stride
@@ -178,7 +178,7 @@ def _rodas_prepare(r, stage):  # type: ignore[no-untyped-def]
         _rodas_point_7(n, (r.u, r.mass, r.ft, k0, k1, k2, k3, k4, k5, k6), out, scalars)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _rodas_matrix(r):  # type: ignore[no-untyped-def]
     """Factors M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
 
@@ -200,7 +200,7 @@ def _rodas_matrix(r):  # type: ignore[no-untyped-def]
     return 2 if lu(matrix, indices(r.pivots, n)) else 0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _rodas_solve(r, k):  # type: ignore[no-untyped-def]
     """What the generated solve does, by dense linear algebra: from the right-hand side at the address k to the stage."""
     n, width = r.n, r.width
@@ -216,7 +216,7 @@ def _rodas_solve(r, k):  # type: ignore[no-untyped-def]
         solve_rows(matrix, pivots, rows)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _rodas(r, rows):  # type: ignore[no-untyped-def]
     outside(r, r.t, r.t)
     if not r.again:
@@ -244,7 +244,7 @@ def _rodas(r, rows):  # type: ignore[no-untyped-def]
     return error_norm(r, error, rows)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _rodas_dense(r):  # type: ignore[no-untyped-def]
     s = 8 * r.stride
     k, d = r.k, r.dense
@@ -282,7 +282,7 @@ def _dopri_quartic(y, yn, *rest):  # type: ignore[no-untyped-def]
     return change + bend, curl - bend + last, curl * -1.0 - last * 2.0, last
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _dopri_prepare(r, stage):  # type: ignore[no-untyped-def]
     """Writes where the stage's right-hand side is taken into r.u, or into r.yn for the last one; returns that address."""
     n, line = r.stride, 8 * r.stride
@@ -305,7 +305,7 @@ def _dopri_prepare(r, stage):  # type: ignore[no-untyped-def]
     return r.u
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+@kernel(fastmath={"contract", "reassoc"})
 def _dopri_stiffness(r):  # type: ignore[no-untyped-def]
     """The square of h times the largest mode, as the last two stages show it (Hairer and Wanner, IV.2)."""
     nx = r.nx
@@ -318,7 +318,7 @@ def _dopri_stiffness(r):  # type: ignore[no-untyped-def]
     return r.hs * r.hs * top / bottom if bottom > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _dopri(r, rows):  # type: ignore[no-untyped-def]
     line = 8 * r.stride
     if not r.fresh:
@@ -334,7 +334,7 @@ def _dopri(r, rows):  # type: ignore[no-untyped-def]
     return error_norm(r, r.e, rows)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _dopri_dense(r):  # type: ignore[no-untyped-def]
     s = 8 * r.stride
     k, d = r.k, r.dense

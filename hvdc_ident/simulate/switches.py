@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from hvdc_ident.simulate.exogenous import outside
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.memory import vector
 from hvdc_ident.simulate.status import CHATTER, CONVERGED, INCONSISTENT
 from hvdc_ident.simulate.steps import evaluate, interpolate
@@ -14,7 +14,7 @@ from hvdc_ident.simulate.unknowns import consistent, rates
 NONE, AGAIN = -1, -2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def violation(r, y):  # type: ignore[no-untyped-def]
     """The switch that is furthest beyond its mode at y (an address), or -1; leaves the switches' values in r.sv."""
     evaluate(r, r.do_sw, y, r.sv)
@@ -32,7 +32,7 @@ def violation(r, y):  # type: ignore[no-untyped-def]
     return which
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def widen(r):  # type: ignore[no-untyped-def]
     """Keeps the largest value of every switch so far, which its tolerance is relative to."""
     values, top, slack = vector(r.sv, r.ns), vector(r.top, r.ns), vector(r.slack, r.ns)
@@ -43,7 +43,7 @@ def widen(r):  # type: ignore[no-untyped-def]
         slack[i] = 0.01 * r.rtol * largest + 1e-14
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def find_switch(r):  # type: ignore[no-untyped-def]
     """The switch that ends the present step, whose end it may move; NONE, or AGAIN where the step is to be redone with r.h."""
     bad, event = 0.5, NONE
@@ -75,7 +75,7 @@ def find_switch(r):  # type: ignore[no-untyped-def]
     return event
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _bisect(r, bad, event):  # type: ignore[no-untyped-def]
     """Bisection on "some switch is beyond its mode", on the dense output: the share of the step, and the switch."""
     values, slack = vector(r.sv, r.ns), vector(r.slack, r.ns)
@@ -96,7 +96,7 @@ def _bisect(r, bad, event):  # type: ignore[no-untyped-def]
     return bad, event
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def shift_rows(r, before, after, jump):  # type: ignore[no-untyped-def]
     """Sensitivities of the states at a jump of the right-hand side: + (f before - f after) d(instant)/dp; all addresses."""
     width, n = r.width, r.n
@@ -106,14 +106,14 @@ def shift_rows(r, before, after, jump):  # type: ignore[no-untyped-def]
             y[n + i * width + c] += (left[i] - right[i]) * slope[c]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def add_echoes(r, order):  # type: ignore[no-untyped-def]
     """Notes that what happens now comes back after every delay, whose room the caller has made."""
     for i in range(r.nd):
         add_echo(r, i, order)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def add_echo(r, i, order):  # type: ignore[no-untyped-def]
     """Notes that a jump (order 0) or a corner of delay i's source comes back after the delay."""
     width = r.width
@@ -129,7 +129,7 @@ def add_echo(r, i, order):  # type: ignore[no-untyped-def]
     r.tb = min(r.tb, at)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def switch(r, event):  # type: ignore[no-untyped-def]
     """At a switch: sensitivities jump by (f- - f+) dt*/dp, unknowns are solved anew. Returns a status."""
     r.events += 1
@@ -173,7 +173,7 @@ def switch(r, event):  # type: ignore[no-untyped-def]
     return CONVERGED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _jump(r, event, speed):  # type: ignore[no-untyped-def]
     """The jump condition, where the right-hand side jumps at all: r.jump_p, the sensitivities, the unknowns' too."""
     width = r.width

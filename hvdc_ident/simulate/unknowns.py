@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from hvdc_ident.simulate.kernel import kernel
 from hvdc_ident.simulate.linear import lu, solve, solve_rows
 from hvdc_ident.simulate.memory import indices, table, vector
 from hvdc_ident.simulate.steps import evaluate
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def _loop_matrix(r):  # type: ignore[no-untyped-def]
     """Factors the Jacobian of the unknowns' equations by the unknowns; r.jac has to be up to date."""
     nx, nz, n = r.nx, r.nz, r.n
@@ -21,7 +21,7 @@ def _loop_matrix(r):  # type: ignore[no-untyped-def]
     return lu(small, indices(r.small_pivots, nz))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def consistent(r, live):  # type: ignore[no-untyped-def]
     """Solves the unknowns (and their sensitivities) for the present states, with modes found from the values where `live`.
 
@@ -67,7 +67,7 @@ def consistent(r, live):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel()
 def rates(r):  # type: ignore[no-untyped-def]
     """Writes the rates of states and unknowns into r.yd; needs modes and values that are consistent. Uses r.e as scratch."""
     nx, nz, n = r.nx, r.nz, r.n
