@@ -1,7 +1,7 @@
 """The list of the studies with their headline numbers, from each one's expected.json: studies/README.md.
 
 python studies/index.py            # writes the list
-A study without a headline here is listed by its name alone.
+A study is listed once it has a README; one without a headline here under its README's title.
 """
 
 from __future__ import annotations
@@ -151,22 +151,27 @@ HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
 }
 
 
+def row(name: str) -> str:
+    """The line of one study; without a headline here, its README's title."""
+    folder = HERE / name
+    if name in HEADLINES:
+        title, headline = HEADLINES[name]
+        found = headline(json.loads((folder / "expected.json").read_text(encoding="utf-8")))
+    else:
+        title = (folder / "README.md").read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+        found = "see there"
+    return f"| [{name}]({name}) | {title} | {found} |"
+
+
 def folders() -> list[str]:
-    """The studies, those of the list first."""
-    found = sorted(p.parent.name for p in HERE.glob("*/run.py"))
+    """The studies that have a README, those with a headline first."""
+    found = sorted(p.parent.name for p in HERE.glob("*/README.md"))
     return [n for n in HEADLINES if n in found] + [n for n in found if n not in HEADLINES]
 
 
 def text() -> str:
     """The list as Markdown."""
-    rows = ["| study | what | headline |", "| --- | --- | --- |"]
-    for name in folders():
-        if name in HEADLINES:
-            title, headline = HEADLINES[name]
-            found = headline(json.loads((HERE / name / "expected.json").read_text(encoding="utf-8")))
-        else:
-            title, found = "see its README", ""
-        rows.append(f"| [{name}]({name}) | {title} | {found} |")
+    rows = ["| study | what | headline |", "| --- | --- | --- |", *(row(n) for n in folders())]
     return HEAD + "\n".join(rows) + "\n"
 
 

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import sys
 
+import pytest
+
 from tests.studies.study_module import STUDIES
 
 sys.path.insert(0, str(STUDIES))
-import index
+import index  # noqa: E402
+
+LIST = (STUDIES / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_list_is_what_the_studies_hold():
-    written = (STUDIES / "README.md").read_text(encoding="utf-8")
-    assert written == index.text(), "write it anew: python studies/index.py"
-    for folder in STUDIES.glob("*/run.py"):
-        assert f"({folder.parent.name})" in written
+@pytest.mark.parametrize("name", index.HEADLINES)
+def test_the_headline_is_what_the_study_holds(name):
+    assert index.row(name) in LIST.splitlines(), "write it anew: python studies/index.py"
+
+
+@pytest.mark.parametrize("name", index.folders())
+def test_every_study_is_listed(name):
+    assert f"({name})" in LIST, "write it anew: python studies/index.py"
