@@ -9,7 +9,7 @@ import pytest
 from tests.studies.study_module import STUDIES
 
 sys.path.insert(0, str(STUDIES))
-import index  # noqa: E402
+import index
 
 LIST = (STUDIES / "README.md").read_text(encoding="utf-8")
 
