@@ -80,7 +80,7 @@ def _time_bins(nominal: Nominal) -> NDArray[np.intp]:
 def _level_bins(nominal: Nominal, by_experiment: Mapping[str, Array]) -> NDArray[np.intp]:
     """Levels of a signal, as many rows in each, rising and falling apart, for each output over all experiments."""
     moving = {n: v for n, v in by_experiment.items() if np.ptp(v) > 0}
-    whole = np.concatenate([v for v in by_experiment.values()]) if by_experiment else np.zeros(1)
+    whole = np.concatenate(list(by_experiment.values())) if by_experiment else np.zeros(1)
     size = float(np.ptp(whole))
     outputs = list(nominal.problem.outputs)
     if size == 0.0 or not moving:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.rounds import Round, Trial
-from hvdc_ident.discrepancy.select import at_edge, clear
+from hvdc_ident.discrepancy.select import at_edge, best_of, clear
+from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.frozen import FrozenMap
 
 
-def rivals(found: Round, options: Options) -> tuple[Rival, ...]:
-    """The winner and every candidate within delta BIC of it, the best first; those with its very signature too."""
+def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, ...]:
+    """The winner and every candidate within delta BIC of it, the best first; those with its very signature too.
+
+    droop: whether a negative coupling is one, for they are the same.
+    """
     assert found.winner is not None
     best = max(t.gain for t in found.trials)
     group: list[Rival] = []
@@ -25,10 +30,39 @@ def rivals(found: Round, options: Options) -> tuple[Rival, ...]:
         c = found.candidates[trial.pick.candidate]
         sizes = trial.refit.sizes(trial.refit.placed[-1])
         group.append(Rival(c.effect, c.at, behind, FrozenMap(sizes), c.source))
+        signed = sizes.get("k", 0.0)
+        group += _as_droop(Rival(c.effect, c.at, behind, FrozenMap(sizes), c.source), signed, droop)
         for twin in found.same.get(trial.pick.candidate, ()):
             other = found.candidates[twin.candidate]
-            group.append(Rival(other.effect, other.at, behind, FrozenMap(), other.source, refitted=False))
+            same = Rival(other.effect, other.at, behind, FrozenMap(), other.source, refitted=False)
+            group += [same, *_as_droop(same, signed, droop)]
+    group += _unfitted(found, best, options, droop)
     return tuple(sorted(group, key=lambda r: r.delta_bic))
+
+
+def _unfitted(found: Round, best: float, options: Options, droop: bool) -> list[Rival]:
+    """Candidates that were not refitted but, being linear in their size, gain what their score says."""
+    assert found.ruler is not None
+    done = {t.pick.candidate for t in (*found.trials, *found.failed)}
+    done |= {p.candidate for twins in found.same.values() for p in twins}
+    group = []
+    for p in best_of(found.scores, found.candidates):
+        c = found.candidates[p.candidate]
+        if p.candidate in done or not is_linear(kind_of(c, p.probe)):
+            continue
+        probe = c.probes[p.probe]
+        behind = best - found.ruler.gain(p.score, 0.0, len(probe.free))
+        if behind <= options.set_bic:
+            rival = Rival(c.effect, c.at, max(behind, 0.0), FrozenMap(), c.source, refitted=False)
+            group += [rival, *_as_droop(rival, p.factor * float(probe.values.get("k", 0.0)), droop)]
+    return group
+
+
+def _as_droop(rival: Rival, k: float, droop: bool) -> list[Rival]:
+    """The same thing under its other name: a negative coupling is a droop without deadband."""
+    if rival.effect != "coupling" or k >= 0 or not droop:
+        return []
+    return [replace(rival, effect="droop", parameters=FrozenMap({"k": -k}), refitted=False)]
 
 
 def _is_nothing(trial: Trial) -> bool:

@@ -43,6 +43,7 @@ class Block:
     def __init__(self, model: Model) -> None:
         self.model = model
         g = self.graph = Graph()
+        self._orders: dict[tuple[int, ...], list[int]] = {}
         self.states = tuple(model.states)
         self.leaves = (*self.states, *model.delays, *model.sampled, *model.inputs, "time", *model.parameters)
         nodes = {n: g.leaf("y", k) for k, n in enumerate(self.leaves)}
@@ -70,7 +71,7 @@ class Block:
     def linear(self, switching: tuple[str, ...]) -> bool:
         """Whether y depends on these parameters, those that make the effect vanish, by a straight line and at once."""
         own = {k for k, n in enumerate(self.leaves) if n in switching}
-        leaf = {n: k for n, k in zip(self._leaf_nodes, range(len(self.leaves)), strict=True)}
+        leaf = dict(zip(self._leaf_nodes, range(len(self.leaves)), strict=True))
         first = self._by(self.output, leaf)
         if any(own & set(row) for row in (*self.jacobian, *self.rest_jacobian)):
             return False
@@ -85,8 +86,12 @@ class Block:
 
     def value(self, nodes: list[int], at: list[Any]) -> list[Any]:
         """The nodes' values, `at` giving one array for each leaf."""
-        g, known = self.graph, {}
-        for n in _order(g, nodes):
+        g = self.graph
+        known: dict[int, Any] = {}
+        key = tuple(nodes)
+        if key not in self._orders:
+            self._orders[key] = _order(g, nodes)
+        for n in self._orders[key]:
             op, *a = g.nodes[n]
             if op in ("const", "bool"):
                 known[n] = a[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -19,7 +19,7 @@ from hvdc_ident.trajectory import Array
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""
 
-SAME = 0.9995
+SAME = 0.99999
 """Correlation from which two signals are one, as a source."""
 STILL = 1e-9
 
@@ -35,7 +35,7 @@ class Candidate:
     at: tuple[str, ...]
     probes: tuple[Probe, ...]
     source: str = ""
-    named: FrozenMap[str] = FrozenMap()
+    named: FrozenMap[str] = field(default_factory=FrozenMap)
     still: bool = False
 
     @property
@@ -71,14 +71,18 @@ def candidates(
     groups = places_of(model, live, places)
     about = {p: SlotSignal.of(times, signals[p], tones) for p in live}
     brought = source_signals(model, signals)
+    tried = entries(names)
+    doubled = any(e.name == "coupling" for e in tried)
     found: list[Candidate] = []
     for at in groups:
         joined = SlotSignal.joined([about[p] for p in at])
         still = joined.high - joined.low <= STILL * max(joined.peak, STILL)
         kinds = {slot(model, p)[0] for p in at}
-        for effect in entries(names):
+        for effect in tried:
             if not kinds <= set(effect.places):
                 continue
+            if effect.name == "droop" and doubled:
+                continue  # without its deadband a droop is a negative coupling, which is tried
             found += _at(model, effect, at, joined, still, about, brought)
     return tuple(found)
 
@@ -93,7 +97,7 @@ def _at(
     brought: Sequence[str],
 ) -> list[Candidate]:
     if effect.resistance:
-        found = [n for n in resistances(model, at[0])] if len(at) == 1 else []
+        found = list(resistances(model, at[0])) if len(at) == 1 else []
         return [
             Candidate(
                 effect.name, at, probes(effect, signal, given={effect.resistance: model.parameters[n].value}),
@@ -103,7 +107,7 @@ def _at(
         ]  # fmt: skip
     if not effect.needs_source:
         return [Candidate(effect.name, at, probes(effect, signal), still=still and not _additive(effect))]
-    if len(at) > 1 or effect.name == "droop":  # without its deadband a droop is a negative coupling
+    if len(at) > 1:
         return []
     open_to = set(sources(model, at[0]))
     return [
@@ -154,7 +158,7 @@ def source_signals(model: Model, signals: Signals) -> tuple[str, ...]:
         (p for p in kinds if kinds[p] != "output"),
         key=lambda p: ("input", "state", "algebraic", "signal").index(kinds[p]),
     )
-    named_out = {o for o in model.outputs}
+    named_out = set(model.outputs)
     order = [p for p in order if kinds[p] in ("input", "state") or p in named_out]
     kept: list[str] = []
     shapes: list[Array] = []

@@ -116,7 +116,7 @@ def _assembled(
     if in_place:
         last = outcome.refit
         effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
-        groups = tuple(rivals(r, search.options) for r in outcome.kept)
+        groups = tuple(rivals(r, search.options, search.tries("droop")) for r in outcome.kept)
     elif other is not None and other.refit is not None:
         last = other.refit
     augmented = None if last is first else last.model.with_values(_own(last))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class Fallback:
     at: str
     text: str
     expression: str = ""
-    coefficients: FrozenMap[Any] = FrozenMap()
+    coefficients: FrozenMap[Any] = field(default_factory=FrozenMap)
     stability: float | None = None
     delta_bic: float | None = None
     curve: Mapping[str, Any] | None = None

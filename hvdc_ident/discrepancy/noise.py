@@ -63,9 +63,9 @@ def _noise(output: str, experiments: Sequence[Experiment]) -> Noise:
     else:
         model, error = _model(quiet, rows, power) if _even(experiments) else ((), 0.0)
     if given is None and std <= max((noise_floor(r) for r in records), default=0.0):
-        rounded = step / np.sqrt(12.0)
-        if rounded > 0.0:
-            return Noise(rounded, (), 0.0, step, "the resolution of the record", rows)
+        if step > 0.0:
+            rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(records, step) ** 2))
+            return Noise(rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
         return Noise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
     if given is None:
         return Noise(std, model, error, step, "the records before the event", rows)
@@ -134,6 +134,19 @@ def _step(records: Sequence[Array]) -> float:
         if r.size and floor > 1.001 * SOFT * float(np.ptp(r)):
             steps.append(float(floor * np.sqrt(12.0)))
     return max(steps, default=0.0)
+
+
+def _dither(records: Sequence[Array], step: float) -> float:
+    """The standard deviation of white noise below a quantiser, in its steps, from how much the records flicker.
+
+    Noise of sigma steps makes rounded values scatter by sigma/sqrt(pi) (variance, averaged over where the level lies
+    between two steps) while it is below a third of a step, and by sigma^2 + 1/12 above.
+    """
+    bends = np.concatenate([(r[2:] - 2.0 * r[1:-1] + r[:-2]) / step for r in records if r.size > 2] or [np.zeros(1)])
+    power = np.sort(bends**2)
+    scatter = float(power[: max(1, int(0.98 * power.size))].mean()) / 6.0  # the largest are the events
+    low = scatter * float(np.sqrt(np.pi))
+    return low if low < 1.0 / 3.0 else float(np.sqrt(max(scatter - 1.0 / 12.0, 0.0)))
 
 
 def draws(

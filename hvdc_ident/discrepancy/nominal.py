@@ -105,13 +105,13 @@ def nominal(
     problem = Problem(simulator, tuple(experiments), tuple(parameters), held=FrozenMap(held))
     if report is not None:
         problem = gated(problem, gate(report))
-    weights = {o: n.std for o, n in noise.items() if n.std is not None and o in problem.outputs}
-    given = {o for o, n in noise.items() if n.source == "given"}
-    problem = replace(
-        problem,
-        weights=FrozenMap({o: w for o, w in weights.items() if o not in given}),
-        rho=FrozenMap({o: n.model for o, n in noise.items() if n.model and o in problem.outputs}),
+    # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
+    told = tuple(
+        e.with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))
+        for e in problem.experiments
     )
+    models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
+    problem = replace(problem, experiments=told, rho=FrozenMap(models))
     optimum, result = pilot(problem, starts=starts, seed=seed, executor=executor)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
@@ -127,6 +127,11 @@ def nominal(
         for o, n in noise.items()
     }
     return Nominal(optimum.problem, optimum.theta, FrozenMap(stated)), tuple(notes)
+
+
+def _stated(experiment: Experiment, output: str, noise: Noise) -> float | None:
+    """The standard deviation of a record: its own where that was given and holds, else what was found of its noise."""
+    return experiment.noise.get(output) if noise.source == "given" else noise.std
 
 
 def _told_apart(optimum: Optimum) -> tuple[Optimum, dict[str, float]]:

@@ -31,7 +31,7 @@ class Options:
     most: int = 3
     holdout_share: float = 0.1
     refuted: float = 0.03
-    starts: int = 4
+    starts: int = 2
     fallback: bool = True
     free_start: bool = False
 

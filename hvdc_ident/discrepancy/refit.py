@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class Refit:
     correlation: float = 0.0
     holdout: float | None = None
     press: float | None = None
-    std: FrozenMap[float | None] = FrozenMap()
+    std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     failure: str = ""
 
     @property

@@ -47,6 +47,10 @@ class Search:
     executor: Executor | None = None
     progress: Progress | None = None
 
+    def tries(self, effect: str) -> bool:
+        """Whether an effect is among those looked for."""
+        return self.effects == "all" or effect in self.effects
+
     def tell(self, done: int, total: int, text: str) -> None:
         """Nothing; whoever watches is told."""
         if self.progress:

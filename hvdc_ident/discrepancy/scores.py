@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.noise import draws
+from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.response import Along, along
 from hvdc_ident.discrepancy.signatures import LOOSE, Column, Task, columns_of, signatures, tasks
 from hvdc_ident.effects import effects
@@ -91,6 +91,11 @@ def runs(model: Model, nominal: Nominal, executor: Executor | None = None) -> di
     return {e.name: along(model, e, nominal.values) for e in experiments}
 
 
+def _largest(paths: Mapping[str, Along]) -> int:
+    """Numbers in one answer, of the longest experiment: outputs at rows, and the signal at its instants."""
+    return max(len(a.outputs) * a.count + 3 * a.time.size for a in paths.values())
+
+
 def two_sided(candidate: Candidate) -> bool:
     """Whether the effect may act either way: a parameter passes its neutral value, or a phase turns it round."""
     entry = effects()[candidate.effect]
@@ -114,7 +119,7 @@ def scored(
 ) -> Scores:
     """The scores of all candidates at the nominal model's optimum."""
     columns = columns_of(found)
-    plan = tasks(found, columns)
+    plan = tasks(found, columns, _largest(paths))
     blocks = nominal.blocks
     noise = (
         np.vstack(draws(nominal.problem, blocks, nominal.noise, nominal.fitted(), bootstraps, seed))
@@ -205,7 +210,7 @@ def signature_rows(
     nominal: Nominal, found: Sequence[Candidate], paths: Mapping[str, Along], chosen: Sequence[Column]
 ) -> Array:
     """(n, N) whitened signatures of some columns over all blocks, without what the parameters make good."""
-    plan = tasks(found, chosen)
+    plan = tasks(found, chosen, _largest(paths))
     whole = []
     for e in nominal.problem.fitted_experiments:
         own = [b for b in nominal.blocks if b.experiment == e.name]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.refit import Job, Placed, Refit, run
 from hvdc_ident.discrepancy.rounds import Round, Search, Trial, one_round
@@ -45,8 +46,19 @@ def forward(search: Search, first: Refit) -> Outcome:
             break
         kept.append(found)
         here = found.winner.refit
+        if is_noise(here, search):
+            break
     outcome = Outcome(here, tuple(rounds), tuple(kept))
     return _settled(search, first, outcome) if len(kept) > 1 else outcome
+
+
+def is_noise(refit: Refit, search: Search) -> bool:
+    """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
+    rows = refit.rows * (1.0 - refit.correlation) / (1.0 + refit.correlation)
+    if refit.chi2 / refit.rows > 1.0 + 3.0 * np.sqrt(2.0 / max(rows, 4.0)):
+        return False
+    tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
+    return all(b.p > 0.05 for b in tests)
 
 
 def _settled(search: Search, first: Refit, outcome: Outcome) -> Outcome:

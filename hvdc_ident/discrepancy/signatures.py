@@ -25,8 +25,8 @@ CLOSED = 0.05
 """A change from pass to pass that counts as none."""
 LOOSE = 0.3
 """A change in the last pass from which the signature is not to be used: the loop would not settle, or not so."""
-TOGETHER = 400
-"""Columns that are kept in memory at a time."""
+TOGETHER = 4_000_000
+"""Numbers of outputs' answers that are kept in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,9 @@ def columns_of(candidates: Sequence[Candidate]) -> tuple[Column, ...]:
     return tuple(Column(i, k) for i, c in enumerate(candidates) if not c.still for k in range(len(c.probes)))
 
 
-def tasks(candidates: Sequence[Candidate], columns: Sequence[Column]) -> tuple[tuple[Task, ...], ...]:
-    """The columns in parcels; those at the same slots, which are computed together, stand in one."""
+def tasks(candidates: Sequence[Candidate], columns: Sequence[Column], size: int) -> tuple[tuple[Task, ...], ...]:
+    """The columns in parcels; those at the same slots, which are computed together, stand in one. size: of one answer."""
+    most = max(TOGETHER // max(size, 1), 50)
     by_place: dict[tuple[str, ...], list[Task]] = {}
     for k, column in enumerate(columns):
         c = candidates[column.candidate]
@@ -73,7 +74,7 @@ def tasks(candidates: Sequence[Candidate], columns: Sequence[Column]) -> tuple[t
         by_place.setdefault((*c.at, c.source), []).append(task)
     parcels: list[list[Task]] = [[]]
     for members in by_place.values():
-        if parcels[-1] and len(parcels[-1]) + len(members) > TOGETHER:
+        if parcels[-1] and len(parcels[-1]) + len(members) > most:
             parcels.append([])
         parcels[-1] += members
     return tuple(tuple(p) for p in parcels if p)
@@ -82,6 +83,11 @@ def tasks(candidates: Sequence[Candidate], columns: Sequence[Column]) -> tuple[t
 def _present(candidate: Candidate, probe: int) -> tuple[str, ...]:
     entry, values = effects()[candidate.effect], candidate.probes[probe].values
     return tuple(n for n, q in entry.parameters.items() if not (q.optional and values[n] == q.neutral))
+
+
+def kind_of(candidate: Candidate, probe: int) -> Kind:
+    """The equations that a probe of a candidate asks for."""
+    return Kind(candidate.effect, _present(candidate, probe), bool(candidate.source))
 
 
 @lru_cache(maxsize=256)

@@ -59,7 +59,7 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             f"{worst.name} are still not noise (p = {worst.p:.2g}).",
             tests,
         )
-    sets = [rivals(r, options) for r in outcome.kept]
+    sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
     if any(len(g) > 1 for g in sets):
         others = max(len(g) for g in sets) - 1
         return Judgement(

@@ -1,0 +1,64 @@
+"""Figures of a diagnosis: the gap of three models, and their frequency responses with the records'."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CHANNELS = 6
+
+
+def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """The pooled residual of given gains, refitted and augmented model, on fitted and on held-out data."""
+    fig = figure(5.5, 3.0)
+    axes = fig.subplots()
+    names = [n for n in ("nominal", "refitted", "augmented") if n in pooled]
+    for k, (part, label, colour) in enumerate((("fit", "fitted", AFTER), ("holdout", "held out", BEFORE))):
+        values = [pooled[n].get(part) for n in names]
+        axes.bar(
+            np.arange(len(names)) + (k - 0.5) * 0.38, [v or np.nan for v in values], 0.38, label=label, color=colour
+        )
+    axes.axhline(1.0, color=MEASURED, linestyle=":", linewidth=1.0, label="noise")
+    axes.set_yscale("log")
+    axes.set_xticks(
+        range(len(names)), [{"nominal": "given gains", "augmented": "with effect"}.get(n, n) for n in names]
+    )
+    axes.set_ylabel("residual, in noise units")
+    axes.legend(fontsize="small")
+    return fig
+
+
+def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
+    """Gain and phase over frequency, one column a channel: what the record shows, the nominal and the augmented model."""
+    shown = [c for c in channels if c.get("omega")][:CHANNELS]
+    fig = figure(3.2 * max(len(shown), 1), 4.6)
+    grid = fig.subplots(2, max(len(shown), 1), sharex="col", squeeze=False)
+    looks = (("data", MEASURED, "record"), ("nominal", BEFORE, "refitted"), ("augmented", AFTER, "with effect"))
+    for column, c in enumerate(shown):
+        f = np.array(c["omega"]) / (2 * np.pi)
+        for key, colour, label in looks:
+            if not c.get(key):
+                continue
+            h = np.array(c[key])[:, 0] + 1j * np.array(c[key])[:, 1]
+            style: dict[str, Any] = (
+                {"linestyle": "none", "marker": ".", "markersize": 4} if key == "data" else {"linewidth": 1.3}
+            )
+            keep = np.abs(h) > 0
+            grid[0, column].semilogx(f[keep], 20 * np.log10(np.abs(h[keep])), color=colour, label=label, **style)
+            grid[1, column].semilogx(f[keep], np.degrees(np.unwrap(np.angle(h[keep]))), color=colour, **style)
+        grid[0, column].set_title(f"{c['input']} to {c['output']}", fontsize="small")
+        grid[1, column].set_xlabel("frequency, Hz")
+        for row in (0, 1):
+            grid[row, column].grid(True, color=MARK, alpha=0.3)
+    if shown:
+        grid[0, 0].set_ylabel("gain, dB")
+        grid[1, 0].set_ylabel("phase, degrees")
+        grid[0, 0].legend(fontsize="small")
+    return fig

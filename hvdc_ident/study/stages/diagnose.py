@@ -1,0 +1,83 @@
+"""The stage `diagnose`: what the model lacks, if the recordings tell, and the model with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from hvdc_ident.study.stage import Options, Outcome, Stage
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+
+def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+    """The verdict with its evidence, the gap before and after, and the augmented model as a card."""
+    from hvdc_ident.discrepancy import diagnose
+    from hvdc_ident.study.at_work import workers_of
+    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
+    from hvdc_ident.study.schema import Diagnose
+
+    need_experiments(study, "diagnose", role="fit")
+    need_candidates(study, "diagnose")
+    need_start(study)
+    asked = study.settings.diagnose or Diagnose()
+    report = earlier["identify"]
+    if "parameters" not in report:
+        why = f"nothing can be diagnosed before the stage identify has run: {report.get('message', 'it failed')}"
+        return Outcome({"status": "failed", "message": why}, failed=why)
+    if not report["identifiable"]:
+        why = "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own"
+        return Outcome({"status": "failed", "message": why}, failed=why)
+    with workers_of(options) as executor:
+        found = diagnose(
+            study.model,
+            study.experiments,
+            tuple(study.candidates.values()),
+            effects="all" if asked.effects == "all" else list(asked.effects),
+            material=asked.material,
+            report=report,
+            seed=options.seed,
+            executor=executor,
+            progress=options.progress,
+        )
+    return Outcome(found.to_dict(), found.files)
+
+
+def told(data: Mapping[str, Any]) -> Sequence[str]:
+    """The verdict, what is missing, what it changes, and what to measure to be sure."""
+    if "verdict" not in data:
+        return [str(data.get("message", ""))]
+    lines = [f"{data['verdict']}: {data['text']}", *(e["text"] + "." for e in data["effects"])]
+    pooled = data["gap"]["pooled"]
+    shown = [
+        f"{n} {pooled[n]['fit']:.3g}" for n in ("nominal", "refitted", "augmented") if pooled[n]["fit"] is not None
+    ]
+    lines.append(f"Residual in noise units: {', '.join(shown)}.")
+    if data["effects"] and data["gap"]["shrink_holdout"] is not None:
+        lines.append(f"The held-out gap shrinks by {100 * data['gap']['shrink_holdout']:.1f} %.")
+    for group in data["ambiguity"]:
+        members = "; ".join(f"{r['effect']} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for r in group[:8])
+        rest = f"; and {len(group) - 8} more" if len(group) > 8 else ""
+        lines.append(f"As good (delta BIC): {members}{rest}.")
+    advice = (data["separating_experiment"] or {}).get("text")
+    lines += [f"Measure next: {advice}"] if advice else []
+    moved = [
+        f"{n} {data['parameters_refitted'][n]:.5g} -> {v:.5g}"
+        for n, v in data["parameters_after"].items()
+        if n in data["parameters_refitted"] and data["augmented_model"]
+    ]
+    lines += [f"Parameters, refitted without and with it: {', '.join(moved)}."] if moved else []
+    return [*lines, *data["notes"]]
+
+
+STAGE = Stage(
+    name="diagnose",
+    file="discrepancy.json",
+    summary="What the model lacks, if the recordings tell.",
+    run=run,
+    wanted=lambda study: study.settings.diagnose is not None,
+    order=50,
+    after=("identify", "fit"),
+    tell=told,
+)
