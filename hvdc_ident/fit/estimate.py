@@ -14,6 +14,7 @@ from hvdc_ident.fit.clock import has_clocks, searched
 from hvdc_ident.fit.intervals import estimates_of
 from hvdc_ident.fit.noise import GIVEN, floor_of, source_of
 from hvdc_ident.fit.nuisance import unknown_of
+from hvdc_ident.fit.objective import promised
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers import catalogue
 from hvdc_ident.fit.optimisers import optimiser as named
@@ -31,6 +32,8 @@ from hvdc_ident.trajectory import Array
 
 STARTS = 8
 """Runs of a multistart, where nothing else is said."""
+SETTLED = 1e-3
+"""A Gauss-Newton step that lowers the cost by less moves no estimate by a twentieth of its standard deviation."""
 Progress = Callable[[int, int, str], None]
 """Called with runs done, runs in all, and a line of text."""
 
@@ -85,7 +88,8 @@ def fit(
     worth = min(1.0, sum(inner.effective.values()) / samples)
     optima = [best] if inner.singular else distinct(problem, [best, *rivals], worth)
     outcomes = _outcomes(problem, begins, runs, weigh=problem is not first)
-    status, message = _status(problem, best, optima, runs, outcomes, worth)
+    settled = None if problem is first and best in usable else promised(problem, best.theta) <= SETTLED
+    status, message = _status(problem, best, optima, runs, outcomes, worth, settled)
     found = estimates_of(problem, best.theta, blocks, inner, all_unknowns)
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     result = FitResult(
@@ -196,16 +200,23 @@ def _status(
     runs: Sequence[OptimiserResult],
     outcomes: Sequence[StartOutcome],
     worth: float,
+    settled: bool | None,
 ) -> tuple[Status, str]:
-    """The status of the whole fit and why, worst first."""
+    """The status of the whole fit and why, worst first.
+
+    settled: whether the optimum stands in the final weights, where it was found again in them; else None, and a run has
+    to have arrived there.
+    """
     slack = 1e-6 * best.cost + 1e-9
     arrived = [o for o in outcomes if o.status == "converged" and o.cost is not None and o.cost <= best.cost + slack]
     lower = [o for o in outcomes if o.cost is not None and (best.cost - o.cost) * worth > DISTINCT]
     if lower and lower[0].status == "failed":
         return "not-converged", f"a run that failed had reached a lower cost: {lower[0].message}"
-    if not arrived and not any(r.status == "converged" for r in runs):
+    if not any(r.status == "converged" for r in runs) and not settled:
         return "not-converged", f"no run reached an optimum: {_words_of_best(runs)}"
-    if not arrived and len(problem.outputs) == 1:
+    if settled is False:
+        return "not-converged", "found again in its final weights, the optimum does not stand: the cost still falls"
+    if settled is None and not arrived:
         return "not-converged", f"the best run did not reach an optimum: {_words_of_best(runs)}"
     near = [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
     if near:
@@ -215,7 +226,8 @@ def _status(
     if at_bound:
         return "at-bound", f"on a bound: {', '.join(at_bound)}"
     count = sum(o.status == "converged" for o in outcomes)
-    return "converged", f"{count} of {len(outcomes)} runs converged, {len(arrived)} to this optimum"
+    there = f"{len(arrived)} to this optimum" if settled is None else "and the best again in the final weights"
+    return "converged", f"{count} of {len(outcomes)} runs converged, {there}"
 
 
 def _words_of_best(runs: Sequence[OptimiserResult]) -> str:

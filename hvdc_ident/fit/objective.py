@@ -121,6 +121,18 @@ def descend(
     return Reached(theta, here, used)
 
 
+def promised(problem: Problem, theta: Array) -> float:
+    """How much lower the cost would be after a Gauss-Newton step within the bounds. Raises SimulationError."""
+    space = problem.coordinates
+    r, jacobian = problem.residual(theta)
+    columns = jacobian * space.slope(theta)
+    low, high = space.bounds
+    x = space.scaled(theta)
+    g, h = columns.T @ r, columns.T @ columns
+    p = bounded_step(g, h, 0.0, low - x, high - x)
+    return -float(g @ p + 0.5 * p @ h @ p)
+
+
 def bounded_step(g: Array, h: Array, damping: float, low: Array, high: Array) -> Array:
     """The p in [low, high] that minimises g'p + p'(h + damping diag h)p/2, (p,); directions without curvature stay.
 

@@ -204,10 +204,14 @@ def _check_questions(study: Study, where: str) -> None:
         _all_known("experiment", group.experiments, names, f"{place}.experiments")
     if s.fit:
         from hvdc_ident.fit.loss import LOSSES
-        from hvdc_ident.fit.optimisers import catalogue
+        from hvdc_ident.fit.optimisers import catalogue, need
         from hvdc_ident.fit.tolerance import tolerance
 
         _all_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
+        try:
+            need(s.fit.optimiser)
+        except InputError as e:
+            raise e.at(where) from None
         _all_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
         try:
             tolerance(s.fit.tolerance, study.path.parent)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.expression import parse
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study import schema
@@ -47,8 +48,16 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
         except InputError as e:
             raise e.at(f"{where}, parameters.{name}") from None
         model = replace(model, parameters=model.parameters | {name: changed})
+    if not ties:
+        return model
+    expressions = {}
+    for name, tie in ties.items():
+        try:
+            expressions[name] = parse(tie)
+        except InputError as e:
+            raise e.at(f"{where}, parameters.{name}.tie") from None
     try:
-        return model.tied(ties) if ties else model
+        return model.tied(expressions)
     except InputError as e:
         raise e.at(f"{where}, parameters") from None
 

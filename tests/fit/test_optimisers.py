@@ -14,7 +14,7 @@ import pytest
 from hvdc_ident.errors import InputError, UnknownNameError
 from hvdc_ident.fit import fit
 from hvdc_ident.fit.optimiser import OptimiserResult
-from hvdc_ident.fit.optimisers import catalogue, is_global, optimiser
+from hvdc_ident.fit.optimisers import catalogue, is_global, need, optimiser
 from tests.fit.known_minima import TABLE, T
 from tests.fit.simulators import Closed, decay, parameters, recorded
 
@@ -117,8 +117,13 @@ def test_the_seed_decides_the_run_and_leaves_the_global_generator_alone(name):
 def test_without_its_package_an_optimiser_names_the_extra(name, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     problem = TABLE[0].make()
-    with pytest.raises(InputError, match=rf"'{name}' needs the package {package}.*hvdc_ident\[optimisers\]"):
+    text = rf"'{name}' needs the package {package}.*hvdc_ident\[optimisers\]"
+    with pytest.raises(InputError, match=text):
         optimiser(name).run(problem, problem.start)
+    monkeypatch.setattr("importlib.util.find_spec", lambda wanted: None)
+    with pytest.raises(InputError, match=text):
+        need(name)
+    need("trust-region")
 
 
 def test_the_extra_lists_the_packages():

@@ -1,17 +1,20 @@
 """The optimisers, one file each; a file supplies NAME, SUMMARY (one line) and OPTIMISER (the options class).
 
-GLOBAL = True in a file: its method searches the whole range by itself, so that one start is enough.
+GLOBAL = True in a file: its method searches the whole range by itself, so that one start is enough. PACKAGE: what it
+needs beyond the package's own dependencies, of the extra `optimisers`.
 """
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
 from dataclasses import fields
 from typing import Any
 
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.fit.optimiser import Optimiser
+from hvdc_ident.fit.search import missing
 
 
 def catalogue() -> dict[str, Any]:
@@ -33,6 +36,16 @@ def optimiser(name: str, seed: int = 0) -> Optimiser:
     seeded = any(f.name == "seed" for f in fields(options))
     found: Optimiser = options(seed=seed) if seeded else options()
     return found
+
+
+def need(name: str) -> None:
+    """Nothing. Raises UnknownNameError for an unknown optimiser, InputError where its package is not installed."""
+    known = catalogue()
+    if name not in known:
+        raise unknown_name("optimiser", name, known)
+    package = getattr(known[name], "PACKAGE", None)
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise missing(package, name)
 
 
 def is_global(name: str) -> bool:

@@ -18,6 +18,7 @@ from hvdc_ident.trajectory import Array
 NAME = "cma-es"
 SUMMARY = "evolution strategy with covariance adaptation (package cma, an extra), without derivatives"
 GLOBAL = True
+PACKAGE = "cma"
 OPTIMA = ("tolfun", "tolx", "tolfunhist", "tolflatfitness", "ftarget")
 """The package's words for an end that is an optimum; others (stagnation, a flat cost) are not."""
 
@@ -39,7 +40,7 @@ class CmaEs:
                 warnings.simplefilter("ignore")  # of optional parts of the package that are not installed
                 import cma
         except ImportError:
-            raise missing("cma", NAME) from None
+            raise missing(PACKAGE, NAME) from None
         search = Search(problem, start, self.max_evaluations)
         random = generator(self.seed, search.start)
         p = search.start.size

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.fit.objective import bounded_step
+from hvdc_ident.fit.objective import promised
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.search import BudgetSpentError, Search, generator
@@ -61,24 +61,12 @@ class DualAnnealing:
             return search.spent()
         if search.cost is None:
             return search.ended(False, "")
-        left = _promised(problem, search.best)
+        left = promised(problem, search.best)
         good = left <= self.stationary * search.cost + 1e-9
         stands = (
             "the best point is an optimum" if good else f"the best point is no optimum: {left:.3g} is still to gain"
         )
         return search.ended(good, f"{self.iterations} iterations done; {stands}")
-
-
-def _promised(problem: Problem, theta: Array) -> float:
-    """How much lower the cost would be after a Gauss-Newton step within the bounds."""
-    space = problem.coordinates
-    r, jacobian = problem.residual(theta)
-    columns = jacobian * space.slope(theta)
-    low, high = space.bounds
-    x = space.scaled(theta)
-    g, h = columns.T @ r, columns.T @ columns
-    p = bounded_step(g, h, 0.0, low - x, high - x)
-    return -float(g @ p + 0.5 * p @ h @ p)
 
 
 OPTIMISER = DualAnnealing

@@ -22,6 +22,7 @@ from hvdc_ident.trajectory import Array
 NAME = "particle-swarm"
 SUMMARY = "a swarm of particles (package pyswarms, an extra), without derivatives"
 GLOBAL = True
+PACKAGE = "pyswarms"
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class ParticleSwarm:
             try:
                 import pyswarms
             except ImportError:
-                raise missing("pyswarms", NAME) from None
+                raise missing(PACKAGE, NAME) from None
             swarm = pyswarms.single.GlobalBestPSO(
                 self.particles,
                 p,
