@@ -66,6 +66,7 @@ class Host:
         self._folder: Path | None = None
         self._useless: SimulationError | None = None
         self.memory = 0
+        self.sensitivity_error = 0.0
         self.started = 0
 
     def __getstate__(self) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from hvdc_ident.trajectory import Array
 
 KEPT_STEPS = 1000
 Answer = tuple[dict[str, Any], dict[str, Array]]
+LOST = 0.5  # relative error from which a derivative is not told from noise
 START_STEP = 1e-3  # of differences of the start by a parameter, in its sizes
 
 
@@ -96,6 +97,12 @@ class _Simulation:
         for name in rest:
             j = self.parameters.index(name)
             gradients[:, :, j], errors[j] = self._by_differences(name)
+        unseen = [n for n, e in zip(self.parameters, errors.tolist(), strict=True) if e > LOST]
+        for name in unseen:  # a column of noise would pass for a direction
+            j = self.parameters.index(name)
+            gradients[:, :, j], errors[j] = 0.0, 0.0
+        if unseen:
+            self.notes["not seen above the noise of the runs"] = ", ".join(unseen)
         if self.parameters:
             ways = {
                 n: "central differences of runs" if n in rest else "directional derivatives" for n in self.parameters

@@ -87,6 +87,11 @@ class FmuModel:
         inputs = {n: i.value for n, i in self.inputs.items()}
         return "\n".join(map(repr, (self.name, self.source, self.fmu.interface, self.values, inputs, self.effects)))
 
+    @property
+    def sensitivity_error(self) -> float:
+        """The largest relative error of a derivative so far, where they were differences; 0 where none was."""
+        return self.host.sensitivity_error
+
     def with_values(self, values: Mapping[str, float]) -> FmuModel:
         """The model with other parameter or input values. Raises UnknownNameError, or ModelError outside the bounds."""
         parameters, inputs = dict(self.parameters), dict(self.inputs)

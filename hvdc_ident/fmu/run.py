@@ -43,6 +43,14 @@ def simulate(
     for name in sensitivities:
         if name not in checked.parameters and name not in checked.inputs:
             raise unknown_name("parameter or input", name, [*checked.parameters, *checked.inputs], where=place)
+    if experiment.starts:
+        raise ModelError(
+            "an FMU begins where its own initialisation puts it",
+            where=place,
+            expected="no starts of states",
+            got=", ".join(experiment.starts),
+            hint="a parameter of the FMU that is a start value, where it has one",
+        )
     for name in experiment.offsets:
         if name not in checked.inputs:
             raise unknown_name("input", name, checked.inputs, where=f"{place}, offsets")
@@ -89,6 +97,7 @@ def bare(
     method = "lsoda" if model.has_equations else "co-simulation"
     notes = dict(answer["notes"])
     errors = dict(zip(sensitivities, out["errors"].tolist(), strict=True))
+    model.host.sensitivity_error = max([model.host.sensitivity_error, *errors.values()])
     worst = max(errors, key=lambda n: errors[n], default=None)
     if worst is not None and errors[worst] > 0.0:
         notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {worst}, the least certain"

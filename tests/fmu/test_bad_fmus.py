@@ -126,6 +126,8 @@ def test_wrong_names_and_values_are_wrong_input(fmu):
         model.with_values({"T": 0.0})
     with pytest.raises(InputError, match="no parameterisation"):
         model.parameterised("physical")
+    with pytest.raises(ModelError, match="begins where its own initialisation"):
+        simulate(model, STEP.with_(starts={"y": 0.5}))
     with pytest.raises(InputError, match="cannot be driven"):
         simulate(model, STEP.with_(drive=("out",)))
     assert FAULTY_VARIABLES[2].name == "T"

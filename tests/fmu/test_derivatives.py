@@ -1,0 +1,143 @@
+"""Operating points, linear models and sensitivities against matrices and derivatives known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from c_fmu import needs_compiler
+from c_models import BALL, COUNTER, FAULTY, spring
+from test_runs import response
+
+from hvdc_ident import find_operating_point, linearize, simulate
+from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fmu.differences import choose, slope
+from hvdc_ident.linearize import continuation, jacobian_error, point_at
+
+TIME = np.linspace(0.0, 5.0, 251)
+STEP = experiment("step", TIME, {"u": InputSignal.step(1.0, 0.0, 1.0)})
+WAYS = {
+    "own": spring(),
+    "none": spring("without", own=False),
+    "wrong": spring("liar", wrong=2.0),
+}
+"""Directional derivatives that are right but for an output that is a state, there are none, or they are wrong."""
+
+
+@needs_compiler
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("way", WAYS)
+def test_the_linear_model(fmu, way, version):
+    model = fmu(WAYS[way], version)
+    point = find_operating_point(model, {"u": 0.3, "k": 9.0})
+    assert point.states["x"] == pytest.approx(0.3, abs=1e-9) and point.states["v"] == pytest.approx(0.0, abs=1e-9)
+    found = linearize(model, point, outputs=["y", "twice"], sensitivities=["m", "k"])
+    tight = {"abs": 1e-12 if way == "own" else 1e-8}
+    assert found.A.ravel().tolist() == pytest.approx([0, 1, -4.5, -0.25], **tight)
+    assert found.B.ravel().tolist() == pytest.approx([0, 4.5], **tight)
+    assert found.C.ravel().tolist() == pytest.approx([1, 0, 0, 2], **tight)
+    assert found.D.ravel().tolist() == pytest.approx([0, 0], **tight)
+    assert found.provenance["method"] == ("directional" if way == "own" else "finite-difference")
+    assert jacobian_error(model, point) < 1e-6
+    assert found.gradients["m"].A.ravel() == pytest.approx([0, 0, 2.25, 0.125], abs=1e-5)
+    assert found.gradients["k"].B.ravel() == pytest.approx([0, 0.5], abs=1e-5)
+    assert [p.real for p in found.poles()] == pytest.approx([-0.125, -0.125], abs=1e-8)
+
+
+@needs_compiler
+def test_points_that_are_sought_and_points_that_are_not(fmu):
+    model = fmu(spring())
+    sought = find_operating_point(model, {"y": 0.7}, free=["u"])
+    assert sought.inputs["u"] == pytest.approx(0.7, abs=1e-9) and sought.residual < 1e-9
+    held = point_at(model, {"x": 0.2, "v": 1.0}, {"u": 0.1})
+    assert held.outputs["twice"] == pytest.approx(2.25) and held.states["x"] == 0.2
+    start = find_operating_point(model, {"u": 0.4}, at="start")
+    assert start.states == {"x": 0.4, "v": 0.0}
+    assert [p.states["x"] for p in continuation(model, "u", [0.0, 0.5, 1.0])] == pytest.approx([0, 0.5, 1.0], abs=1e-9)
+    with pytest.raises(SteadyStateError, match=r"no operating point.*d\(v\)/dt left with -9.81"):
+        find_operating_point(fmu(BALL, 2, "model-exchange"))
+    with pytest.raises(InputError, match="no variable 'uu'"):
+        find_operating_point(model, {"uu": 1.0})
+    with pytest.raises(InputError, match="no input 'x'"):
+        linearize(model, sought, inputs=["x"])
+    with pytest.raises(ModelError, match="expected model exchange"):
+        linearize(fmu(FAULTY, 2, "co-simulation"))
+    with pytest.raises(ModelError, match="effects at its ends"):
+        linearize(model.with_effects([{"effect": "lag", "at": "u", "parameters": {"T": 0.1}}]))
+    assert linearize(fmu(COUNTER)).A.shape == (0, 0)
+    assert issubclass(LinearizationError, InputError)
+
+
+def exact(name):
+    """The derivative of the step response, by complex-free differences of its closed form."""
+    h, at = 1e-5, {"m": 2.0, "d": 0.5, "k": 8.0}
+    up, down = ({**at, name: at[name] + s * h} for s in (1, -1))
+    return (response(TIME, **up) - response(TIME, **down)) / (2 * h)
+
+
+@needs_compiler
+@pytest.mark.parametrize("interface", ["model-exchange", "co-simulation"])
+@pytest.mark.parametrize("way", WAYS)
+def test_sensitivities(fmu, way, interface):
+    model = fmu(WAYS[way], 2, interface)
+    found = simulate(model, STEP, {}, ["m", "d", "k", "b"])
+    directional = way == "own" and interface == "model-exchange"
+    said = "directional derivatives: m, d, k, b" if directional else "central differences of runs: m, d, k, b"
+    assert found.notes["sensitivities"] == said
+    assert ("sensitivity error" in found.notes) is not directional
+    for j, name in enumerate("mdk"):
+        wanted = exact(name)
+        assert np.abs(found.gradient("y")[:, j] - wanted).max() < 1e-6 * max(np.abs(wanted).max(), 1.0), name
+    assert found.gradient("y")[:, 3] == pytest.approx(0.0, abs=1e-9)
+    assert found.gradient("twice")[:, 3] == pytest.approx(1.0, abs=1e-9)
+
+
+@needs_compiler
+def test_a_bounce_is_too_much_for_directional_derivatives(fmu):
+    """Before the first bounce the height does not depend on the factor; after it the closed form is known."""
+    time = np.linspace(0.0, 1.0, 101)
+    found = simulate(fmu(BALL, 2, "model-exchange"), experiment("fall", time), {}, ["e"])
+    first = np.sqrt(2 / 9.81)
+    wanted = np.where(time > first, np.sqrt(2 * 9.81) * (time - first), 0.0)
+    assert np.abs(found.gradient("height")[:, 0] - wanted).max() < 1e-6
+    assert found.notes["sensitivities"] == "central differences of runs: e"
+
+
+@needs_compiler
+def test_there_is_no_derivative_by_a_whole_number(fmu):
+    from dataclasses import replace
+
+    from c_fmu import Var
+
+    counted = replace(
+        FAULTY,
+        name="counted",
+        variables=tuple(
+            v if v.name != "fault" else Var("fault", 3, "parameter", "fixed", (("start", "0"),), "Integer")
+            for v in FAULTY.variables
+        ),
+    )
+    model = fmu(counted)
+    assert simulate(model, STEP, {"T": 0.5})["out"][-1] == pytest.approx(1.0, abs=1e-3)
+    with pytest.raises(InputError, match="takes whole numbers only"):
+        simulate(model, STEP, {"fault": 0.5})
+    with pytest.raises(InputError, match="no derivative by 'fault'"):
+        simulate(model, STEP, {}, ["fault"])
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-10, 1e-7])
+@pytest.mark.parametrize(("low", "high"), [(-np.inf, np.inf), (2.0, np.inf), (-np.inf, 2.0)])
+def test_a_step_is_chosen_against_the_noise(noise, low, high):
+    """exp(p t) with noise: the error is about what is said, and near the least there can be."""
+    t, random = np.linspace(0.0, 1.0, 200), np.random.default_rng(0)
+
+    def runs(p):
+        return (np.exp(p * t) + noise * random.normal(size=t.size))[:, None]
+
+    step = choose(runs, 2.0, 2.0, low, high)
+    found = slope(runs, 2.0, step.h, low, high)[:, 0]
+    wanted = t * np.exp(2.0 * t)
+    error = np.sqrt(np.mean((found - wanted) ** 2)) / np.sqrt(np.mean(wanted**2))
+    central = low == -np.inf and high == np.inf
+    assert error < (5.0 if central else 20.0) * step.error
+    assert step.error < {0.0: 1e-8, 1e-10: 1e-5, 1e-7: 1e-3}[noise]

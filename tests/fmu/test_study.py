@@ -1,0 +1,158 @@
+"""The same study file with an FMU in it, from the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from c_fmu import build, needs_compiler
+from c_models import spring
+from test_ends import TWIN
+from typer.testing import CliRunner
+
+from hvdc_ident.cli import app
+from hvdc_ident.model.card import save_card
+
+pytestmark = needs_compiler
+
+STUDY = """schema = 1
+name = "spring"
+[model]
+source = "{source}"
+{interface}
+[model.values]
+d = 0.5
+[parameters]
+d = {{start = 0.5, min = 0.1, max = 2}}
+k = {{start = 8, min = 2, max = 30}}
+[[experiment]]
+name = "step"
+data = "step.csv"
+inputs = ["u"]
+outputs = ["y", "twice"]
+noise = {{y = 1e-3, twice = 1e-3}}
+[[experiment]]
+name = "back"
+data = "back.csv"
+inputs = ["u"]
+outputs = ["y", "twice"]
+noise = {{y = 1e-3, twice = 1e-3}}
+role = "holdout"
+[linearize]
+inputs = ["u"]
+outputs = ["y"]
+[[sweep]]
+parameter = "d"
+min = 0.3
+max = 0.9
+points = 3
+[identifiability]
+[fit]
+starts = 2
+"""
+TRUE = {"d": 0.6, "k": 9.0}
+
+
+def study(folder, interface):
+    """A study of the spring's FMU, or of its twin in equations, with noisy records of a spring of other values."""
+    from hvdc_ident import simulate
+    from hvdc_ident.experiment import InputSignal, experiment
+
+    random, time = np.random.default_rng(3), np.linspace(0.0, 5.0, 126)
+    for name, level in (("step", 1.0), ("back", -0.7)):
+        u = InputSignal.step(1.0, 0.0, level)
+        run = simulate(TWIN.with_values(TRUE), experiment(name, time, {"u": u}))
+        table = np.column_stack([time, u(time), run["y"], run["twice"]])
+        table[:, 2:] += 1e-3 * random.normal(size=(time.size, 2))
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="time,u,y,twice", comments="", fmt="%.9g")
+    if interface == "twin":
+        source = save_card(TWIN, folder / "spring.toml").name
+    else:
+        source = build(spring(), folder).name
+    line = "" if interface == "twin" else f'interface = "{interface}"'
+    path = folder / "study.toml"
+    path.write_text(STUDY.format(source=source, interface=line))
+    return path
+
+
+def told(*arguments):
+    """The JSON a command prints."""
+    result = CliRunner().invoke(app, [*map(str, arguments), "--json"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def stages(tmp_path_factory):
+    """The results of every stage, by interface."""
+    found = {}
+
+    def of(interface):
+        if interface not in found:
+            folder = tmp_path_factory.mktemp(interface)
+            found[interface] = told("run", study(folder, interface), "--out", folder / "out")["stages"]
+        return found[interface]
+
+    return of
+
+
+@pytest.mark.parametrize("interface", ["model-exchange", "co-simulation"])
+def test_every_stage_says_what_it_says_of_the_twin(stages, interface, tmp_path):
+    if interface == "co-simulation":
+        path = study(tmp_path, interface)
+        refused = CliRunner().invoke(app, ["linearize", str(path)])
+        assert refused.exit_code == 2 and "expected model exchange" in refused.output
+        path.write_text(path.read_text().replace('[linearize]\ninputs = ["u"]\noutputs = ["y"]\n', ""))
+        found = told("run", path, "--out", tmp_path / "out")["stages"]
+    else:
+        found = stages(interface)
+        a, b = found["linearize"], stages("twin")["linearize"]
+        assert a["method"] == "directional" and a["jacobian_error"] < 1e-6
+        for key in "ABCD":
+            assert np.allclose(a[key], b[key], atol=1e-9)
+        assert np.allclose([m["eigenvalue"] for m in a["modes"]], [m["eigenvalue"] for m in b["modes"]], atol=1e-9)
+    twin = stages("twin")
+    for output in ("y", "twice"):
+        for name in ("step", "back"):
+            assert found["simulate"]["rmse"][output][name] == pytest.approx(
+                twin["simulate"]["rmse"][output][name], rel=1e-4
+            )
+    for p, q in zip(found["sweep"]["points"], twin["sweep"]["points"], strict=True):
+        assert p["values"] == q["values"] and p["rmse"]["y"]["step"] == pytest.approx(q["rmse"]["y"]["step"], rel=1e-4)
+    assert found["identify"]["identifiable"] == twin["identify"]["identifiable"]
+    for n, e in found["fit"]["estimates"].items():
+        other = twin["fit"]["estimates"][n]
+        assert abs(e["value"] - other["value"]) < 1e-3 * other["std"]
+        assert e["std"] == pytest.approx(other["std"], rel=1e-3)
+
+
+def test_check_runs_nothing_and_tells_what_is_there(tmp_path):
+    found = told("check", study(tmp_path, "model-exchange"))
+    assert found["sizes"] == {"states": 2, "parameters": 4, "inputs": 1, "outputs": 2}
+    assert list(found["candidates"]) == ["d", "k"]
+
+
+def test_an_fmu_with_effects_runs_from_the_study(tmp_path):
+    path = study(tmp_path, "co-simulation")
+    effect = '[[model.effect]]\neffect = "lag"\nat = ["y"]\nparameters = {T = 0.05}\n[parameters]\n'
+    path.write_text(path.read_text().replace("[parameters]\n", effect))
+    assert told("simulate", path)["rmse"]["y"]["step"] > 0.0
+
+
+def test_wrong_studies_are_one_message(tmp_path):
+    path = study(tmp_path, "model-exchange")
+    text = path.read_text()
+    for old, new, message in (
+        ('source = "spring2.fmu"', 'source = "none.fmu"', "no model file 'none.fmu'"),
+        ('interface = "model-exchange"', 'interface = "scheduled"', "model.interface"),
+        ("d = 0.5", "dd = 0.5", "no parameter or input 'dd'"),
+        ('inputs = ["u"]', 'inputs = ["uu"]', "no input 'uu'"),
+    ):
+        path.write_text(text.replace(old, new, 1))
+        result = CliRunner().invoke(app, ["check", str(path)])
+        assert result.exit_code == 2 and message in result.output and "Traceback" not in result.output
+    (tmp_path / "spring2.fmu").write_bytes(b"no archive")
+    path.write_text(text)
+    result = CliRunner().invoke(app, ["check", str(path)])
+    assert result.exit_code == 2 and "no zip archive" in result.output
