@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 See = Callable[[str, Array], Array]
 Flow = Callable[[list[Array], Mapping[str, Array], Mapping[str, Array], See], list[Array]]
 

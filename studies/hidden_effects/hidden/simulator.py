@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hidden.operators import CATALOGUE, OUTSIDE, Operator
 from hidden.plants import Plant
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 STEP = 2e-4
 LEAD = 1.0
 """s: how long a run that has no steady start waits for rest before its first row."""
@@ -86,9 +86,7 @@ class _Batch:
         waits = any(kinds[h.effect].waits_for_rest for h in hidden)
         self.lead = round(LEAD / step) if waits else 0
         self.steps = self.lead + (rows - 1) * self.every + 1
-        self.p = {
-            n: np.array([float(r.values.get(n, v)) for r in runs]) for n, v in plant.parameters.items()
-        }
+        self.p = {n: np.array([float(r.values.get(n, v)) for r in runs]) for n, v in plant.parameters.items()}
         self.chains: dict[str, list[tuple[Operator, int, str]]] = {}
         count = len(plant.states)
         for e in hidden:

@@ -1,0 +1,210 @@
+"""A case given to the package, and what came of it as one line of numbers. The only part that imports the package."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hidden.campaigns import summary
+from hidden.cases import Case
+from hidden.plants import PLANTS
+from hvdc_ident import simulate
+from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.experiment import Experiment, InputSignal
+from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model import Model
+from hvdc_ident.model.card import read_card
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.trajectory import Trajectory
+
+CARDS = Path(__file__).resolve().parents[1] / "cards"
+NAMES = ("fit-1", "fit-2", "holdout")
+WIDTH = 5.0
+"""The bounds of a fitted parameter: its true value divided and multiplied by this."""
+
+
+def model_of(plant: str) -> Model:
+    """The plant's card."""
+    return read_card(CARDS / f"{plant}.toml")
+
+
+def experiments_of(case: Case) -> tuple[Experiment, ...]:
+    """The case's records as experiments; the last one is held out."""
+    outputs = PLANTS[case.design.plant].outputs
+    names = tuple(outputs[k] for k in case.channels)
+    noise = {} if case.told is None else {outputs[k]: float(case.told[k]) for k in case.channels}
+    found = []
+    for k, run in enumerate(case.runs):
+        inputs = {n: InputSignal.corners(points) for n, points in summary(run).items()}  # type: ignore[arg-type]
+        records = np.asarray(case.records[:, k][:, list(case.channels)], dtype=np.float64)
+        rows = np.asarray(case.times, dtype=np.float64)
+        measured = Trajectory(rows, records, names, tuple("" for _ in names))
+        found.append(
+            Experiment(
+                NAMES[k],
+                rows,
+                FrozenMap(inputs),
+                measured=measured,
+                noise=FrozenMap(noise),
+                event=case.event,
+                role="holdout" if k == 2 else "fit",
+            )
+        )
+    return tuple(found)
+
+
+def free_of(case: Case) -> tuple[Free, ...]:
+    """The parameters that may be fitted, from where a user would start."""
+    true = PLANTS[case.design.plant].parameters
+    return tuple(Free(n, v, true[n] / WIDTH, true[n] * WIDTH) for n, v in case.given.items())
+
+
+def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
+    """One line: the design, the truth, the diagnosis, and how the held-out record is then predicted.
+
+    sindy: whether the baseline of that name is run too.
+    """
+    design = case.design
+    line: dict[str, Any] = {
+        "case": design.name,
+        "part": design.part,
+        "plant": design.plant,
+        "effects": list(design.effects),
+        "size": design.size,
+        "noise": design.noise,
+        "excitation": design.excitation,
+        "removed": design.removed,
+        "told": case.told is not None,
+        "level": design.level,
+        "units": case.units,
+        "tries": case.tries,
+        "truth": case.truth,
+    }
+    model, experiments, free = model_of(design.plant), experiments_of(case), free_of(case)
+    tried: Any = [n for n in effects() if n not in design.effects] if design.part == "left-out" else "all"
+    begin = time.perf_counter()
+    try:
+        found = diagnose(model, experiments, free, effects=tried, seed=seed)
+    except HvdcIdentError as e:
+        return line | {"failed": str(e), "seconds": time.perf_counter() - begin}
+    line |= {"seconds": time.perf_counter() - begin} | _told(found)
+    line["held_out"] = {
+        "refitted": _misfit(model, experiments, case, found.parameters_refitted),
+        "augmented": None
+        if found.augmented is None
+        else _misfit(found.augmented, experiments, case, found.parameters_after),
+        "oracle": _oracle(model, experiments, case, free),
+    }
+    if sindy:
+        line["sindy"] = _sindy(model, experiments, case, found.parameters_refitted)
+    return line
+
+
+def _told(found: Any) -> dict[str, Any]:
+    """What the diagnosis says, as plain numbers; of its candidates the best by score and the best by BIC."""
+    told = found.to_dict()
+    lines = told["candidates"]
+    scored = [c for c in lines if c["score"] is not None and np.isfinite(c["score"])]
+    refitted = [c for c in lines if c["delta_bic"] is not None]
+    return {
+        "verdict": told["verdict"],
+        "found": told["effects"],
+        "ambiguity": told["ambiguity"],
+        "location": told["location"],
+        "shrink": told["gap"]["shrink_holdout"],
+        "adequate": told["remaining"].get("adequate"),
+        "best_score": max(scored, key=lambda c: c["score"], default=None),
+        "best_bic": max(refitted, key=lambda c: c["delta_bic"], default=None),
+        "tried": len(lines),
+    }
+
+
+def _misfit(model: Model, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
+    """Root mean square of the held-out record's residuals in units of its true noise; None where the model cannot run."""
+    held = experiments[2]
+    assert held.measured is not None
+    try:
+        run = simulate(model, held, values, outputs=held.outputs)
+    except HvdcIdentError:
+        return None
+    sigma = case.sigma[list(case.channels)]
+    return float(np.sqrt(np.mean(((run.trajectory.values - held.measured.values) / sigma) ** 2)))
+
+
+def _sindy(
+    model: Model, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]
+) -> dict[str, float | None]:
+    """The held-out misfit with a sparse law for the residual, and how many terms the law has."""
+    from hidden.sindy import predicted
+
+    plant = PLANTS[case.design.plant]
+    residuals, drivers = [], []
+    for e, run in zip(experiments, case.runs, strict=True):
+        assert e.measured is not None
+        told = simulate(model, e, values, outputs=e.outputs).trajectory.values
+        inputs = [
+            run.inputs[n].at(case.times) if n in run.inputs else np.full(case.times.size, v)
+            for n, v in plant.inputs.items()
+        ]
+        residuals.append(np.asarray(e.measured.values - told))
+        drivers.append(np.column_stack([told, *(i for i in inputs)]))
+    moving = np.ptp(np.concatenate(drivers), axis=0) > 1e-9
+    law, terms = predicted(residuals, [d[:, moving] for d in drivers], np.asarray(case.times, dtype=np.float64))
+    sigma = case.sigma[list(case.channels)]
+    misfit = None if law is None else float(np.sqrt(np.mean(((residuals[-1] - law) / sigma) ** 2)))
+    return {"augmented": misfit, "terms": float(terms)}
+
+
+def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: Sequence[Free]) -> float | None:
+    """The same for the model with what is truly there, fitted from the truth; None outside the catalogue and without effects."""
+    known = effects()
+    if not case.hidden or any(h.effect not in known for h in case.hidden):
+        return None
+    true = PLANTS[case.design.plant].parameters
+    unknown = [Free(f.name, true[f.name], f.min, f.max) for f in free]
+    for h in case.hidden:
+        use = EffectUse(h.effect, (h.at,), FrozenMap(_numbers(h.parameters)), source=h.source)
+        before = set(model.parameters)
+        model = model.with_effects([use])
+        bounds = _bounds(h.effect, _numbers(h.parameters))
+        for name in (n for n in model.parameters if n not in before):
+            own = next(
+                n for n in h.parameters if use.parameter_name(n) == name or name.startswith(use.parameter_name(n))
+            )
+            if own in bounds:
+                low, high = bounds[own]
+                value = model.parameters[name].value
+                unknown.append(Free(name, value, min(low, value), max(high, value)))
+    sigma = {o: float(case.sigma[k]) for o, k in zip(experiments[0].outputs, case.channels, strict=True)}
+    coloured = case.design.noise in ("ar", "told-white")
+    problem = Problem(ModelSimulator(model), tuple(experiments), tuple(unknown), weights=FrozenMap(sigma))
+    try:
+        result = fit(problem, starts=1, assess=False, whiten="pre-event" if coloured else "no")
+    except HvdcIdentError:
+        return None
+    if result.status == "failed":
+        return None
+    return _misfit(model, experiments, case, {n: e.value for n, e in result.estimates.items()})
+
+
+def _numbers(parameters: Mapping[str, Any]) -> dict[str, float]:
+    return {n: float(v) for n, v in parameters.items()}
+
+
+def _bounds(effect: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Bounds for a fit from the truth: a factor of ten, or ten times the distance from neutral; what a refit holds is left."""
+    found = {}
+    for name, q in effects()[effect].parameters.items():
+        value = values.get(name, q.value)
+        if q.held or (q.optional and value == q.neutral):
+            continue
+        low, high = sorted((value / 10.0, value * 10.0)) if value else (-1.0, 1.0)
+        found[name] = (max(low, q.min), min(high, q.max))
+    return found

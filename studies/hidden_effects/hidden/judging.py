@@ -1,0 +1,394 @@
+"""What the lines of all cases come to: who was named, who should have been, how large, how well it then predicts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+Line = Mapping[str, Any]
+SAME_NAME = ({"coupling", "droop"}, {"lag", "inductance"})
+"""Effects that are one equation: a droop is a coupling with the other sign, an inductance over R a lag of L/R."""
+SUMS: Mapping[str, Sequence[set[str]]] = {
+    "station": ({"Pref", "Pm", "err"}, {"E", "V"}),
+    "drive": ({"wref", "wm", "err"}, {"torque", "friction", "load"}, {"v", "emf"}),
+}
+"""Slots that only enter one sum together: what is added at one might as well be added at another."""
+ADDED = ("offset", "disturbance", "coupling", "droop", "conductance", "loss")
+MAIN = {
+    "lag": "T", "delay": "T", "window-mean": "T", "sample-hold": "Ts", "second-order": "wn", "lead-lag": "T1", "limit": "level",
+    "saturation": "level", "rate-limit": "rate", "deadband": "width", "backlash": "width", "quantisation": "step", "gain": "k",
+    "offset": "c", "coupling": "k", "droop": "k", "conductance": "g", "inductance": "L", "disturbance": "amplitude",
+}  # fmt: skip
+"""The parameter that measures the effect."""
+OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")
+
+
+# --- one case ---
+
+
+def same_effect(a: str, b: str) -> bool:
+    """Whether two names stand for one equation."""
+    return a == b or any({a, b} <= group for group in SAME_NAME)
+
+
+def same_place(plant: str, effect: str, a: str, b: str) -> bool:
+    """Whether an effect at one slot is the same as at the other."""
+    return a == b or (effect in ADDED and any({a, b} <= group for group in SUMS[plant]))
+
+
+def _is(line: Line, truth: Line, told: Line, place: bool = True) -> bool:
+    """Whether what is told (effect, at, from) is what is hidden."""
+    if not same_effect(truth["effect"], told["effect"]):
+        return False
+    if not place:
+        return True
+    sources = {truth.get("source") or "", told.get("from") or ""}
+    one_slot = len(told["at"]) == 1 and same_place(line["plant"], truth["effect"], truth["at"], told["at"][0])
+    return one_slot and len(sources) == 1
+
+
+def outcome(line: Line) -> str:
+    """What came of one case with an effect in it.
+
+    right: named, effect and place. covered: the truth is in the ambiguity set. place: the effect is right, its place is
+    not (and not in the set). wrong: another effect is named, or one beside the right ones. ambiguous: a set without the
+    truth. abstained: nothing is named. failed: no diagnosis. A pair is right if both are.
+    """
+    if "failed" in line:
+        return "failed"
+    truths, found = line["truth"], line["found"]
+    sets = [r for group in line["ambiguity"] for r in group]
+    if line["verdict"] not in ("named", "ambiguous"):
+        return "abstained"
+    if (
+        line["verdict"] == "named"
+        and len(found) == len(truths)
+        and all(any(_is(line, t, f) for f in found) for t in truths)
+    ):
+        return "right"
+    if all(any(_is(line, t, told) for told in (*found, *sets)) for t in truths) and len(found) <= len(truths):
+        return "covered"
+    if line["verdict"] == "ambiguous":
+        return "ambiguous"
+    if all(any(_is(line, t, f, place=False) for t in truths) for f in found):
+        return "place"
+    return "wrong"
+
+
+def limit_above(count: int, of: int, level: float = 0.95) -> float:
+    """The upper Clopper-Pearson limit of a share."""
+    return 1.0 if count >= of else float(stats.beta.ppf(level, count + 1, of - count))
+
+
+# --- all cases ---
+
+
+def summary(lines: Sequence[Line]) -> dict[str, Any]:
+    """Everything the study reports, as plain numbers."""
+    made = [x for x in lines if not x.get("unreachable")]
+    by_part = {p: [x for x in made if x["part"] == p] for p in ("single", "pair", "clean", "outside", "left-out")}
+    single = by_part["single"]
+    large = [x for x in single if x["size"] >= 10.0]
+    return {
+        "cases": {p: len(x) for p, x in by_part.items()},
+        "unreachable": len(lines) - len(made),
+        "seconds": _quantiles([x["seconds"] for x in made]),
+        "outcomes_by_size": {
+            f"{s:g}": _outcomes([x for x in single if x["size"] == s]) for s in (1.0, 3.0, 10.0, 30.0)
+        },
+        "large": _shares(large),
+        "pairs": _shares(by_part["pair"]),
+        "by_noise": _by(large, "noise"),
+        "by_excitation": _by(large, "excitation"),
+        "by_channels": _by(large, "removed"),
+        "by_effect": {
+            e: _outcomes([x for x in large if x["effects"] == [e]]) for e in sorted({x["effects"][0] for x in large})
+        },
+        "confusion": _confusion(large),
+        "ambiguity": _ambiguity(large),
+        "clean": _clean(by_part["clean"]),
+        "outside": _strangers(by_part["outside"]),
+        "left_out": _strangers(by_part["left-out"]),
+        "location": _location(large),
+        "sizes": _sizes(single),
+        "held_out": _held_out(large),
+        "sindy": _sindy(large, by_part["clean"]),
+        "baselines": _baselines(large, by_part["clean"], by_part["outside"]),
+    }
+
+
+def _outcomes(lines: Sequence[Line]) -> dict[str, int]:
+    found = Counter(outcome(x) for x in lines)
+    return {name: found.get(name, 0) for name in OUTCOMES}
+
+
+def _shares(lines: Sequence[Line]) -> dict[str, Any]:
+    found = _outcomes(lines)
+    n = len(lines)
+    wrong = found["wrong"]
+    return {
+        "cases": n,
+        **found,
+        "right_or_covered": (found["right"] + found["covered"]) / n if n else None,
+        "wrong_names": wrong / n if n else None,
+        "wrong_names_limit": limit_above(wrong, n) if n else None,
+    }
+
+
+def _by(lines: Sequence[Line], key: str) -> dict[str, Any]:
+    return {str(v): _shares([x for x in lines if x[key] == v]) for v in sorted({x[key] for x in lines}, key=str)}
+
+
+def _confusion(lines: Sequence[Line]) -> dict[str, dict[str, int]]:
+    """By hidden effect: what was named (the first), or the verdict where nothing was."""
+    table: dict[str, Counter[str]] = {}
+    for x in lines:
+        if "failed" in x:
+            told = "failed"
+        elif x["verdict"] == "ambiguous" and outcome(x) == "covered":
+            told = "ambiguous, truth in the set"
+        elif x["verdict"] == "named" and x["found"]:
+            told = x["found"][0]["effect"]
+        else:
+            told = x["verdict"]
+        table.setdefault(x["effects"][0], Counter())[told] += 1
+    return {e: dict(sorted(c.items())) for e, c in sorted(table.items())}
+
+
+def _ambiguity(lines: Sequence[Line]) -> dict[str, Any]:
+    """Of the cases with an ambiguity set: how often the truth is in it, and how many members it has."""
+    sets = [(x, x["ambiguity"][0]) for x in lines if "failed" not in x and x["ambiguity"]]
+    inside = [any(_is(x, x["truth"][0], r) for r in members) for x, members in sets]
+    return {
+        "sets": len(sets),
+        "coverage": float(np.mean(inside)) if sets else None,
+        "mean_size": float(np.mean([len(m) for _, m in sets])) if sets else None,
+    }
+
+
+def _clean(lines: Sequence[Line]) -> dict[str, Any]:
+    """False names, all and by noise; an ambiguous verdict claims an effect too and is counted beside."""
+    ran = [x for x in lines if "failed" not in x]
+
+    def row(part: Sequence[Line]) -> dict[str, Any]:
+        false = sum(x["verdict"] == "named" for x in part)
+        claimed = sum(x["verdict"] in ("ambiguous", "unnameable") for x in part)
+        return {
+            "cases": len(part),
+            "false_names": false,
+            "limit": limit_above(false, len(part)) if part else None,
+            "evidence_without_name": claimed,
+        }
+
+    return {
+        **row(ran),
+        "failed": len(lines) - len(ran),
+        "by_noise": {n: row([x for x in ran if x["noise"] == n]) for n in sorted({x["noise"] for x in ran})},
+        "verdicts": dict(Counter(x["verdict"] for x in ran)),
+        "unreached_verdicts": dict(Counter(x["verdict"] for x in ran if x["noise"] == "unreached")),
+    }
+
+
+def _strangers(lines: Sequence[Line]) -> dict[str, Any]:
+    """Cases whose effect the search did not have: a name is wrong unless it is the same equation."""
+    ran = [x for x in lines if "failed" not in x]
+    named = [x for x in ran if x["verdict"] == "named" and not any(_is(x, x["truth"][0], f) for f in x["found"])]
+    return {
+        "cases": len(ran),
+        "failed": len(lines) - len(ran),
+        "confident_wrong_names": len(named),
+        "share": len(named) / len(ran) if ran else None,
+        "limit": limit_above(len(named), len(ran)) if ran else None,
+        "verdicts": dict(Counter(x["verdict"] for x in ran)),
+        "named_as": {
+            e: dict(Counter(x["found"][0]["effect"] for x in named if x["effects"][0] == e))
+            for e in sorted({x["effects"][0] for x in named})
+        },
+    }
+
+
+def _location(lines: Sequence[Line]) -> dict[str, Any]:
+    """Of the cases in which the right effect is named: is the place? And with the places of the set?"""
+    named = [x for x in lines if "failed" not in x and x["verdict"] in ("named", "ambiguous") and x["found"]]
+    named = [x for x in named if same_effect(x["truth"][0]["effect"], x["found"][0]["effect"])]
+    exact = sum(_is(x, x["truth"][0], x["found"][0]) for x in named)
+    inside = sum(outcome(x) in ("right", "covered") for x in named)
+    n = len(named)
+    return {"cases": n, "place": exact / n if n else None, "place_or_in_set": inside / n if n else None}
+
+
+def _sizes(lines: Sequence[Line]) -> dict[str, Any]:
+    """Of what was named rightly: the relative error of the size, and how often its interval holds the truth."""
+    table: dict[str, list[tuple[float, bool]]] = {}
+    for x in lines:
+        if "failed" in x or outcome(x) != "right" or len(x["found"]) != 1:
+            continue
+        effect, found = x["truth"][0]["effect"], x["found"][0]
+        name = MAIN.get(effect)
+        if name is None or found["effect"] != effect or name not in found["parameters"]:
+            continue
+        true, told = float(x["truth"][0]["parameters"][name]), found["parameters"][name]
+        if not same_sign_place(x):
+            continue
+        low, high = told["ci95"] or (None, None)
+        holds = (low is None or low <= true) and (high is None or true <= high)
+        table.setdefault(effect, []).append((told["value"] / true - 1.0, holds))
+    everything = [p for rows in table.values() for p in rows]
+
+    def row(pairs: Iterable[tuple[float, bool]]) -> dict[str, Any]:
+        rows = list(pairs)
+        errors = np.array([e for e, _ in rows])
+        return {
+            "cases": len(rows),
+            "median_error": float(np.median(errors)) if rows else None,
+            "median_absolute_error": float(np.median(np.abs(errors))) if rows else None,
+            "coverage": float(np.mean([h for _, h in rows])) if rows else None,
+        }
+
+    return {"all": row(everything), "by_effect": {e: row(rows) for e, rows in sorted(table.items())}}
+
+
+def same_sign_place(line: Line) -> bool:
+    """Whether the effect was found at its own slot: at the other side of a sum its size has another sign."""
+    return bool(line["found"][0]["at"] == [line["truth"][0]["at"]])
+
+
+def _held_out(lines: Sequence[Line]) -> dict[str, Any]:
+    """Shrink of the held-out misfit against the refitted nominal, for what was named, beside the oracle's."""
+    rows = []
+    for x in lines:
+        held = x.get("held_out") or {}
+        if outcome(x) not in ("right", "covered", "place", "wrong") or None in (
+            held.get("refitted"),
+            held.get("augmented"),
+            held.get("oracle"),
+        ):
+            continue
+        rows.append((1 - held["augmented"] / held["refitted"], 1 - held["oracle"] / held["refitted"]))
+    if not rows:
+        return {"cases": 0}
+    own, oracle = np.array(rows).T
+    return {
+        "cases": len(rows),
+        "shrink_median": float(np.median(own)),
+        "oracle_median": float(np.median(oracle)),
+        "behind_oracle": _quantiles((oracle - own).tolist()),
+        "within_a_tenth": float(np.mean(oracle - own <= 0.1)),
+    }
+
+
+def _baselines(large: Sequence[Line], clean: Sequence[Line], outside: Sequence[Line]) -> dict[str, Any]:
+    """What simpler rules would have said, from the same candidates.
+
+    refit only: never names. best score: the candidate with the best score before any refit, whenever p < 0.01. best BIC:
+    the refit with the best BIC whenever it gains more than 10, without held-out records and without a look at what is left.
+    """
+
+    def rule(name: str, x: Line) -> Line | None:
+        best = x.get(name)
+        if best is None:
+            return None
+        sure = best["p"] < 0.01 if name == "best_score" else best["delta_bic"] > 10.0
+        return best if sure else None
+
+    found: dict[str, Any] = {"refit only": {"right": 0.0, "wrong_effect": 0.0, "false_names": 0, "outside_names": 0}}
+    for name, title in (("best_score", "best score, no refit"), ("best_bic", "BIC, no adequacy test")):
+        told = [(x, rule(name, x)) for x in large if "failed" not in x]
+        n = max(len(told), 1)
+        found[title] = {
+            "right": sum(t is not None and _is(x, x["truth"][0], t) for x, t in told) / n,
+            "wrong_effect": sum(t is not None and not _is(x, x["truth"][0], t, place=False) for x, t in told) / n,
+            "false_names": sum(rule(name, x) is not None for x in clean if "failed" not in x),
+            "outside_names": sum(rule(name, x) is not None for x in outside if "failed" not in x),
+        }
+    return found
+
+
+def _sindy(large: Sequence[Line], clean: Sequence[Line]) -> dict[str, Any]:
+    """The sparse law for the residual: its held-out shrink where an effect is, and where none is (it should be none)."""
+
+    def row(lines: Sequence[Line]) -> dict[str, Any]:
+        ran = [x for x in lines if "sindy" in x]
+        sound = [x for x in ran if x["sindy"]["augmented"] is not None and x["held_out"]["refitted"]]
+        shrinks = [1 - x["sindy"]["augmented"] / x["held_out"]["refitted"] for x in sound]
+        return {
+            "cases": len(ran),
+            "ran_away": len(ran) - len(sound),
+            "shrink": _quantiles(shrinks),
+            "worse_than_without": float(np.mean(np.array(shrinks) < 0)) if shrinks else None,
+        }
+
+    return {"size 10 and above": row(large), "clean": row(clean)}
+
+
+def _quantiles(values: Sequence[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    low, middle, high, top = np.quantile(values, [0.05, 0.5, 0.95, 1.0])
+    return {"5 %": float(low), "median": float(middle), "95 %": float(high), "largest": float(top)}
+
+
+# --- as text ---
+
+
+def report(found: Mapping[str, Any]) -> str:
+    """The summary as Markdown."""
+    sizes = {"all": found["sizes"]["all"], **found["sizes"]["by_effect"]}
+    parts = [
+        f"Cases: {', '.join(f'{n} {p}' for p, n in found['cases'].items())}; "
+        f"{found['unreachable']} designs that no place could hold.",
+        _table("Single effects by size (units)", found["outcomes_by_size"], OUTCOMES),
+        "Size 10 and above: " + _said(found["large"]),
+        "Pairs: " + _said(found["pairs"]),
+        _table("Size 10 and above, by noise", found["by_noise"], ("cases", *OUTCOMES)),
+        _table("by excitation", found["by_excitation"], ("cases", *OUTCOMES)),
+        _table("with a channel removed", found["by_channels"], ("cases", *OUTCOMES)),
+        _table("by effect", found["by_effect"], OUTCOMES),
+        "Confusion (hidden: named or verdict)\n"
+        + "\n".join(
+            f"- {e}: " + ", ".join(f"{k} {n}" for k, n in row.items()) for e, row in found["confusion"].items()
+        ),
+        f"Ambiguity sets: {_plain(found['ambiguity'])}",
+        f"Clean cases: {_plain({k: v for k, v in found['clean'].items() if k != 'by_noise'})}",
+        _table(
+            "Clean cases by noise",
+            found["clean"]["by_noise"],
+            ("cases", "false_names", "limit", "evidence_without_name"),
+        ),
+        f"Outside the catalogue: {_plain(found['outside'])}",
+        f"Left out of the search: {_plain(found['left_out'])}",
+        f"Localisation: {_plain(found['location'])}",
+        _table(
+            "Sizes, of what was named rightly", sizes, ("cases", "median_error", "median_absolute_error", "coverage")
+        ),
+        f"Held-out shrink: {_plain(found['held_out'])}",
+        _table("Baselines", found["baselines"], ("right", "wrong_effect", "false_names", "outside_names")),
+        f"Sparse law for the residual (pysindy): {_plain(found['sindy'])}",
+        f"Seconds a diagnosis: {_plain(found['seconds'])}",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _said(shares: Mapping[str, Any]) -> str:
+    if not shares["cases"]:
+        return "none"
+    return (
+        f"{shares['cases']} cases, right or covered {shares['right_or_covered']:.1%}, wrong names "
+        f"{shares['wrong_names']:.1%} (upper limit {shares['wrong_names_limit']:.1%})"
+    )
+
+
+def _plain(values: Any) -> str:
+    if isinstance(values, Mapping):
+        return ", ".join(f"{k} {_plain(v)}" for k, v in values.items()) or "none"
+    return f"{values:.3g}" if isinstance(values, float) else str(values)
+
+
+def _table(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str]) -> str:
+    head = f"| {title} | " + " | ".join(columns) + " |\n|" + "---|" * (len(columns) + 1)
+    body = [f"| {name} | " + " | ".join(_plain(row.get(c, "")) for c in columns) + " |" for name, row in rows.items()]
+    return "\n".join([head, *body])

@@ -1,0 +1,45 @@
+"""Noise of the records, and how it weighs a difference."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+RHO = 0.9
+KINDS = ("white", "ar", "quantised")
+WRONG = ("told-half", "told-white", "heavy", "louder-later")
+"""Kinds for clean cases in which what a record says of its noise, or the whole noise model, is wrong."""
+
+
+def added(rng: np.random.Generator, clean: Array, sigma: Array, kind: str, event: int) -> Array:
+    """The record: clean (rows, outputs) with noise of standard deviation sigma (outputs,). event: its row.
+
+    told-half: white, told-white: AR(1); what they tell is another matter. heavy: Student's t with 3 degrees of freedom.
+    louder-later: one and a half times as loud from the event on. quantised: rounded to steps whose error has this
+    standard deviation, with white noise of a quarter of a step below.
+    """
+    e = rng.standard_normal(clean.shape)
+    if kind == "quantised":
+        step = sigma * np.sqrt(12.0)
+        return np.round((clean + 0.25 * step * e) / step) * step
+    if kind in ("ar", "told-white"):
+        e[1:] *= np.sqrt(1.0 - RHO**2)
+        for k in range(1, e.shape[0]):
+            e[k] += RHO * e[k - 1]
+    elif kind == "heavy":
+        e = rng.standard_t(3, clean.shape) / np.sqrt(3.0)
+    elif kind == "louder-later":
+        e[event:] *= 1.5
+    return clean + sigma * e
+
+
+def whitened(difference: Array, sigma: Array, kind: str) -> Array:
+    """A difference (rows, ..., outputs) in units of independent noise."""
+    d = difference / sigma
+    if kind == "ar":
+        d = d.copy()
+        d[1:] = (d[1:] - RHO * (difference / sigma)[:-1]) / np.sqrt(1.0 - RHO**2)
+    elif kind == "quantised":
+        d = d / np.sqrt(1.0 + 12.0 * 0.25**2)
+    return d

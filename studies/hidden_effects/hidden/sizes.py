@@ -1,0 +1,233 @@
+"""How large an effect has to be: in units of what can just be detected once the gains have been refitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hidden.campaigns import campaign
+from hidden.noise import whitened
+from hidden.operators import WITH_SOURCE
+from hidden.plants import PLANTS, Plant
+from hidden.simulator import STEP, Hidden, Run, simulate
+
+Array = NDArray[np.floating]
+UNIT = 4.15
+"""One unit: the post-refit signature |M s|, in whitened noise, at which its score s'Mr/|Ms| has a mean equal to the
+threshold of a two-sided test at 1 % over three hundred candidates."""
+GRID = 14
+
+
+@dataclass(frozen=True)
+class About:
+    """What a size is relative to: the slot's signal (and the other one) over the fitted experiments without the effect."""
+
+    low: float
+    high: float
+    rest: float
+    other_range: float = 1.0
+    other_peak: float = 1.0
+    other_rest: float = 0.0
+
+    @property
+    def peak(self) -> float:
+        """Its largest magnitude."""
+        return max(abs(self.low), abs(self.high), 1e-9)
+
+    @property
+    def range(self) -> float:
+        """How far it moves, or a hundredth of its peak."""
+        return max(self.high - self.low, 0.01 * self.peak)
+
+
+SPANS: Mapping[str, tuple[float, float]] = {
+    "lag": (4e-4, 0.3),
+    "delay": (2e-4, 0.15),
+    "window-mean": (4e-4, 0.3),
+    "sample-hold": (1e-3, 0.2),
+    "second-order": (2e-4, 0.1),
+    "lead-lag": (0.01, 0.9),
+    "limit": (0.02, 0.9),
+    "saturation": (0.05, 1.5),
+    "rate-limit": (1e-3, 0.6),
+    "deadband": (2e-4, 0.6),
+    "backlash": (1e-3, 1.2),
+    "quantisation": (0.01, 1.5),
+    "inductance": (4e-4, 0.3),
+    "notch": (0.01, 0.95),
+}
+"""From the smallest to the largest size tried, in what `parameters` counts sizes in; (1e-3, 1) where not listed."""
+
+TIMES = ("lag", "delay", "window-mean", "sample-hold", "second-order", "inductance")
+"""Sized by a time, which the simulator's step bounds from below."""
+
+
+def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, resistance: float) -> dict[str, Array]:
+    """The effect's parameters for sizes x (any shape, growing with the effect). rng: what else there is to choose."""
+    sign, one = rng.choice([-1.0, 1.0]), np.ones_like(x)
+    ratio = about.range / max(about.other_range, 1e-9)
+    match effect:
+        case "lag" | "delay" | "window-mean":
+            return {"T": x}
+        case "sample-hold":
+            # An odd number of steps: the samples meet the rows as rarely as they can.
+            return {"Ts": STEP * (2 * np.round((x / STEP - 1) / 2) + 1), "compute": 0 * one}
+        case "second-order":
+            return {"wn": 1 / x, "zeta": rng.uniform(0.2, 0.9) * one}
+        case "lead-lag":
+            t2 = rng.uniform(0.01, 0.04) * one
+            return {"T1": t2 * (1 + sign * x), "T2": t2}
+        case "limit":
+            return {"level": about.peak - x * (about.peak - about.rest)}
+        case "saturation":
+            return {"level": about.peak / x}
+        case "rate-limit":
+            return {"rate": about.range / x}
+        case "deadband":
+            return {"width": x * about.peak}
+        case "backlash":
+            return {"width": x * about.range}
+        case "quantisation":
+            return {"step": x * about.range}
+        case "gain":
+            return {"k": 1 + sign * 0.6 * x}
+        case "offset":
+            return {"c": sign * x * about.range}
+        case "coupling":
+            return {"k": sign * x * ratio}
+        case "droop":
+            return {"k": x * ratio}
+        case "conductance":
+            return {"g": sign * x * about.range / about.other_peak}
+        case "loss":
+            share = rng.choice([0.0, 1.0], size=2) if rng.random() < 0.7 else np.ones(2)
+            b, c = share if share.any() else (0.0, 1.0)
+            size = x * about.range / about.other_peak
+            return {"a": 0.2 * b * c * x * about.range, "b": b * size, "c": c * size / about.other_peak}
+        case "inductance":
+            return {"L": x * resistance, "R": resistance * one}
+        case "disturbance":
+            frequency, phase = rng.uniform(2.0, 25.0), rng.uniform(0, 2 * np.pi)
+            return {"amplitude": x * about.range, "frequency": frequency * one, "phase": phase * one}
+        case "cubic":
+            return {"k": sign * x * about.range / about.peak**3}
+        case "relay":
+            width = 0.1 * max(about.other_range, 1e-9)
+            return {"k": x * about.range, "centre": about.other_rest * one, "width": width * one}
+        case "notch":
+            return {"k": x, "wn": 2 * np.pi * rng.uniform(3.0, 10.0) * one}
+        case "drift":
+            return {"k": sign * 0.5 * x}
+        case "product":
+            return {"k": sign * x / max(about.other_range, 1e-9)}
+    raise ValueError(f"no such effect: {effect}")
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """The plant without effects under a campaign: outputs (rows, 3, outputs) and their slopes by the fitted parameters."""
+
+    plant: Plant
+    runs: tuple[Run, Run, Run]
+    outputs: Array
+    slopes: Array  # (rows, 2, parameters, outputs), of the fitted experiments
+    slots: Mapping[str, Array]  # (rows, 2)
+
+
+@lru_cache(maxsize=32)
+def nominal(plant_name: str, excitation: str, variant: int) -> Nominal:
+    """The plant's own answer to a campaign, and how the fitted parameters move it."""
+    plant = PLANTS[plant_name]
+    runs = campaign(plant, excitation, variant)
+    batch = list(runs)
+    for name in plant.fitted:
+        value = plant.parameters[name]
+        for sign in (-1, 1):
+            batch += [Run(r.inputs, {name: value * (1 + sign * 1e-3)}) for r in runs[:2]]
+    watch = (*(f"outputs.{o}" for o in plant.outputs), *plant.slots)
+    found = simulate(plant, batch, watch=watch)
+    n = len(plant.outputs)
+    moved = found[:, 3:, :n].reshape(found.shape[0], len(plant.fitted), 2, 2, n)
+    size = np.array([2e-3 * plant.parameters[p] for p in plant.fitted])
+    slopes = (moved[:, :, 1] - moved[:, :, 0]).transpose(0, 2, 1, 3) / size[:, None]
+    slots = {s: found[:, :2, n + k] for k, s in enumerate(plant.slots)}
+    slots |= {f"outputs.{o}": found[:, :2, k] for k, o in enumerate(plant.outputs)}
+    return Nominal(plant, runs, found[:, :3, :n], slopes, slots)
+
+
+def about(base: Nominal, at: str, source: str) -> About:
+    """What sizes at a slot are relative to."""
+    u, o = base.slots[at], base.slots[source] if source else np.zeros((1, 2))
+    return About(
+        float(u.min()), float(u.max()), float(np.abs(u[0]).max()),
+        float(np.ptp(o)), float(max(np.abs(o).max(), 1e-9)), float(o[0, 0]),
+    )  # fmt: skip
+
+
+def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Sequence[int]) -> Array:
+    """(n,) the post-refit size of each answer, in units. answer: (rows, 2, n, outputs) of the fitted experiments."""
+    pick = list(channels)
+    s = whitened(answer - base.outputs[:, :2, None], sigma, kind)[..., pick]
+    slopes = whitened(base.slopes, sigma, kind)[..., pick]
+    s = s.transpose(0, 1, 3, 2).reshape(-1, answer.shape[2])
+    slopes = slopes.transpose(0, 1, 3, 2).reshape(-1, len(base.plant.fitted))
+    slopes = slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-12)
+    left, values, _ = np.linalg.svd(slopes, full_matrices=False)
+    left = left[:, values > 1e-9 * values.max()]
+    return np.asarray(np.linalg.norm(s - left @ (left.T @ s), axis=0) / UNIT)
+
+
+def sized(
+    base: Nominal,
+    effect: str,
+    at: str,
+    source: str,
+    wanted: float,
+    sigma: Array,
+    kind: str,
+    channels: Sequence[int],
+    seed: Sequence[int],
+) -> Hidden | None:
+    """The effect as large as wanted, in units; None where no size reaches it, or a run leaves all bounds before.
+
+    A size beyond which the answer is out of all proportion (four times the outputs' own range) counts as out of bounds.
+    """
+    plant = base.plant
+    low, high = SPANS.get(effect, (1e-3, 1.0))
+    x = np.geomspace(low, high, GRID)
+    signal = about(base, at, source)
+    resistance = plant.parameters.get(plant.resistance[1], 1.0)
+    values = parameters(effect, x, signal, np.random.default_rng(seed), resistance)
+    tiled = {n: np.tile(v, 2) for n, v in values.items()}
+    runs = [r for r in base.runs[:2] for _ in range(GRID)]
+    answer = simulate(plant, runs, [Hidden(effect, at, tiled, source)])
+    answer = answer.reshape(answer.shape[0], 2, GRID, -1)
+    extent = np.ptp(base.outputs[:, :2], axis=(0, 1)) + 1e-3 * np.abs(base.outputs).max(axis=(0, 1, 2))
+    far = np.abs(answer - base.outputs[:, :2, None]).max(axis=(0, 1)) / extent
+    fine = np.isfinite(answer).all(axis=(0, 1, 3)) & (far < 4.0).all(axis=1)
+    count = GRID if fine.all() else int(np.argmin(fine))
+    if count == 0:
+        return None
+    size = units(base, answer[:, :, :count], sigma, kind, channels)
+    above = np.flatnonzero(size >= wanted)
+    if above.size == 0:
+        return None
+    k = int(above[0])
+    if k == 0:
+        chosen = x[0] * wanted / size[0]
+    else:
+        share = np.log(wanted / max(size[k - 1], 1e-9 * wanted)) / np.log(size[k] / max(size[k - 1], 1e-9 * wanted))
+        chosen = x[k - 1] * (x[k] / x[k - 1]) ** share
+    if chosen < (low if effect in TIMES else 0.2 * low):
+        return None
+    point = parameters(effect, np.array([chosen]), signal, np.random.default_rng(seed), resistance)
+    return Hidden(effect, at, {n: float(v[0]) for n, v in point.items()}, source)
+
+
+def needs_source(effect: str) -> bool:
+    """Whether the effect brings another signal in."""
+    return effect in WITH_SOURCE
