@@ -132,6 +132,12 @@ def _why(e: dict[str, Any]) -> str:
     return f"a lag of 1.6 ms left out gives {moved}, put in {back}; without filters and inner loop KIVDC is {inner}"
 
 
+def _optimisers(e: dict[str, Any]) -> str:
+    m = e["methods"]
+    own, swarm = m["trust-region"]["evaluations"], m["particle-swarm"]["evaluations"]
+    return f"the same optimum from all {len(m)}; {own} evaluations with exact sensitivities, {swarm} for the particle swarm"
+
+
 HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "software_to_software": ("Fig. 3: is the reference to be believed?", _software),
     "table_1": ("Table I: six gains from two numbers", _table_1),
@@ -147,6 +153,7 @@ HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "why_table_3_is_biased": ("Why Table III's gains are off Table I", _why),
     "avm_modes": ("The modes of the average-value link", _modes),
     "dymola_waveform": ("The phasor link on Dymola's waveforms", _dymola),
+    "optimisers": ("RaPId's optimisers on the link", _optimisers),
     "profile_coverage": ("How often the profile's interval holds the truth", _coverage),
 }
 
