@@ -81,7 +81,12 @@ def _correlation(fit: dict[str, Any]) -> str:
 
 
 def _one_by_one(fit: dict[str, Any]) -> str:
-    lines = {n: d for n, d in (fit.get("per_experiment") or {}).items() if d.get("std") is not None}
+    known = fit.get("estimates") or {}  # a weak one has no value with a spread, here neither
+    lines = {
+        n: d
+        for n, d in (fit.get("per_experiment") or {}).items()
+        if d.get("std") is not None and (known.get(n) or {}).get("std") is not None
+    }
     if not lines:
         return ""
     rows = []
