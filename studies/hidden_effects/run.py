@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -33,11 +34,21 @@ def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
     if case is None:
         return {"case": design.name, "part": design.part, "effects": list(design.effects), "unreachable": True}
     making = time.perf_counter() - begin
-    return diagnosed(case, seed=design.number, sindy=sindy) | {"making": making}
+    try:
+        return diagnosed(case, seed=design.number, sindy=sindy) | {"making": making}
+    except Exception:  # a mistake in the program: a line of its own, and the others go on
+        told: dict[str, Any] = {
+            "case": design.name,
+            "part": design.part,
+            "plant": design.plant,
+            "effects": list(design.effects),
+        }
+        told |= {"size": design.size, "noise": design.noise, "excitation": design.excitation, "removed": design.removed}
+        return told | {"failed": traceback.format_exc(), "crash": True, "seconds": time.perf_counter() - begin}
 
 
-def lines(path: Path) -> dict[str, dict[str, Any]]:
-    """What a file of results holds, by case; a last line that a kill cut short is left out."""
+def lines(path: Path, crashes: bool = False) -> dict[str, dict[str, Any]]:
+    """What a file of results holds, by case; a last line that a kill cut short is left out, and unless asked for, so are crashes."""
     found: dict[str, dict[str, Any]] = {}
     if path.exists():
         for text in path.read_text(encoding="utf-8").splitlines():
@@ -45,7 +56,8 @@ def lines(path: Path) -> dict[str, dict[str, Any]]:
                 line = json.loads(text)
             except json.JSONDecodeError:
                 continue
-            found[line["case"]] = line
+            if not line.get("crash") or crashes:
+                found[line["case"]] = line
     return found
 
 
@@ -77,7 +89,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     if not asked.judge_only:
         todo = list(pending(asked.parts, asked.seed, asked.limit, set(done), asked.full))
         _work(todo, asked, path, len(done))
-        done = lines(path)
+    done = lines(path, crashes=True)
     found = summary(list(done.values()))
     (out / "summary.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     (out / "summary.md").write_text(report(found), encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import product
@@ -20,8 +21,8 @@ from hidden.sizes import Nominal, needs_source, nominal, sized, units
 Array = NDArray[np.floating]
 SIZES = (1.0, 3.0, 10.0, 30.0)
 TRIES = 12
-LEVELS = (2e-3, 2e-2)
-"""Of the noise: its standard deviation in shares of an output's range."""
+LOUDNESS = (math.log(2e-3), math.log(2e-2))
+"""Of the noise: its standard deviation in shares of an output's range, as logarithms."""
 PARTS = {"single": 340, "pair": 60, "clean": 400, "outside": 50, "left-out": 60}
 """How many cases each part has."""
 
@@ -102,11 +103,11 @@ def factorial(seed: int) -> tuple[Design, ...]:
     """Every combination of the factors for a single effect; the place is drawn, as in the fractional design."""
     rng = np.random.default_rng([seed, 99])
     rows = product(CATALOGUE, PLANTS, SIZES, KINDS, EXCITATIONS, (False, True), (True, False), range(VARIANTS))
-    found = []
+    found: list[Design] = []
     for effect, plant, size, noise, excitation, removed, told, variant in rows:
         if effect == "inductance" and plant != "station":
             continue
-        level = float(np.exp(rng.uniform(*np.log(LEVELS))))
+        level = float(np.exp(rng.uniform(LOUDNESS[0], LOUDNESS[1])))
         factors = (effect,), size, noise, excitation, removed, told, level, variant
         found.append(Design("single", len(found), plant, *factors))
     return tuple(found)
@@ -135,7 +136,7 @@ def _balanced(rng: np.random.Generator, count: int, part: str) -> list[dict[str,
         column = [options[k % len(options)] for k in range(count)]
         order = rng.permutation(count)
         columns[name] = [column[k] for k in order]
-    loudness = np.exp(rng.uniform(*np.log(LEVELS), count))
+    loudness = np.exp(rng.uniform(LOUDNESS[0], LOUDNESS[1], count))
     return [{n: c[k] for n, c in columns.items()} | {"level": float(loudness[k])} for k in range(count)]
 
 

@@ -173,20 +173,20 @@ class _Batch:
             return self._result()
 
     def _result(self) -> Array:
-        x = self._rest()
+        x = np.array(self._rest())
         out = np.full((self.rows, self.n, len(self.watch)), np.nan)
-        h = self.h
+        h, places = self.h, (0, 1, 1, 2)
         for step in range(self.steps):
             t = (step - self.lead) * h
-            total = [np.zeros(self.n) for _ in x]
-            rate: list[Array] = []
-            for stage, (share, weight) in enumerate(zip(STAGES, WEIGHTS, strict=True)):
-                at = x if stage == 0 else [a + share * h * r for a, r in zip(x, rate, strict=True)]
-                inputs = {n: v[step, (0, 1, 1, 2)[stage]] for n, v in self.inputs.items()}
-                rate = self._flow("run", at, inputs, t + share * h, share)
+            total, rate = np.zeros_like(x), x
+            for stage in range(4):
+                share, place = STAGES[stage], places[stage]
+                at = x + (share * h) * rate if stage else x
+                inputs = {n: v[step, place] for n, v in self.inputs.items()}
+                rate = np.array(self._flow("run", list(at), inputs, t + share * h, share))
                 if stage == 0 and step >= self.lead and (step - self.lead) % self.every == 0:
                     for k, name in enumerate(self.watch):
                         out[(step - self.lead) // self.every, :, k] = self.seen[name]
-                total = [a + weight * r for a, r in zip(total, rate, strict=True)]
-            x = [a + h * r for a, r in zip(x, total, strict=True)]
+                total += WEIGHTS[stage] * rate
+            x = x + h * total
         return out
