@@ -21,8 +21,6 @@ from hvdc_ident.trajectory import Array
 
 FEWEST = 3
 """Fewer experiments have no scatter worth the name."""
-BATCHES = 8
-"""Parts that a bootstrap is cut into where there are other processes to run them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +59,9 @@ def bootstrap(
     random = np.random.default_rng(seed)
     drawn = [random.integers(len(units), size=len(units)) for _ in range(samples)]
     counts = np.array([np.bincount(d, minlength=len(units)) for d in drawn])
-    parts = np.array_split(counts, BATCHES) if executor else [counts]
-    fits = partial(_refits, problem, np.asarray(theta, dtype=float))
-    rows = [row for part in (executor.map if executor else map)(fits, parts) for row in part]
+    theta = np.asarray(theta, dtype=float)
+    refit = partial(_refit, problem, theta, problem.blocks(theta))
+    rows = list((executor.map if executor else map)(refit, counts))
     good = [row for row in rows if row is not None]
     if not good:
         raise SimulationError("no sample of the bootstrap could be fitted", got=f"{len(rows)} failures")
@@ -71,13 +69,8 @@ def bootstrap(
     return Bootstrap(names, np.array(good)[:, : len(names)], len(rows) - len(good), len(units))
 
 
-def _refits(problem: Problem, theta: Array, counts: NDArray[np.intp]) -> list[Array | None]:
-    """The estimates, (p,), with every experiment counted so many times, a row of counts a fit; None where it fails."""
-    blocks = problem.blocks(theta)
-    return [_refit(problem, theta, blocks, row) for row in counts]
-
-
 def _refit(problem: Problem, theta: Array, blocks: Sequence[Block], counts: NDArray[np.intp]) -> Array | None:
+    """The estimates, (p,), with every experiment counted so many times; None where the fit fails."""
     units = problem.fitted_experiments
     times = {e.name: int(c) for e, c in zip(units, counts, strict=True) if c}
     drawn = replace(problem, experiments=tuple(e for e in units if e.name in times))

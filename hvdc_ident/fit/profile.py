@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from hvdc_ident.fit.objective import Objective, Reached, descend
 from hvdc_ident.fit.unknown import Coordinates
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.estimate import Executor
 
 TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
@@ -109,13 +112,15 @@ def profiles(
     threshold: float | Mapping[str, float] = TWO_SIDED,
     physical: Physical | None = None,
     walk: Walk | None = None,
+    executor: Executor | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Profiles:
     """The profile of each named unknown (all) around the optimum theta, (p,), which is refined first.
 
     threshold: rise of the cost at the ends of a two-sided interval; at a bound 1.353/1.92 of it, one-sided.
     Where a profile falls below the optimum, everything begins again from there (up to three times), and `restarts`
-    says so. Raises SimulationError where the objective cannot be evaluated at theta.
+    says so. executor: a side is a piece of work, all from the same optimum, so the result does not depend on it.
+    Raises SimulationError where the objective cannot be evaluated at theta.
     """
     walk = walk or Walk()
     wanted = list(names) if names is not None else [u.name for u in objective.unknowns]
@@ -123,28 +128,105 @@ def profiles(
     least = min(threshold.values(), default=TWO_SIDED) if isinstance(threshold, Mapping) else threshold
     enough = 0.1 * walk.tolerance * least
     none = np.zeros(len(objective.unknowns), dtype=bool)
+    asked = [(name, direction) for name in wanted for direction in (-1.0, 1.0)]
     while True:
         best = descend(objective, theta, none, enough=enough)
-        found: dict[str, Profile] = {}
+        rises = {n: threshold[n] if isinstance(threshold, Mapping) else threshold for n in wanted}
+        walkers = _Walkers(objective, best, rises, physical or {}, walk, last=len(restarts) == 3)
+        found: dict[str, list[_Walked]] = {name: [] for name in wanted}
+        ends = (executor.map if executor else map)(walkers, asked)
+        better: _Better | None = None
+        for done, name in enumerate(wanted):
+            if progress:
+                progress(done, len(wanted), f"profile of {name}")
+            while better is None and len(found[name]) < 2:
+                walked = next(ends)
+                found[name].append(walked)
+                better = walked.better
+            if better is not None:
+                theta = better.theta
+                restarts.append(f"on the profile of {name} the cost fell by {better.fall:.3g} below the optimum")
+                break
+        else:
+            named = {n: _profile(walkers.of(n), *sides) for n, sides in found.items()}
+            return Profiles(best.theta, best.at.cost, FrozenMap(named), tuple(restarts))
+
+
+@dataclass(frozen=True, eq=False)
+class _Better:
+    """A place that costs less than the optimum. theta: (p,); fall: by how much."""
+
+    theta: Array
+    fall: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Walked:
+    """One side as walked: how it ended; m points, their scaled places (m,), unknowns (m, p) and costs (m,).
+
+    better: set where the walk was given up because it came below the optimum; `side` is then None.
+    """
+
+    side: Side | None
+    scaled: Array
+    thetas: Array
+    costs: Array
+    better: _Better | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Walkers:
+    """The walks from one optimum; called with the name of an unknown and a direction, it walks that side."""
+
+    objective: Objective
+    best: Reached
+    rises: Mapping[str, float]
+    physical: Physical
+    walk: Walk
+    last: bool
+
+    def __call__(self, asked: tuple[str, float]) -> _Walked:
+        name, direction = asked
+        size = len(self.objective.unknowns)
         try:
-            for done, name in enumerate(wanted):
-                if progress:
-                    progress(done, len(wanted), f"profile of {name}")
-                t = threshold[name] if isinstance(threshold, Mapping) else threshold
-                found[name] = _Walker(objective, best, t, physical or {}, walk, last=len(restarts) == 3).profile(name)
-        except _BetterFoundError as better:
-            theta = better.theta
-            restarts.append(f"on the profile of {better.name} the cost fell by {better.fall:.3g} below the optimum")
-            continue
-        return Profiles(best.theta, best.at.cost, FrozenMap(found), tuple(restarts))
+            side, points = self.of(name).side(direction)
+        except _BetterFoundError as found:
+            return _Walked(None, np.zeros(0), np.zeros((0, size)), np.zeros(0), _Better(found.theta, found.fall))
+        thetas = np.array([p.theta for _, p in points]).reshape(len(points), size)
+        return _Walked(side, np.array([x for x, _ in points]), thetas, np.array([p.at.cost for _, p in points]))
+
+    def of(self, name: str) -> _Walker:
+        """The walker of one unknown."""
+        return _Walker(self.objective, self.best, self.rises[name], self.physical, self.walk, name, self.last)
+
+
+def _profile(walker: _Walker, below: _Walked, above: _Walked) -> Profile:
+    """The profile put together from its sides and the optimum between them."""
+    assert below.side is not None and above.side is not None
+    best = walker.best
+    scaled = np.concatenate([walker.x0[[walker.i]], below.scaled, above.scaled])
+    thetas = np.vstack([best.theta, below.thetas, above.thetas])
+    costs = np.concatenate([[best.at.cost], below.costs, above.costs])
+    order = np.argsort(scaled, kind="stable")
+    return Profile(
+        walker.name,
+        float(best.theta[walker.i]),
+        below.side,
+        above.side,
+        thetas[order, walker.i],
+        costs[order] - best.at.cost,
+        thetas[order],
+        walker.rise,
+        walker.on_bound,
+    )
 
 
 class _BetterFoundError(Exception):
     """A point on a profile lies below the optimum."""
 
-    def __init__(self, name: str, theta: Array, fall: float) -> None:
-        super().__init__(name)
-        self.name, self.theta, self.fall = name, theta, fall
+    def __init__(self, theta: Array, fall: float) -> None:
+        super().__init__(fall)
+        self.theta, self.fall = theta, fall
 
 
 @dataclass
@@ -156,38 +238,20 @@ class _Walker:
     threshold: float
     physical: Physical
     walk: Walk
+    name: str
     last: bool = False
     evaluations: int = field(default=0, init=False)
 
-    def profile(self, name: str) -> Profile:
-        """The profile of the unknown."""
+    def __post_init__(self) -> None:
         self.space = Coordinates(self.objective.unknowns)
         self.low, self.high = self.space.bounds
-        self.name = name
-        self.i = [u.name for u in self.objective.unknowns].index(name)
+        self.i = [u.name for u in self.objective.unknowns].index(self.name)
         self.fixed = np.arange(len(self.objective.unknowns)) == self.i
         self.x0 = self.space.scaled(self.best.theta)
-        on_bound = bool(self.x0[self.i] <= self.low[self.i] or self.x0[self.i] >= self.high[self.i])
-        self.rise = self.threshold * (ONE_SIDED / TWO_SIDED if on_bound else 1.0)
-        sides, points = [], [(self.x0[self.i], self.best)]
-        for direction in (-1.0, 1.0):
-            side, walked = self._side(direction)
-            sides.append(side)
-            points += walked
-        points.sort(key=lambda p: p[0])
-        return Profile(
-            name,
-            float(self.best.theta[self.i]),
-            sides[0],
-            sides[1],
-            np.array([p.theta[self.i] for _, p in points]),
-            np.array([p.at.cost - self.best.at.cost for _, p in points]),
-            np.array([p.theta for _, p in points]),
-            self.rise,
-            on_bound,
-        )
+        self.on_bound = bool(self.x0[self.i] <= self.low[self.i] or self.x0[self.i] >= self.high[self.i])
+        self.rise = self.threshold * (ONE_SIDED / TWO_SIDED if self.on_bound else 1.0)
 
-    def _side(self, direction: float) -> tuple[Side, list[tuple[float, Reached]]]:
+    def side(self, direction: float) -> tuple[Side, list[tuple[float, Reached]]]:
         """One side: how it ended, and its points in the order walked."""
         self.evaluations = 0
         end = self.high[self.i] if direction > 0 else self.low[self.i]
@@ -262,7 +326,7 @@ class _Walker:
         self.evaluations += found.evaluations
         fall = self.best.at.cost - found.at.cost
         if fall > 0.02 * self.rise and not self.last:
-            raise _BetterFoundError(self.name, found.theta, fall)
+            raise _BetterFoundError(found.theta, fall)
         return found
 
     def _look_for_another(self, point: Reached) -> None:
@@ -275,7 +339,7 @@ class _Walker:
         self.evaluations += end.evaluations
         fall = self.best.at.cost - end.at.cost
         if fall > 0.02 * self.rise:
-            raise _BetterFoundError(self.name, end.theta, fall)
+            raise _BetterFoundError(end.theta, fall)
 
     def _refine(self, x: float, at: Reached, ahead: float, there: Reached) -> tuple[float, Reached]:
         """The crossing between a point below the threshold and one above, by false position (Illinois)."""

@@ -71,7 +71,7 @@ def identifiability(
     _data_notes(so_far, optimum, result)
     left = narrow.insensitive(so_far, optimum)
     left = narrow.lost(so_far, left) if left else None
-    last = narrow.profiled(so_far, left) if left else None
+    last = narrow.profiled(so_far, left, executor) if left else None
     report = _assembled(so_far, structure, optimum, last, result, executor)
     if pair and last is not None and set(pair) <= set(report.identifiable):
         return replace(report, pair=pair_of(last, report.parameters, pair))

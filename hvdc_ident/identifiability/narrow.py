@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.fit.estimate import Executor
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import Profile, profiles
 from hvdc_ident.identifiability import verdicts
@@ -92,7 +93,7 @@ def lost(so_far: Findings, optimum: Optimum) -> Optimum | None:
     return so_far.without(optimum, {n: so_far.found[n].reason for n in out})
 
 
-def profiled(so_far: Findings, optimum: Optimum | None) -> Optimum | None:
+def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | None = None) -> Optimum | None:
     """The optimum of the set all of whose profiles are closed, with a verdict on every member."""
     while optimum is not None:
         limits = thresholds(optimum)
@@ -105,6 +106,7 @@ def profiled(so_far: Findings, optimum: Optimum | None) -> Optimum | None:
             threshold=limits,
             physical=physical,
             walk=so_far.walk,
+            executor=executor,
             progress=so_far.progress,
         )
         so_far.notes += [f"A better optimum was found: {r}." for r in around.restarts]
