@@ -203,7 +203,8 @@ def _solved(matrix: Array, right: Array) -> Array:
     if matrix.shape[0] == 1:
         return np.asarray(right / np.where(matrix[0] == 0.0, 1.0, matrix[0]))
     m = np.moveaxis(matrix, (0, 1), (-2, -1))
-    return np.moveaxis(np.linalg.solve(m, np.moveaxis(right, 0, -1)[..., None])[..., 0], -1, 0)
+    found: Array = np.asarray(np.linalg.solve(m, np.moveaxis(right, 0, -1)[..., None])[..., 0], dtype=float)
+    return np.moveaxis(found, -1, 0)
 
 
 def _at(signal: Array, time: Array, when: Array) -> Array:

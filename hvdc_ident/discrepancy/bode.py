@@ -12,7 +12,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.frequency import frequency_response
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.trajectory import Array
 
 POINTS = 60
@@ -20,7 +20,7 @@ MOST = 12
 """Channels that are drawn at most."""
 
 
-def responses(model: Model, first: Refit, augmented: Model | None, last: Refit) -> tuple[Mapping[str, Any], ...]:
+def responses(model: AnyModel, first: Refit, augmented: AnyModel | None, last: Refit) -> tuple[Mapping[str, Any], ...]:
     """For each moved input and measured output: gain by frequency of nominal, augmented and recorded responses.
 
     The models are linear about the start of the experiment that moves the input; a point without one is a reason.
@@ -37,7 +37,7 @@ def responses(model: Model, first: Refit, augmented: Model | None, last: Refit) 
 
 
 def _channel(
-    model: Model, first: Refit, augmented: Model | None, last: Refit, e: Experiment, name: str, output: str
+    model: AnyModel, first: Refit, augmented: AnyModel | None, last: Refit, e: Experiment, name: str, output: str
 ) -> Mapping[str, Any]:
     omega, data = recorded(e, name, output, first.noise[output].std or 0.0)
     line: dict[str, Any] = {
@@ -58,7 +58,7 @@ def _channel(
     return line
 
 
-def _model(model: Model, e: Experiment, values: Mapping[str, float], name: str, output: str, omega: Array) -> Array:
+def _model(model: AnyModel, e: Experiment, values: Mapping[str, float], name: str, output: str, omega: Array) -> Array:
     begin = float(e.time[0])
     levels = {n: float(s(np.nextafter(begin, -np.inf))) for n, s in e.inputs.items() if n in model.inputs}
     at = {**e.values, **levels, **{n: v for n, v in values.items() if n in model.parameters}}

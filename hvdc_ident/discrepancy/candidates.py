@@ -13,7 +13,8 @@ from hvdc_ident.effects import Effect, EffectUse, Probe, SlotSignal, effects, pr
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.model.transform import slot
+from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model.transform import slot as slot_of
 from hvdc_ident.trajectory import Array
 
 Signals = Mapping[str, tuple[Array, ...]]
@@ -59,7 +60,7 @@ def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:
 
 
 def candidates(
-    model: Model,
+    model: AnyModel,
     signals: Signals,
     times: Sequence[Array],
     names: Iterable[str] | Literal["all"],
@@ -77,7 +78,7 @@ def candidates(
     for at in groups:
         joined = SlotSignal.joined([about[p] for p in at])
         still = joined.high - joined.low <= STILL * max(joined.peak, STILL)
-        kinds = {slot(model, p)[0] for p in at}
+        kinds = {kind_of(model, p) for p in at}
         for effect in tried:
             if not kinds <= set(effect.places):
                 continue
@@ -88,7 +89,7 @@ def candidates(
 
 
 def _at(
-    model: Model,
+    model: AnyModel,
     effect: Effect,
     at: tuple[str, ...],
     signal: SlotSignal,
@@ -97,7 +98,7 @@ def _at(
     brought: Sequence[str],
 ) -> list[Candidate]:
     if effect.resistance:
-        found = list(resistances(model, at[0])) if len(at) == 1 else []
+        found = list(resistances(model, at[0])) if len(at) == 1 and isinstance(model, Model) else []
         return [
             Candidate(
                 effect.name, at, probes(effect, signal, given={effect.resistance: model.parameters[n].value}),
@@ -109,7 +110,7 @@ def _at(
         return [Candidate(effect.name, at, probes(effect, signal), still=still and not _additive(effect))]
     if len(at) > 1:
         return []
-    open_to = set(sources(model, at[0]))
+    open_to = set(sources(model, at[0])) if isinstance(model, Model) else set(_open_ends(model, at[0]))
     return [
         Candidate(effect.name, at, _halved(probes(effect, signal, about[s])), source=s)
         for s in brought
@@ -132,10 +133,29 @@ def _halved(found: tuple[Probe, ...]) -> tuple[Probe, ...]:
     return tuple(kept)
 
 
-def _moves(model: Model, place: str) -> bool:
+def kind_of(model: AnyModel, place: str) -> str:
+    """The kind of a slot: input, signal, algebraic, state or output; a closed model has inputs and outputs only.
+
+    Raises UnknownNameError for a place that is no slot.
+    """
+    if isinstance(model, Model):
+        return slot_of(model, place)[0]
+    if place in model.inputs:
+        return "input"
+    if place.removeprefix("outputs.") in model.outputs:
+        return "output"
+    raise unknown_name("slot", place, model.slots, where=f"model '{model.name}', which is closed inside")
+
+
+def _open_ends(model: AnyModel, place: str) -> tuple[str, ...]:
+    """What an effect at an end of a closed model may bring in: its inputs, for an output would close a loop around it."""
+    return tuple(n for n in model.inputs if n != place)
+
+
+def _moves(model: AnyModel, place: str) -> bool:
     """Whether a slot's signal depends on states or inputs at all; what is made of parameters alone is no signal."""
-    kind, name = slot(model, place)
-    if kind in ("input", "state", "output", "algebraic"):
+    kind, name = kind_of(model, place), place
+    if kind in ("input", "state", "output", "algebraic") or not isinstance(model, Model):
         return True
     seen: set[str] = set()
     stack = [name]
@@ -151,9 +171,9 @@ def _moves(model: Model, place: str) -> bool:
     return False
 
 
-def source_signals(model: Model, signals: Signals) -> tuple[str, ...]:
+def source_signals(model: AnyModel, signals: Signals) -> tuple[str, ...]:
     """Signals worth bringing in: those that move, of several that move alike the first; inputs, states, then the rest."""
-    kinds = {p: slot(model, p)[0] for p in signals if _moves(model, p)}
+    kinds = {p: kind_of(model, p) for p in signals if _moves(model, p)}
     order = sorted(
         (p for p in kinds if kinds[p] != "output"),
         key=lambda p: ("input", "state", "algebraic", "signal").index(kinds[p]),
@@ -175,7 +195,7 @@ def source_signals(model: Model, signals: Signals) -> tuple[str, ...]:
 
 
 def places_of(
-    model: Model, live: Sequence[str], given: Iterable[str | tuple[str, ...]] | None
+    model: AnyModel, live: Sequence[str], given: Iterable[str | tuple[str, ...]] | None
 ) -> tuple[tuple[str, ...], ...]:
     """The places to try: those given, or every slot and every family of slots that are named alike.
 
@@ -185,14 +205,14 @@ def places_of(
     if given is not None:
         listed = [(g,) if isinstance(g, str) else tuple(g) for g in given]
         for p in {p for at in listed for p in at}:
-            slot(model, p)
+            kind_of(model, p)
         return tuple(at for at in listed if all(p in live for p in at))
     families = [f for kind in ("input", "signal", "algebraic", "state", "output") for f in _families(model, live, kind)]
     return (*((p,) for p in live), *dict.fromkeys(families))
 
 
-def _families(model: Model, live: Sequence[str], kind: str) -> list[tuple[str, ...]]:
-    names = [p for p in live if slot(model, p)[0] == kind]
+def _families(model: AnyModel, live: Sequence[str], kind: str) -> list[tuple[str, ...]]:
+    names = [p for p in live if kind_of(model, p) == kind]
     # A digit marks one of several stations; "P1" and "Q1" are alike, "x" and "v" are not.
     stems = {p: re.sub(r"\d+", "#", p.removeprefix("outputs.")) for p in names}
     found: list[tuple[str, ...]] = []

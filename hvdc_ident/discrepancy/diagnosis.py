@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -29,11 +29,17 @@ from hvdc_ident.fit import Free, Simulator
 from hvdc_ident.fit.estimate import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
+
+CLOSED = (
+    "The model is closed inside: effects were tried at its inputs and outputs only; its signals, states and loops were "
+    "not, and no form outside the catalogue was looked for."
+)
 
 
 def diagnose(
-    subject: Model | Simulator,
+    subject: AnyModel | Simulator,
     experiments: Iterable[Experiment],
     parameters: Iterable[Free],
     *,
@@ -63,7 +69,7 @@ def diagnose(
     model = _model_of(subject)
     chosen = options or Options()
     given, free = tuple(experiments), tuple(parameters)
-    names = "all" if effects == "all" else tuple(e.name for e in entries(effects))
+    names: Any = "all" if effects == "all" else tuple(e.name for e in entries(effects))
     _check_material(material or {}, given)
     search = Search(
         names, None if places is None else tuple(places), FrozenMap(material or {}), chosen, seed, executor, progress
@@ -75,16 +81,27 @@ def diagnose(
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
     outcome = forward(search, first)
     judgement = judge(search, first, outcome)
-    other = fallback(search, first, outcome) if judgement.verdict == "unnameable" and chosen.fallback else None
+    inside = isinstance(model, Model)
+    other = (
+        fallback(search, first, outcome) if judgement.verdict == "unnameable" and chosen.fallback and inside else None
+    )
+    if not inside:
+        notes = (*notes, CLOSED)
     return _assembled(search, model, first, outcome, judgement, other, free, notes)
 
 
-def _model_of(subject: Model | Simulator) -> Model:
-    if isinstance(subject, Model):
-        return subject
+def _model_of(subject: AnyModel | Simulator) -> AnyModel:
+    """The model behind the subject. Raises StudyError for something that effects cannot be put on."""
     if isinstance(subject, ModelSimulator):
         return subject.model
-    raise StudyError("only a model with equations can be diagnosed", got=type(subject).__name__)
+    if isinstance(subject, Model) or hasattr(subject, "with_effects"):
+        return cast("AnyModel", subject)
+    raise StudyError(
+        "effects cannot be put on it",
+        where="what is to be diagnosed",
+        expected="a model, or an FMU: something with slots and `with_effects`",
+        got=type(subject).__name__,
+    )
 
 
 def _check_material(material: Mapping[str, float], experiments: tuple[Experiment, ...]) -> None:
@@ -100,7 +117,7 @@ def _check_material(material: Mapping[str, float], experiments: tuple[Experiment
 
 def _assembled(
     search: Search,
-    model: Model,
+    model: AnyModel,
     first: Refit,
     outcome: Outcome,
     judgement: Judgement,
@@ -130,7 +147,7 @@ def _assembled(
         ambiguity=sets,
         separating_experiment=separating(sets) or judgement.experiment,
         candidates=lines(outcome),
-        location=localise(model, first.nominal()),
+        location=localise(model if isinstance(model, Model) else None, first.nominal()),
         detectable=detectable(outcome, search.options),
         gap=gap(given, first, last),
         remaining=remaining(first, last, judgement.tests, search),

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import adequacy
-from hvdc_ident.discrepancy.candidates import Candidate, source_signals
+from hvdc_ident.discrepancy.candidates import Candidate, kind_of, source_signals
 from hvdc_ident.discrepancy.hidden import Regression, over_signal, over_time, regression
 from hvdc_ident.discrepancy.library import Term, along, terms
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.refit import Job, Placed, Refit, run, unseen
-from hvdc_ident.discrepancy.response import Along
 from hvdc_ident.discrepancy.rounds import Search, slot_signals
+from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Ruler
 from hvdc_ident.effects import EffectUse, effects
@@ -23,7 +23,6 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.transform import slot
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
@@ -86,17 +85,17 @@ def fallback(search: Search, first: Refit, outcome: Outcome) -> Fallback:
     return _curve(search, first, outcome, [p for _, p, *_ in ranked] or places)
 
 
-def _along(term: Term) -> Callable[[str, Along], Array]:
+def _along(term: Term) -> Callable[[str, Path], Array]:
     return lambda _, path: along(term, path.values)
 
 
 def _is_output(first: Refit, place: str) -> bool:
-    return slot(first.model, place)[0] == "output"
+    return kind_of(first.model, place) == "output"
 
 
-def _places(search: Search, first: Refit, paths: Mapping[str, Along]) -> list[str]:
+def _places(search: Search, first: Refit, paths: Mapping[str, Path]) -> list[str]:
     """Slots inside the model that are heard at the outputs."""
-    inner = [p for p in slot_signals(paths) if slot(first.model, p)[0] in ("signal", "algebraic")]
+    inner = [p for p in slot_signals(paths) if kind_of(first.model, p) in ("signal", "algebraic")]
     if search.places is not None:
         named = {p for g in search.places for p in ((g,) if isinstance(g, str) else g)}
         inner = [p for p in inner if p in named]

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.response import Along
-from hvdc_ident.discrepancy.scores import Whitening
+from hvdc_ident.discrepancy.scores import Path, Whitening
 from hvdc_ident.trajectory import Array
 
 KNOTS = 24
@@ -60,7 +59,7 @@ class Regression:
 
 
 def regression(
-    nominal: Nominal, paths: Mapping[str, Along], place: str, functions: Sequence[Callable[[str, Along], Array]]
+    nominal: Nominal, paths: Mapping[str, Path], place: str, functions: Sequence[Callable[[str, Path], Array]]
 ) -> Regression:
     """The regression of the residual on functions of time put on a slot; each gives (K,) for an experiment and its run."""
     parts = []
@@ -73,21 +72,21 @@ def regression(
     return Regression(np.where(np.isfinite(columns), columns, 0.0), nominal.projected(nominal.residual[:, None])[:, 0])
 
 
-def over_time(paths: Mapping[str, Along]) -> list[Callable[[str, Along], Array]]:
+def over_time(paths: Mapping[str, Path]) -> list[Callable[[str, Path], Array]]:
     """Hats over time, the same in every experiment."""
     begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())
     return [_hat(np.linspace(begin, end, KNOTS), k, lambda _, a: a.time) for k in range(KNOTS)]
 
 
 def over_signal(
-    paths: Mapping[str, Along], signal: str, knots: int = 9
-) -> tuple[Array, list[Callable[[str, Along], Array]]]:
+    paths: Mapping[str, Path], signal: str, knots: int = 9
+) -> tuple[Array, list[Callable[[str, Path], Array]]]:
     """Knots over the levels of a signal, and hats over them."""
     whole = np.concatenate([a.signal(signal) for a in paths.values()])
     at = np.linspace(float(whole.min()), float(whole.max()), knots)
     return at, [_hat(at, k, lambda _, a: a.signal(signal)) for k in range(knots)]
 
 
-def _hat(at: Array, k: int, of: Callable[[str, Along], Array]) -> Callable[[str, Along], Array]:
+def _hat(at: Array, k: int, of: Callable[[str, Path], Array]) -> Callable[[str, Path], Array]:
     unit = np.eye(at.size)[k]
     return lambda name, path: np.asarray(np.interp(of(name, path), at, unit))

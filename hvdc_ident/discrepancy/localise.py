@@ -113,11 +113,12 @@ def _band(nominal: Nominal) -> list[float] | None:
     total = sum(float(p.sum()) for _, p in powers)
     if not powers or total <= 0:
         return None
-    f = max((f for f, _ in powers), key=lambda f: f.size)
+    longest = int(np.argmax([g.size for g, _ in powers]))
+    f = powers[longest][0]
     whole = np.sum([np.interp(f, g, p) for g, p in powers], axis=0)
     sums = np.cumsum(whole) / whole.sum()
-    low, high = 0.5 * (1.0 - MOST_OF), 1.0 - 0.5 * (1.0 - MOST_OF)
-    return [float(f[np.searchsorted(sums, low)]), float(f[min(np.searchsorted(sums, high), f.size - 1)])]
+    ends = np.searchsorted(sums, [0.5 * (1.0 - MOST_OF), 0.5 * (1.0 + MOST_OF)])
+    return [float(v) for v in f[np.minimum(ends, f.size - 1)]]
 
 
 def _region(nominal: Nominal) -> dict[str, Any] | None:
@@ -170,7 +171,8 @@ def _blocks(model: Model, nominal: Nominal) -> list[dict[str, Any]]:
     """
     found = []
     for output in nominal.problem.outputs:
-        total, rows, why, driven = 0.0, 0, "", ()
+        total, rows, why = 0.0, 0, ""
+        driven: tuple[str, ...] = ()
         for e in nominal.problem.fitted_experiments:
             if output not in e.outputs:
                 continue

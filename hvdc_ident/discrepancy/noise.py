@@ -58,10 +58,12 @@ def _noise(output: str, experiments: Sequence[Experiment]) -> Noise:
     power = sum(float(r @ r) for r in quiet)
     scale = max((float(np.abs(r).max()) for r in records if r.size), default=1.0)
     std = float(np.sqrt(power / max(rows - 2 * len(quiet), 1))) if rows else 0.0
+    model: AR = ()
+    error = 0.0
     if std <= 1e-12 * scale or (given is not None and std < 1e-3 * given):
-        std, model, error = 0.0, (), 0.0
-    else:
-        model, error = _model(quiet, rows, power) if _even(experiments) else ((), 0.0)
+        std = 0.0
+    elif _even(experiments):
+        model, error = _model(quiet, rows, power)
     if given is None and std <= max((noise_floor(r) for r in records), default=0.0):
         if step > 0.0:
             rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(records, step) ** 2))

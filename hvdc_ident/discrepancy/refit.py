@@ -17,7 +17,7 @@ from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
@@ -39,7 +39,7 @@ class Placed:
 class Job:
     """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start)."""
 
-    model: Model
+    model: AnyModel
     placed: tuple[Placed, ...]
     problem: Problem
     begins: tuple[Array, ...]
@@ -56,7 +56,7 @@ class Refit:
     std: standard deviation of each effect parameter, by its name in the model.
     """
 
-    model: Model
+    model: AnyModel
     placed: tuple[Placed, ...]
     problem: Problem
     noise: FrozenMap[Noise]
@@ -91,8 +91,8 @@ class Refit:
 
 
 def added(
-    model: Model, problem: Problem, candidate: Candidate, probe: int, factor: float
-) -> tuple[Model, Problem, Placed, Array]:
+    model: AnyModel, problem: Problem, candidate: Candidate, probe: int, factor: float
+) -> tuple[AnyModel, Problem, Placed, Array]:
     """The model and problem with one more effect, and where it starts: the probe, or the size the score asks for.
 
     Raises ModelError where the effect cannot be put there.

@@ -77,7 +77,7 @@ class Along:
         s, at = self.system, [self.slots.index(p) for p in places]
         m, count, nc = d.shape
         u, y = np.empty((m, count, nc)), np.empty((len(self.outputs), self.count, nc))
-        pick = np.ix_(np.arange(count), at, at)
+        pick = np.ix_(np.arange(count), np.array(at, dtype=np.intp), np.array(at, dtype=np.intp))
         propagate(
             s.phi, _of(s.g0, at), _of(s.g1, at), s.gw0, s.gw1, np.ascontiguousarray(s.cs[:, at]),
             np.ascontiguousarray(s.ds[pick]), np.ascontiguousarray(s.csw[:, at]), s.co, _of(s.do, at), s.dow, s.cf,
@@ -228,7 +228,7 @@ def _start(parts: Tangent, plant: Model, d: Partials) -> tuple[Array, Array]:
         if state.start is not None:
             left_x[i], right_x[i] = np.eye(nx + nw)[i], 0.0
     left = np.vstack([left_x, left_w - np.eye(nx + nw)[nx:]])
-    found = np.linalg.lstsq(left, -np.vstack([right_x, right_w]), rcond=1e-12)[0]
+    found = np.asarray(np.linalg.lstsq(left, -np.vstack([right_x, right_w]), rcond=1e-12)[0])
     return found[:nx], found[nx:]
 
 

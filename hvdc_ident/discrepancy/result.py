@@ -12,7 +12,7 @@ from hvdc_ident.frozen import FrozenMap
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model.external import AnyModel
 
 Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
 AUGMENTED = "augmented-model.toml"
@@ -130,7 +130,7 @@ class Diagnosis:
     parameters_before: FrozenMap[float]
     parameters_refitted: FrozenMap[float]
     parameters_after: FrozenMap[float]
-    augmented: Model | None = None
+    augmented: AnyModel | None = None
     fallback: Mapping[str, Any] | None = None
     bode: tuple[Mapping[str, Any], ...] = ()
     noise: Mapping[str, Any] = field(default_factory=dict)
@@ -146,15 +146,15 @@ class Diagnosis:
         out["effects"] = [_effect(e) for e in self.effects]
         out["ambiguity"] = [[_named(r) for r in group] for group in self.ambiguity]
         out["candidates"] = [_named(line) for line in self.candidates]
-        out["augmented_model"] = AUGMENTED if self.augmented is not None else None
+        out["augmented_model"] = next(iter(self.files), None)
         return out
 
     @property
     def files(self) -> dict[str, str]:
-        """The augmented model's card by its file name; empty where nothing was put in."""
-        from hvdc_ident.model import write_card
+        """The augmented model's card by its file name; empty where nothing was put in, or the model has no card (an FMU)."""
+        from hvdc_ident.model import Model, write_card
 
-        return {} if self.augmented is None else {AUGMENTED: write_card(self.augmented)}
+        return {AUGMENTED: write_card(self.augmented)} if isinstance(self.augmented, Model) else {}
 
     def plot(self) -> Figure:
         """The gap before and after by output, and the best candidates."""

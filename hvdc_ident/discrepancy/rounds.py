@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Job, Refit, added, run, unseen
-from hvdc_ident.discrepancy.response import Along
-from hvdc_ident.discrepancy.scores import Scores, runs, scored, signature_rows
+from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import (
     Pick,
     Ruler,
@@ -39,7 +39,7 @@ STEP = 0.05
 class Search:
     """What stays the same over the rounds."""
 
-    effects: tuple[str, ...] | str
+    effects: tuple[str, ...] | Literal["all"]
     places: tuple[str | tuple[str, ...], ...] | None
     material: FrozenMap[float]
     options: Options
@@ -74,7 +74,7 @@ class Round:
     """
 
     before: Refit
-    paths: Mapping[str, Along]
+    paths: Mapping[str, Path]
     candidates: tuple[Candidate, ...]
     scores: Scores
     trials: tuple[Trial, ...]
@@ -95,7 +95,7 @@ class Round:
         return float(t[k]), self.scores.p(float(t[k])), k
 
 
-def slot_signals(paths: Mapping[str, Along]) -> dict[str, tuple[Array, ...]]:
+def slot_signals(paths: Mapping[str, Path]) -> dict[str, tuple[Array, ...]]:
     """The signal at every slot that all experiments have, one array an experiment."""
     common = [p for p in next(iter(paths.values())).slots if all(p in a.slots for a in paths.values())]
     return {p: tuple(a.signal(p) for a in paths.values()) for p in common}
@@ -110,7 +110,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         before.model,
         slot_signals(paths),
         [a.time for a in paths.values()],
-        search.effects,  # type: ignore[arg-type]
+        search.effects,
         search.places,
         tones(nominal),
     )
@@ -118,7 +118,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
     search.tell(0, 1, f"round {number}: scores of {len(found)} candidates")
     scores = scored(
-        before.model, nominal, found, paths, bootstraps=options.bootstraps, seed=search.seed + number,
+        nominal, found, paths, bootstraps=options.bootstraps, seed=search.seed + number,
         executor=search.executor,
     )  # fmt: skip
     picks = best_of(scores, found)
@@ -138,7 +138,7 @@ def _refitted(
     search: Search,
     before: Refit,
     number: int,
-    paths: Mapping[str, Along],
+    paths: Mapping[str, Path],
     found: tuple[Candidate, ...],
     scores: Scores,
     picks: tuple[Pick, ...],

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.ends import Ends, ends
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.response import Along, along
@@ -24,8 +25,11 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.estimate import Executor
 from hvdc_ident.fit.residual import Block, Treatment
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.trajectory import Array
 
+Path = Along | Ends
+"""A run with its answers: of equations, or of something closed."""
 SEEN = 1.0
 """s's below which a size leaves no trace: no experiment excites it."""
 LEFT = 1e-3
@@ -85,13 +89,15 @@ class Scores:
         return float(np.quantile(self.largest, 1.0 - significance)) if self.largest.size else 0.0
 
 
-def runs(model: Model, nominal: Nominal, executor: Executor | None = None) -> dict[str, Along]:
+def runs(model: AnyModel, nominal: Nominal) -> dict[str, Path]:
     """The model's runs of the fitted experiments, with their answers, by the experiment's name."""
     experiments = nominal.problem.fitted_experiments
-    return {e.name: along(model, e, nominal.values) for e in experiments}
+    if isinstance(model, Model):
+        return {e.name: along(model, e, nominal.values) for e in experiments}
+    return {e.name: ends(model, e, nominal.values) for e in experiments}
 
 
-def _largest(paths: Mapping[str, Along]) -> int:
+def _largest(paths: Mapping[str, Path]) -> int:
     """Numbers in one answer, of the longest experiment: outputs at rows, and the signal at its instants."""
     return max(len(a.outputs) * a.count + 3 * a.time.size for a in paths.values())
 
@@ -108,10 +114,9 @@ def two_sided(candidate: Candidate) -> bool:
 
 
 def scored(
-    model: Model,
     nominal: Nominal,
     found: Sequence[Candidate],
-    paths: Mapping[str, Along],
+    paths: Mapping[str, Path],
     *,
     bootstraps: int,
     seed: int,
@@ -182,7 +187,7 @@ class Whitening:
 class Job:
     """One experiment's share of the work."""
 
-    path: Along
+    path: Path
     plan: tuple[tuple[Task, ...], ...]
     whitening: Whitening
     right: Array
@@ -207,7 +212,7 @@ def _products(job: Job) -> tuple[Array, Array, Array]:
 
 
 def signature_rows(
-    nominal: Nominal, found: Sequence[Candidate], paths: Mapping[str, Along], chosen: Sequence[Column]
+    nominal: Nominal, found: Sequence[Candidate], paths: Mapping[str, Path], chosen: Sequence[Column]
 ) -> Array:
     """(n, N) whitened signatures of some columns over all blocks, without what the parameters make good."""
     plan = tasks(found, chosen, _largest(paths))

@@ -136,9 +136,8 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         own = sizes.get(k) or {n: at.get(name, p.start[n]) for n, name in p.names.items()}
         values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
         named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
-        use = EffectUse(
-            p.use.effect, p.use.at, FrozenMap({**values, **named}), source=p.use.source, expression=p.use.expression
-        )
+        parameters: dict[str, float | str] = {**values, **named}
+        use = EffectUse(p.use.effect, p.use.at, FrozenMap(parameters), source=p.use.source, expression=p.use.expression)
         before = set(model.parameters)
         model = model.with_effects([use])
         new = [n for n in model.parameters if n not in before]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.block import block, parameter
 from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.ends import Ends
 from hvdc_ident.discrepancy.response import Along
 from hvdc_ident.effects import effects
 from hvdc_ident.trajectory import Array
@@ -98,7 +99,9 @@ def is_linear(kind: Kind) -> bool:
     return bool(own) and block(kind.effect, kind.present, kind.brings).linear(tuple(parameter(n) for n in own))
 
 
-def signatures(model: Along, parcels: Sequence[tuple[Task, ...]]) -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
+def signatures(
+    model: Along | Ends, parcels: Sequence[tuple[Task, ...]]
+) -> Iterator[tuple[NDArray[np.intp], Array, Array]]:
     """(columns' places, (o, R, nc) differences of the outputs, (nc,) change in the last pass) by parcel."""
     for parcel in parcels:
         work = _Parcel(model, parcel)
@@ -109,7 +112,7 @@ def signatures(model: Along, parcels: Sequence[tuple[Task, ...]]) -> Iterator[tu
 class _Parcel:
     """Some columns on their way to a closed loop. u: by column what its slots, then the brought signal, see (m, K)."""
 
-    def __init__(self, model: Along, parcel: tuple[Task, ...]) -> None:
+    def __init__(self, model: Along | Ends, parcel: tuple[Task, ...]) -> None:
         self.model, self.parcel = model, parcel
         self.places = [(*t.at, t.source) if t.source else t.at for t in parcel]
         self.base = [np.array([model.signal(p) for p in at]) for at in self.places]

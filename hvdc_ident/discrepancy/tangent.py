@@ -90,8 +90,8 @@ class Tangent:
         """The derivatives along a trajectory. time: (K,); values: (K, n) of the variables; parameters: all the model's."""
         k, n = time.size, len(self.variables)
         flat = np.zeros((k, self._rows * n))
-        for p, v in self._constants:
-            flat[:, p] = v
+        for place, constant in self._constants:
+            flat[:, place] = constant
         moving = np.zeros((k, max(self._places.size, 1)))
         p = np.ascontiguousarray(parameters, dtype=float)
         y, t = np.ascontiguousarray(values, dtype=float), np.ascontiguousarray(time, dtype=float)

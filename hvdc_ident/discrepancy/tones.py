@@ -5,35 +5,40 @@ from __future__ import annotations
 import numpy as np
 
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.trajectory import Array
 
-MOST = 3
-OUT = 8.0
-"""How far a frequency's power must stand above the median of those around it."""
+MOST = 4
+OUT = 6.0
+"""Standard deviations by which the power at a frequency, over all records, must exceed that of white noise."""
+APART = 0.08
+"""Tones nearer to each other than this, in the logarithm, are one."""
 
 
 def tones(nominal: Nominal) -> tuple[float, ...]:
-    """Hz, the strongest first; none where no frequency stands out.
+    """Hz, the strongest first; none where no frequency stands out, or rows are unevenly spaced.
 
-    Records before the event count as the rest: a disturbance is there all along.
+    The whitened residuals' periodograms are added up over outputs and experiments: a disturbance is in many of them.
     """
     experiments = {e.name: e for e in nominal.problem.fitted_experiments}
-    power: dict[float, float] = {}
+    spectra: list[tuple[Array, Array]] = []
     for b in nominal.blocks:
         t = experiments[b.experiment].time[b.rows]
         steps = np.diff(t)
         if t.size < 64 or (steps <= 0).any() or np.ptp(steps) > 0.02 * float(np.median(steps)):
             continue
         window = np.hanning(t.size)
-        spectrum = np.abs(np.fft.rfft((b.residual - b.residual.mean()) * window, 4 * t.size)) ** 2
-        frequency = np.fft.rfftfreq(4 * t.size, float(np.median(steps)))
-        floor = np.array([np.median(spectrum[max(0, k - 60) : k + 61]) for k in range(0, spectrum.size, 20)])
-        around = np.interp(np.arange(spectrum.size), np.arange(0, spectrum.size, 20), floor)
-        ratio = spectrum / np.maximum(around, 1e-300)
-        inner = np.flatnonzero((ratio[1:-1] > ratio[:-2]) & (ratio[1:-1] >= ratio[2:]) & (ratio[1:-1] > OUT)) + 1
-        for k in inner[inner > 12]:
-            power[float(frequency[k])] = max(power.get(float(frequency[k]), 0.0), float(ratio[k]))
+        line = np.abs(np.fft.rfft((b.residual - b.residual.mean()) * window, 4 * t.size)) ** 2
+        spectra.append((np.fft.rfftfreq(4 * t.size, float(np.median(steps))), line / float(window @ window)))
+    if not spectra:
+        return ()
+    frequency = max((f for f, _ in spectra), key=len)
+    power = np.sum([np.interp(frequency, f, p, right=1.0) for f, p in spectra], axis=0)
+    count = len(spectra)
+    inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
+    # Below two periods a record the residual of anything slow has power.
+    inner = inner[(inner > 8) & (power[inner] > count + OUT * np.sqrt(count))]
     found: list[float] = []
-    for f in sorted(power, key=lambda f: -power[f]):
-        if all(abs(np.log(f / other)) > 0.1 for other in found):
-            found.append(f)
+    for k in inner[np.argsort(-power[inner])]:
+        if all(abs(np.log(frequency[k] / other)) > APART for other in found):
+            found.append(float(frequency[k]))
     return tuple(found[:MOST])
