@@ -221,7 +221,10 @@ def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet:
         )
     for d in done:
         state = "failed" if d.failed else "done" if d.fresh else "kept from before"
-        _say(f"{d.stage.name}: {state}", json=json, quiet=quiet)
+        # A fit that ended on a bound or found two optima is done, but not by that word alone.
+        status = d.data.get("status")
+        rest = f", {status}" if status in ("at-bound", "two-optima") and not d.failed else ""
+        _say(f"{d.stage.name}: {state}{rest}", json=json, quiet=quiet)
     _say(f"report: {folder / 'report.html'}", json=json, quiet=quiet)
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:

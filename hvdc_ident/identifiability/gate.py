@@ -72,7 +72,8 @@ def gated_fit(
     report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak parameters get the profile's interval
     and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
     whole: whether the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
-    Where nothing is left to fit the status is "failed" and the message says so.
+    Where nothing is left to fit the status is "failed" and the message says so. One that is held on a bound makes the
+    status "at-bound", for that is where the fit of all would have ended.
     """
     through = gate(report, force)
     if not through.fitted:
@@ -90,8 +91,13 @@ def gated_fit(
     if result.status == "failed":
         return result
     estimates = {n: _stated(n, e, report, through, whole=whole) for n, e in result.estimates.items()}
-    ordered = {n: {**estimates, **_at_bound(report, through)}.get(n) for n in report["parameters"]}
-    return replace(result, estimates=FrozenMap({n: e for n, e in ordered.items() if e is not None}))
+    on_bound = _at_bound(report, through)
+    ordered = {n: {**estimates, **on_bound}.get(n) for n in report["parameters"]}
+    result = replace(result, estimates=FrozenMap({n: e for n, e in ordered.items() if e is not None}))
+    if not on_bound or result.status not in ("converged", "at-bound"):
+        return result
+    held = f"held on a bound: {', '.join(on_bound)}"
+    return replace(result, status="at-bound", message=f"{result.message}; {held}")
 
 
 def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate, *, whole: bool) -> Estimate:

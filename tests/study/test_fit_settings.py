@@ -169,3 +169,13 @@ def test_a_frequency_residual_and_a_named_optimiser(folder):
 def test_what_cannot_be_asked_is_told_with_its_place(folder, edit, message):
     with pytest.raises(InputError, match=message):
         study(folder, "wrong", edit)
+
+
+def test_a_candidate_held_on_a_bound_is_in_the_status(folder):
+    """The gate takes it out of the fit, whose rest converges: the fit has hit a bound all the same."""
+    data, _ = fitted(study(folder, "narrow", (GAIN, "KIVDC = {start = 650, min = 550, max = 700}")))
+    assert data["status"] == "at-bound"
+    assert data["message"].endswith("held on a bound: KIVDC")
+    assert data["estimates"]["KIVDC"]["std"] is None
+    assert stage("fit").tell(data)[0].startswith("at-bound: ")
+    assert "The fit ended on a bound" in gains.SECTION.render(Pages(data))

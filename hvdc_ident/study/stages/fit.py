@@ -84,6 +84,18 @@ def _files(
     return files | {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
 
 
+def told(data: Mapping[str, Any]) -> list[str]:
+    """The status, then every estimate in the form it may be stated in, then what is held."""
+    lines = [f"{data['status']}: {data['message']}"]
+    for name, e in data["estimates"].items():
+        unit = f" {e['unit']}" if e["unit"] else ""
+        low, high = e["ci95"] or (None, None)
+        interval = "" if low is None or high is None else f", 95 %: {low:.6g} to {high:.6g}"
+        lines.append(f"{name} = {e['value']:.6g}{unit}{interval}" + (f" ({e['reason']})" if e["reason"] else ""))
+    held = [n for n in data["candidates"] if n not in data["estimates"]]
+    return lines + [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
+
+
 STAGE = Stage(
     name="fit",
     file="fit.json",
@@ -93,4 +105,5 @@ STAGE = Stage(
     order=40,
     after=("identify",),
     takes=("force",),
+    tell=told,
 )
