@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from ctypes import POINTER, byref, c_double
+from ctypes import byref, c_double
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +41,7 @@ class Vector:
     def __init__(self, size: int) -> None:
         self.values: Array = np.zeros(size)
         self.size = size
-        self.pointer = self.values.ctypes.data_as(POINTER(c_double))
+        self.pointer = (c_double * size).from_buffer(self.values.data) if size else (c_double * 1)()
 
 
 class Block:

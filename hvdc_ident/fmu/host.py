@@ -33,7 +33,7 @@ from hvdc_ident.trajectory import Array
 @dataclass(frozen=True)
 class Limits:
     """What an FMU may use. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
-    runs: after which a worker is replaced by a new one."""
+    runs: after which a worker is replaced by a new one, as it is where it keeps half of its memory."""
 
     deadline: float = 60.0
     load: float = 60.0
@@ -159,7 +159,7 @@ class Host:
         worker = self._worker
         if worker is not None and worker.owner != os.getpid():  # this process was forked: the worker is another's
             self._worker = worker = self._folder = None
-        if worker is not None and worker.runs >= self.limits.runs:
+        if worker is not None and (worker.runs >= self.limits.runs or self._leaks(worker)):
             self._end(worker)
             worker = None
         if worker is None:
@@ -167,6 +167,10 @@ class Host:
                 raise self._useless
             worker = self._start()
         return worker
+
+    def _leaks(self, worker: _Worker) -> bool:
+        """Whether the worker kept so much memory that the next run may find too little."""
+        return self.limits.memory is not None and self.memory > worker.resident + 0.5 * self.limits.memory
 
     def _start(self) -> _Worker:
         folder = self._unpacked()
@@ -189,7 +193,7 @@ class Host:
         worker = _Worker(
             process, Connection(requests, readable=False), Connection(answers, writable=False), said, os.getpid()
         )
-        self._worker = worker
+        self._worker, self.memory = worker, 0
         self._finalizer = Finalize(self, _close, (worker,), exitpriority=20)
         self.started += 1
         try:
