@@ -26,7 +26,6 @@ app = typer.Typer(
     help="Linearisation, identifiability, calibration and discrepancy diagnosis of converter models.",
     epilog="Exit codes: 0 done; 1 the work ran and a stage failed, results kept; 2 the input is wrong.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
@@ -325,6 +324,7 @@ def report(
         Path, typer.Argument(metavar="STUDY|DIR", help="A study, or a folder of results.", show_default=False)
     ],
     out: Out = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Write report.pdf too; needs the extra 'pdf'.")] = False,
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
@@ -339,6 +339,10 @@ def report(
 
         folder = out or load_study(source, trust).folder
     page = write_report(folder)
+    if pdf:
+        from hvdc_ident.report.pdf import write_pdf
+
+        _say(f"report: {write_pdf(page)}", json=json, quiet=quiet)
     if json:
         _print_json({"schema": 1, "report": page.as_posix(), "bytes": page.stat().st_size})
     _say(f"report: {page}", json=json, quiet=quiet)
@@ -464,4 +468,7 @@ def _catalogue(kind: str, lines: dict[str, str], *, json: bool) -> None:
 
 def main() -> None:
     """Nothing; the process ends with the command's exit code."""
+    # The matrices are narrow: threads of the linear algebra would cost more than they save. Workers inherit this.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     app()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import WaveformError, unknown_name
+from hvdc_ident.notebook import axes_of, table_html
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,28 @@ class Trajectory:
     def rows(self, mask: NDArray[np.bool_]) -> Trajectory:
         """The rows where the mask holds."""
         return Trajectory(self.time[mask], self.values[mask], self.names, self.units)
+
+    def plot(self, names: Iterable[str] | None = None, ax: Any = None) -> Any:
+        """Axes with the signals over time, all or those named."""
+        axes = axes_of(ax)
+        for name in self.names if names is None else names:
+            unit = self.unit(name)
+            axes.plot(self.time, self[name], label=f"{name}, {unit}" if unit else name)
+        axes.set_xlabel("time, s")
+        axes.legend(fontsize="small")
+        return axes
+
+    def _repr_html_(self) -> str:
+        span = f"{self.time[0]:g} to {self.time[-1]:g} s" if len(self) else "no rows"
+        rows = (
+            [
+                (n, u, float(v.min()), float(v.max()))
+                for n, u, v in zip(self.names, self.units, self.values.T, strict=True)
+            ]
+            if len(self)
+            else []
+        )
+        return table_html(f"{len(self)} rows, {span}", ("signal", "unit", "smallest", "largest"), rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Time, signals and units as plain lists."""

@@ -70,11 +70,11 @@ class Response:
         axes = {"omega": self.omega, "output": list(self.output_names), "input": list(self.input_names)}
         return xarray.DataArray(self.values, coords=axes, dims=tuple(axes), name="response")
 
-    def plot(self) -> Any:
-        """A Bode figure."""
+    def plot(self, ax: Any = None) -> Any:
+        """The two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""
         from hvdc_ident.linearize.plots.bode import bode
 
-        return bode([self])
+        return bode([self], ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
         """The response as plain lists."""

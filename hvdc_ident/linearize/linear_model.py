@@ -13,6 +13,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.delays import DelayFree
 from hvdc_ident.linearize.operating_point import OperatingPoint
+from hvdc_ident.notebook import table_html
 
 if TYPE_CHECKING:
     import control
@@ -212,11 +213,16 @@ class LinearModel:
 
         return frequency_response(self, omega)
 
-    def plot(self, kind: str = "bode") -> Any:
-        """A figure: "bode", "nyquist", "poles" or "participation"."""
+    def plot(self, kind: str = "bode", ax: Any = None) -> Any:
+        """The axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation"."""
         from hvdc_ident.linearize.plots import draw
 
-        return draw(self, kind)
+        return draw(self, kind, ax)
+
+    def _repr_html_(self) -> str:
+        sizes = f"{len(self.state_names)} states, {len(self.input_names)} inputs, {len(self.output_names)} outputs"
+        rows = [(f"{m.eigenvalue:.5g}", m.frequency_hz, m.damping) for m in self.modes()]
+        return table_html(f"Linear model {self.name}: {sizes}", ("eigenvalue, rad/s", "Hz", "damping"), rows)
 
     def to_dict(self) -> dict[str, Any]:
         """The model as plain lists, with names, units, operating point and provenance."""

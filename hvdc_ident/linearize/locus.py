@@ -46,11 +46,11 @@ class Locus:
         """(points,) whether every eigenvalue lies left of the axis, those that stay at 0 apart."""
         return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
 
-    def plot(self) -> Any:
-        """A figure of the locus."""
+    def plot(self, ax: Any = None) -> Any:
+        """The axes with the locus."""
         from hvdc_ident.linearize.plots.locus import locus
 
-        return locus(self)
+        return locus(self, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
         """The locus as plain lists, complex numbers as [re, im]."""

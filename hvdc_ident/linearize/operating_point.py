@@ -16,6 +16,7 @@ from hvdc_ident.linearize.newton import ACCURACY, Root, newton, pseudo_transient
 from hvdc_ident.linearize.search import At, Search
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
+from hvdc_ident.notebook import table_html
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]
@@ -44,6 +45,11 @@ class OperatingPoint:
     at: At = "steady"
     time: float = 0.0
     search: Search | None = field(default=None, repr=False)
+
+    def _repr_html_(self) -> str:
+        rows = [(n, v) for part in (self.states, self.inputs, self.outputs) for n, v in part.items()]
+        title = f"Operating point ({self.at}), residual {self.residual:.2g}, {len(self.active_limits)} limits active"
+        return table_html(title, ("state, input or output", "value"), rows)
 
     @property
     def active_limits(self) -> tuple[Limit, ...]:

@@ -12,6 +12,7 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.notebook import table_html
 from hvdc_ident.parameters import Input, Parameter
 
 Start: TypeAlias = sp.Expr | Literal["free"] | None
@@ -171,6 +172,13 @@ class Model:
         from hvdc_ident.model.transform import tied
 
         return tied(self, {n: parse(e) if isinstance(e, str) else e for n, e in ties.items()})
+
+    def _repr_html_(self) -> str:
+        sizes = f"{len(self.states)} states, {len(self.algebraic)} unknowns, {len(self.signals)} signals"
+        rows = [(n, q.value, q.unit, q.description) for n, q in self.parameters.items()]
+        rows += [(n, q.value, q.unit, q.description) for n, q in self.inputs.items()]
+        header = ("parameter or input", "value", "unit", "")
+        return table_html(f"Model {self.name}: {sizes}, outputs {', '.join(self.outputs)}", header, rows)
 
     def __getitem__(self, name: str) -> sp.Symbol:
         """The symbol of one of the model's names, for use in expressions."""

@@ -72,14 +72,10 @@ class Simulation:
 
     def plot(self, outputs: Any = None, ax: Any = None) -> Any:
         """Axes with the outputs over time."""
-        import matplotlib.pyplot as plt
+        return self.trajectory.plot(outputs, ax)
 
-        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
-        for name in outputs or self.trajectory.names:
-            axes.plot(self.trajectory.time, self.trajectory[name], label=name)
-        axes.set_xlabel("time, s")
-        axes.legend()
-        return axes
+    def _repr_html_(self) -> str:
+        return self.trajectory._repr_html_()
 
     def to_dict(self) -> dict[str, Any]:
         """The outputs, derivatives and statistics as plain lists and numbers."""

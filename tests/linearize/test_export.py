@@ -1,11 +1,12 @@
 """Every format of a linear model read back to the last bit, and the figures."""
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from helpers import linear
 
 from hvdc_ident.errors import InputError, UnknownNameError
-from hvdc_ident.linearize import LinearModel, linearize
+from hvdc_ident.linearize import LinearModel, find_operating_point, linearize
 from hvdc_ident.linearize.export import formats, read, write
 from hvdc_ident.linearize.export.sections import sections
 from hvdc_ident.linearize.locus import root_locus
@@ -100,17 +101,35 @@ def test_sizes_and_values_of_a_linear_model_are_checked():
 
 @pytest.mark.parametrize("kind", ["bode", "nyquist", "poles", "participation"])
 def test_figures_of_a_model(known, kind, tmp_path):
-    figure = known["link"].channel("Vdcref1", "Vdc1").plot(kind)
-    for axes in figure.axes:
+    drawn = np.atleast_1d(known["link"].channel("Vdcref1", "Vdc1").plot(kind))
+    for axes in drawn:
         assert axes.get_xlabel() or axes.get_ylabel()
-    figure.savefig(tmp_path / "x.png")
+    drawn[0].figure.savefig(tmp_path / "x.png")
+    plt.close(drawn[0].figure)
+
+
+def test_figures_are_drawn_where_asked(known):
+    figure, (gain, phase) = plt.subplots(2, 1)
+    channel = known["link"].channel("Vdcref1", "Vdc1")
+    assert channel.plot(ax=(gain, phase)) == (gain, phase) and gain.lines and phase.lines
+    assert channel.plot("poles", ax=gain) is gain
+    plt.close(figure)
+
+
+def test_values_show_themselves_in_notebooks(known):
+    model = load_model("vsc-hvdc-link")
+    shown = [known["link"], model, find_operating_point(model)]
+    for value, word in zip(shown, ["-30", "KIVDC", "Vdcref1"], strict=True):
+        assert "<table>" in value._repr_html_() and word in value._repr_html_()
 
 
 def test_other_figures(known, tmp_path):
     from hvdc_ident.linearize.plots.shapes import shapes
 
     locus = root_locus(load_model("vsc-hvdc-link"), "KIVDC", np.linspace(250, 1500, 5)).plot()
-    assert "rad/s" in locus.axes[0].get_xlabel()
-    shapes(known["link"].modes()[4]).savefig(tmp_path / "x.png")
+    assert "rad/s" in locus.get_xlabel()
+    drawn = shapes(known["link"].modes()[4])
+    drawn.figure.savefig(tmp_path / "x.png")
+    plt.close("all")
     with pytest.raises(UnknownNameError):
         known["link"].plot("pie")

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from hvdc_ident.linearize.frequency import Response
-from hvdc_ident.linearize.plots.style import figure, grid, look
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from hvdc_ident.linearize.plots.style import grid, look
+from hvdc_ident.notebook import axes_of
 
 
-def bode(responses: Sequence[Response], labels: Sequence[str] = ()) -> Figure:
-    """The figure; every channel of every response is one curve, measured ones are dots."""
-    fig = figure(7.0, 6.0)
-    gain, phase = fig.subplots(2, 1, sharex=True)
+def bode(responses: Sequence[Response], labels: Sequence[str] = (), ax: Any = None) -> Any:
+    """The two axes, gain above phase; every channel of every response is one curve, measured ones are dots."""
+    gain, phase = pair = axes_of(ax, 7.0, 6.0, rows=2)
     k = 0
     for number, r in enumerate(responses):
         name = f"{labels[number]}: " if number < len(labels) else ""
@@ -44,4 +41,4 @@ def bode(responses: Sequence[Response], labels: Sequence[str] = ()) -> Figure:
         grid(axes)
     if k:
         gain.legend(fontsize="small")
-    return fig
+    return pair

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.linearize.plots.style import COLOURS, MARK, axes_through_zero, figure, grid
+from hvdc_ident.linearize.plots.style import COLOURS, MARK, axes_through_zero, grid
+from hvdc_ident.notebook import axes_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from hvdc_ident.linearize.locus import Locus
 
 
-def locus(found: Locus, left: float | None = None) -> Figure:
-    """The figure: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
-    fig = figure(6.5, 5.0)
-    axes = fig.subplots()
+def locus(found: Locus, left: float | None = None, ax: Any = None) -> Any:
+    """The axes: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
+    axes = axes_of(ax, 6.5, 5.0)
     for k in range(found.eigenvalues.shape[1]):
         v = found.eigenvalues[:, k]
         if left is not None and v.real.max() < left:
@@ -38,4 +36,4 @@ def locus(found: Locus, left: float | None = None) -> Figure:
     axes.set_ylabel("imaginary part, rad/s")
     axes_through_zero(axes)
     grid(axes)
-    return fig
+    return axes

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from hvdc_ident.linearize.frequency import Response
-from hvdc_ident.linearize.plots.style import MARK, axes_through_zero, figure, grid, look
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from hvdc_ident.linearize.plots.style import MARK, axes_through_zero, grid, look
+from hvdc_ident.notebook import axes_of
 
 
-def nyquist(responses: Sequence[Response], modulus: float = 0.0, reach: float = 3.0) -> Figure:
-    """The figure; reach: how far the axes go where the curves go further. modulus: radius of the disk around -1."""
-    fig = figure(6.0, 6.0)
-    axes = fig.subplots()
+def nyquist(responses: Sequence[Response], modulus: float = 0.0, reach: float = 3.0, ax: Any = None) -> Any:
+    """The axes; reach: how far the axes go where the curves go further. modulus: radius of the disk around -1."""
+    axes = axes_of(ax, 6.0, 6.0)
     k, largest = 0, 1.5
     for r in responses:
         for i, output in enumerate(r.output_names):
@@ -41,4 +38,4 @@ def nyquist(responses: Sequence[Response], modulus: float = 0.0, reach: float = 
     axes_through_zero(axes)
     grid(axes)
     axes.legend(fontsize="small")
-    return fig
+    return axes

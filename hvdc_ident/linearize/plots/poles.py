@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.plots.style import COLOURS, axes_through_zero, figure, grid
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from hvdc_ident.linearize.plots.style import COLOURS, axes_through_zero, grid
+from hvdc_ident.notebook import axes_of
 
 
-def poles(model: LinearModel) -> Figure:
-    """The figure: crosses for poles, circles for invariant zeros, rad/s; a symmetric log axis where they spread."""
-    fig = figure(6.0, 5.0)
-    axes = fig.subplots()
+def poles(model: LinearModel, ax: Any = None) -> Any:
+    """The axes: crosses for poles, circles for invariant zeros, rad/s; a symmetric log axis where they spread."""
+    axes = axes_of(ax, 6.0, 5.0)
     p, z = model.poles(), model.zeros()
     axes.plot(p.real, p.imag, "x", color=COLOURS[0], markersize=8, label="poles")
     axes.plot(z.real, z.imag, "o", color=COLOURS[1], markerfacecolor="none", markersize=8, label="zeros")
@@ -25,4 +22,4 @@ def poles(model: LinearModel) -> Figure:
     axes_through_zero(axes)
     grid(axes)
     axes.legend(fontsize="small")
-    return fig
+    return axes

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from hvdc_ident.linearize.modal import Mode
-from hvdc_ident.linearize.plots.style import axes_through_zero, figure, grid, look
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from hvdc_ident.linearize.plots.style import axes_through_zero, grid, look
+from hvdc_ident.notebook import axes_of
 
 
-def shapes(mode: Mode, smallest: float = 0.01) -> Figure:
-    """The figure of one mode; entries below a share of the largest are left out."""
-    fig = figure(5.5, 5.0)
-    axes = fig.subplots()
+def shapes(mode: Mode, smallest: float = 0.01, ax: Any = None) -> Any:
+    """The axes of one mode; entries below a share of the largest are left out."""
+    axes = axes_of(ax, 5.5, 5.0)
     k = 0
     for name, value in mode.shape.items():
         if abs(value) < smallest:
@@ -32,4 +29,4 @@ def shapes(mode: Mode, smallest: float = 0.01) -> Figure:
     axes_through_zero(axes)
     grid(axes)
     axes.legend(fontsize="small")
-    return fig
+    return axes
