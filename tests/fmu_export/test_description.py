@@ -12,6 +12,7 @@ from fmpy.validation import validate_fmu
 
 from hvdc_ident.errors import ComputationError, ModelError
 from hvdc_ident.fmu.export import export_fmu
+from hvdc_ident.fmu.export.program import Program
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model, shipped_models
 from tests.fmu_export import cases
@@ -22,11 +23,12 @@ ALL = {
 }
 
 
-@pytest.mark.parametrize("version", ["2.0", "3.0"])
 @pytest.mark.parametrize("name", sorted(ALL))
-def test_the_validator_finds_nothing(tmp_path: Path, name: str, version: str) -> None:
-    path = export_fmu(ALL[name](), tmp_path / "x.fmu", version=version, binary=False).path
-    assert validate_fmu(str(path)) == []
+def test_the_validator_finds_nothing(tmp_path: Path, name: str) -> None:
+    program = Program(ALL[name]())  # the same for both versions
+    for version in ("2.0", "3.0"):
+        path = export_fmu(program, tmp_path / "x.fmu", version=version, binary=False).path
+        assert validate_fmu(str(path)) == [], version
 
 
 @pytest.mark.parametrize("version", ["2.0", "3.0"])

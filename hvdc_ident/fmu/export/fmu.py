@@ -46,7 +46,7 @@ class FmuFile:
 
 
 def export_fmu(
-    model: Model,
+    model: Model | Program,
     path: str | Path,
     *,
     version: str = "2.0",
@@ -54,7 +54,7 @@ def export_fmu(
     binary: bool | None = None,
     stop: float = 1.0,
 ) -> FmuFile:
-    """The FMU, written to path.
+    """The FMU, written to path. model: itself, or its equations as C, where several FMUs are made of it.
 
     kinds: "model-exchange", "co-simulation" or both. binary: True needs a C compiler, False leaves the sources alone,
     None compiles where there is a compiler. stop: end of the default experiment, s.
@@ -76,8 +76,9 @@ def export_fmu(
             expected="cc, gcc, clang or what CC names",
             hint="leave the binary out",
         )
-    identifier = identifier_of(model.name)
-    content = _content(model, version, chosen, identifier, stop)
+    program = model if isinstance(model, Program) else Program(model)
+    identifier = identifier_of(program.model.name)
+    content = _content(program, version, chosen, identifier, stop)
     folder = None
     if command:
         folder = build.folder(version)
@@ -96,12 +97,12 @@ def identifier_of(name: str) -> str:
     return text if re.match(r"[A-Za-z_]", text) else f"m_{text}"
 
 
-def _content(model: Model, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
+def _content(program: Program, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
     interface = "fmi2.c" if version == "2.0" else "fmi3.c"
     runtime = resources.files("hvdc_ident.fmu.export") / "runtime"
     names = ("model.c", *_SHARED, interface)
 
-    variables = Variables(Program(model))
+    variables = Variables(program)
     files = {"model.c": variables.program.source, "tableau.h": tableau()}
     files |= {n: (runtime / n).read_text("utf-8") for n in (*_SHARED, interface, "internal.h")}
 

@@ -107,7 +107,7 @@ class Program:
             ]
         return "\n".join([*lines, "#endif", ""])
 
-    @property
+    @cached_property
     def source(self) -> str:
         """The text of model.c."""
         head = f'/* {_comment(self.model.name)}; generated. */\n#include <math.h>\n#include <stddef.h>\n\n#include "model.h"\n'
