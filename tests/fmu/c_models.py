@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 from c_fmu import CModel, Var
+
+from hvdc_ident import Model
 
 HEAD = "#include <math.h>\n#ifndef NOMINAL\n#define NOMINAL 1.0\n#endif\n"
 PLAIN = HEAD + "#define INITIALIZE(r)\n"
@@ -174,3 +177,21 @@ def broken(name: str, instantiate: str = "", token: str = "{token}", defines: tu
     """The lag whose instantiation does something else."""
     code = FAULTY_CODE + (f"#define AT_INSTANTIATE {instantiate}\n" if instantiate else "")
     return CModel(name, code, FAULTY_VARIABLES, 1, token=token, defines=defines)
+
+
+TWIN = Model(
+    name="twin",
+    parameters={"m": 2.0, "d": 0.5, "k": 8.0, "b": 0.25},
+    inputs={"u": 0.0},
+    states={"x": "v", "v": "(k*u - d*v - k*x)/m"},
+    outputs={"y": "x", "twice": "2*v + b"},
+)
+"""The spring in equations."""
+
+
+def response(t, m=2.0, d=0.5, k=8.0):
+    """The spring's step response from the step on."""
+    wn, zeta = np.sqrt(k / m), d / (2 * np.sqrt(k * m))
+    wd = wn * np.sqrt(1 - zeta**2)
+    s = np.maximum(t - 1.0, 0.0)
+    return np.where(t < 1.0, 0.0, 1 - np.exp(-zeta * wn * s) * (np.cos(wd * s) + zeta * wn / wd * np.sin(wd * s)))

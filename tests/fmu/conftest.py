@@ -8,11 +8,6 @@ from c_fmu import COMPILER, build
 from hvdc_ident.fmu.host import Limits
 from hvdc_ident.fmu.model import read_fmu
 
-QUICK = Limits(deadline=1.0, load=30.0, memory=128 * 2**20)
-"""A hang costs a second, a leak 128 MiB."""
-PATIENT = Limits(deadline=60.0, load=60.0, memory=128 * 2**20)
-"""For what ends by itself, however slowly."""
-
 
 @pytest.fixture(scope="session")
 def fmu(tmp_path_factory):

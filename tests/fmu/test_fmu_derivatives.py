@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from c_fmu import needs_compiler
-from c_models import BALL, COUNTER, FAULTY, spring
-from test_runs import response
+from c_models import BALL, COUNTER, FAULTY, response, spring
 
 from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 from c_fmu import build, needs_compiler
-from c_models import BALL, COUNTER, FAULTY, TRIANGLE, spring
+from c_models import BALL, COUNTER, FAULTY, TRIANGLE, response, spring
 from scipy.signal import lsim
 
 from hvdc_ident import load_model, simulate
@@ -20,14 +20,6 @@ pytestmark = needs_compiler
 TIME = np.linspace(0.0, 5.0, 251)
 STEP = experiment("step", TIME, {"u": InputSignal.step(1.0, 0.0, 1.0)})
 BOTH = ["model-exchange", "co-simulation"]
-
-
-def response(t, m=2.0, d=0.5, k=8.0):
-    """The spring's step response from the step on."""
-    wn, zeta = np.sqrt(k / m), d / (2 * np.sqrt(k * m))
-    wd = wn * np.sqrt(1 - zeta**2)
-    s = np.maximum(t - 1.0, 0.0)
-    return np.where(t < 1.0, 0.0, 1 - np.exp(-zeta * wn * s) * (np.cos(wd * s) + zeta * wn / wd * np.sin(wd * s)))
 
 
 @pytest.mark.parametrize("interface", BOTH)

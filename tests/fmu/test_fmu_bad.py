@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from c_fmu import FOLDER, build, needs_compiler
 from c_models import FAULTS, FAULTY, FAULTY_VARIABLES, broken
-from conftest import PATIENT, QUICK
+from fmu_limits import PATIENT, QUICK
 
 from hvdc_ident import load_model, simulate, sweep
 from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError

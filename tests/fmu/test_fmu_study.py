@@ -7,8 +7,7 @@ import json
 import numpy as np
 import pytest
 from c_fmu import build, needs_compiler
-from c_models import spring
-from test_ends import TWIN
+from c_models import TWIN, spring
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from c_fmu import needs_compiler
-from c_models import FAULTY, spring
+from c_models import FAULTY, TWIN, spring
 
-from hvdc_ident import Model, simulate
+from hvdc_ident import simulate
 from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.frozen import FrozenMap
@@ -16,13 +16,6 @@ pytestmark = needs_compiler
 
 TIME = np.linspace(0.0, 4.0, 201)
 RUN = experiment("run", TIME, {"u": InputSignal.corners([(0, 0.0), (1, 0.0), (1, 1.0), (2, 1.0), (2.5, -0.5)])})
-TWIN = Model(
-    name="twin",
-    parameters={"m": 2.0, "d": 0.5, "k": 8.0, "b": 0.25},
-    inputs={"u": 0.0},
-    states={"x": "v", "v": "(k*u - d*v - k*x)/m"},
-    outputs={"y": "x", "twice": "2*v + b"},
-)
 CASES = [
     ([{"effect": "lag", "at": "u", "parameters": {"T": 0.2}}], ["lag_u_T"]),
     ([{"effect": "lag", "at": "y", "parameters": {"T": 0.2}}], ["lag_y_T"]),
