@@ -136,7 +136,7 @@ def pilot(
 
     Raises SimulationError, with the experiment's name, where no start could be simulated.
     """
-    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress)
+    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress, assess=False)
     if result.status == "failed":
         raise _failure(problem, result.message)
     weights = {
