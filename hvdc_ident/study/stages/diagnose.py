@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.discrepancy import diagnose
+    from hvdc_ident.discrepancy.sizes import size_curves
+    from hvdc_ident.model.definition import Model
     from hvdc_ident.study.at_work import workers_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
     from hvdc_ident.study.schema import Diagnose
@@ -41,7 +43,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             executor=executor,
             progress=options.progress,
         )
-    return Outcome(found.to_dict(), found.files)
+    sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
+    return Outcome({**found.to_dict(), "sizes": sizes}, found.files)
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:
