@@ -51,6 +51,7 @@ outputs = ["Irorder1"]            # or {Irorder1 = "column name"}
 # window = [0.0, 0.8]             # s: what is compared; if left out, all of it
 # values = {Pref2 = 0.5}          # inputs held at another value than the model's
 # columns = {Irorder1 = {name = "I:REG:1", unit = "kA", scale = 5.54}}   # value in the model = scale x recorded
+# nuisance = ["time-shift", "Pref2"]   # unknown in this recording alone: its clock's offset, an input's offset
 
 [[experiment]]
 name = "ramp"
@@ -62,6 +63,8 @@ outputs = ["Irorder1"]
 # The questions. A stage runs where its table stands here.
 [fit]
 starts = 4                        # runs of the optimiser, from places spread over the bounds
+# optimiser = "trust-region"      # or least-squares, l-bfgs-b, nelder-mead, differential-evolution, dual-annealing, ...
+# loss = "huber"                  # outliers count less; whiten = true where samples are not independent
 """
 
 
