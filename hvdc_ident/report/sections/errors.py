@@ -9,6 +9,10 @@ from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
 
+MOST = 36
+"""Windows that are listed openly; more are folded under their count."""
+
+
 def _render(results: Results) -> str:
     fit, simulation = results.get("fit"), results.get("simulation")
     after = fit.get("rmse") or {}
@@ -68,7 +72,12 @@ def _windows(fit: dict[str, Any]) -> str:
         f"An error above its limit is marked with its limit.{steps} {text(profile.get('notes', ''))}</p>"
     )
     head = ["output", "experiment", "window", "s", "largest", "mean", "mean absolute", "unit"]
-    return "<h3>Before, during and after the event</h3>" + table(head, rows, words=(0, 1, 2, 7)) + told
+    listed = table(head, rows, words=(0, 1, 2, 7))
+    if len(rows) > MOST:
+        over = sum("<strong>" in cell for row in rows for cell in row)
+        counted = f"{len(rows)} windows, {over} errors above their limits"
+        listed = f"<details><summary>{counted}</summary>{listed}</details>"
+    return "<h3>Before, during and after the event</h3>" + listed + told
 
 
 def _error(window: dict[str, Any], kind: str) -> str:
