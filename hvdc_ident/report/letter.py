@@ -77,7 +77,8 @@ def _missed(results: Results, found: dict[str, Any]) -> str:
     if worst is None:
         return f"The model was compared with the recordings; the verdict is {found['verdict']}."
     share, output, experiment, rmse = worst
-    unit = (results.get("simulation").get("units") or {}).get(output, "")
+    units = {**(results.get("fit").get("units") or {}), **(results.get("simulation").get("units") or {})}
+    unit = units.get(output, "")
     return (
         f"With the gains it came with, your model misses {output} in experiment '{experiment}' by "
         f"{100 * share:.2g} % of what that signal does (RMSE {rmse:.3g} {unit}), the most of all recorded signals."
@@ -85,10 +86,12 @@ def _missed(results: Results, found: dict[str, Any]) -> str:
 
 
 def _swing(results: Results, output: str, experiment: str) -> float | None:
-    table = results.table(f"simulation.{experiment}.csv")
-    if table is None or f"{output}.measured" not in table:
-        return None
-    return float(np.ptp(table[f"{output}.measured"]))
+    """What a recorded signal does in an experiment, from its smallest to its largest value."""
+    for stage in ("simulation", "fit"):
+        table = results.table(f"{stage}.{experiment}.csv")
+        if table is not None and f"{output}.measured" in table:
+            return float(np.ptp(table[f"{output}.measured"]))
+    return None
 
 
 def _consistent(found: dict[str, Any]) -> str:
@@ -113,7 +116,7 @@ def _interval(effect: dict[str, Any]) -> str:
     for name, size in effect["parameters"].items():
         low, high = size.get("ci95") or (None, None)
         if low is not None and high is not None:
-            parts.append(f"{name} between {low:.3g} and {high:.3g} {size.get('unit', '')}".rstrip())
+            parts.append(f"{name} between {low:.4g} and {high:.4g} {size.get('unit', '')}".rstrip())
     return f"({', '.join(parts)}, 95 %)" if parts else ""
 
 
@@ -130,16 +133,22 @@ def _gains(found: dict[str, Any]) -> str:
     if not found.get("effects"):
         if abs(alone) < 0.02:
             return "Your gains are not to blame: a fit leaves them within 2 % of what you gave."
-        return f"Your gains are to blame: fitted, {name} moves by {100 * alone:+.1f} %, and that closes the gap as far as it closes."
+        return f"Your gains are to blame: fitted, {name} moves by {_percent(alone)}, and that closes the gap as far as it closes."
     if abs(with_it) < 0.5 * abs(alone):
         return (
-            f"Your gains are not to blame: fitted without the effect {name} would be bent by {100 * alone:+.1f} %, "
-            f"with it the same fit leaves {100 * with_it:+.1f} %."
+            f"Your gains are not to blame: fitted without the effect {name} would be bent by {_percent(alone)}, "
+            f"with it the same fit leaves {_percent(with_it)}."
         )
     return (
-        f"Your gains move too: {name} by {100 * alone:+.1f} % when fitted without the effect and by "
-        f"{100 * with_it:+.1f} % with it."
+        f"Your gains move too: {name} by {_percent(alone)} when fitted without the effect and by "
+        f"{_percent(with_it)} with it."
     )
+
+
+def _percent(share: float) -> str:
+    """A share with its sign in per cent; nothing has no sign."""
+    shown = f"{100 * share:+.1f} %"
+    return "0.0 %" if shown[1:] == "0.0 %" else shown
 
 
 def _gained(found: dict[str, Any]) -> str:
@@ -176,29 +185,8 @@ def _slider(sizes: dict[str, Any] | None) -> str:
     """The curves at several sizes in one drawing, of which a slider shows one."""
     if not sizes or not sizes.get("curves"):
         return ""
-    time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
     chosen = sizes.get("chosen") or 0
-    fig = figure(7.4, 2.8)
-    axes = fig.subplots()
-    keep = visible_rows(measured, 600)
-    axes.plot(time[keep], measured[keep], color=MEASURED, linewidth=1.0, label="recorded")
-    for k, curve in enumerate(sizes["curves"]):
-        values = np.asarray(curve, dtype=float)
-        rows = visible_rows(values, 600)
-        (line,) = axes.plot(
-            time[rows], values[rows], color=AFTER, linewidth=1.5, label="model" if k == chosen else None
-        )
-        line.set_gid(f"size-{k}")
-    unit = sizes.get("output_unit") or ""
-    axes.set_xlabel("time, s")
-    axes.set_ylabel(f"{sizes['output']}, {unit}" if unit else str(sizes["output"]))
-    axes.grid(True, color="#e4e4e4", linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
-    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
-    for k in range(len(sizes["curves"])):
-        hidden = "" if k == chosen else ' style="display: none"'
-        drawn = drawn.replace(f'<g id="size-{k}">', f'<g class="size"{hidden}>', 1)
+    drawn = _at_sizes(sizes, chosen)
     data = json.dumps({"labels": sizes["labels"]}).replace("<", "\\u003c")
     label = f"size of the effect, {sizes['effect']} at {' and '.join(sizes['at'])}"
     return (
@@ -207,3 +195,33 @@ def _slider(sizes: dict[str, Any] | None) -> str:
         f"</label> <output>{text(sizes['labels'][chosen])}</output></p>"
         f'<script type="application/json">{data}</script></div>'
     )
+
+
+def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
+    """The drawing: recorded and simulated above, what is left below; the curves of one size are shown."""
+    time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
+    fig = figure(7.4, 3.6)
+    top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+    keep = visible_rows(measured, 600)
+    top.plot(time[keep], measured[keep], color=MEASURED, linewidth=1.0, label="recorded")
+    for k, curve in enumerate(sizes["curves"]):
+        values = np.asarray(curve, dtype=float)
+        for axes, shown in ((top, values), (strip, measured - values)):
+            rows = visible_rows(shown, 600)
+            label = "model" if k == chosen and axes is top else None
+            (line,) = axes.plot(time[rows], shown[rows], color=AFTER, linewidth=1.3, label=label)
+            line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
+    unit = sizes.get("output_unit") or ""
+    top.set_ylabel(f"{sizes['output']}, {unit}" if unit else str(sizes["output"]))
+    strip.set_ylabel("left over")
+    strip.set_xlabel("time, s")
+    for axes in (top, strip):
+        axes.grid(True, color="#e4e4e4", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    top.legend(frameon=False, fontsize=8)
+    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
+    for k in range(len(sizes["curves"])):
+        hidden = "" if k == chosen else ' style="display: none"'
+        for place in ("top", "strip"):
+            drawn = drawn.replace(f'<g id="size-{k}-{place}">', f'<g class="size" data-k="{k}"{hidden}>', 1)
+    return drawn

@@ -102,7 +102,7 @@ def test_without_evidence_nothing_is_named_and_the_gains_are_judged(tmp_path: Pa
 
 def test_the_page_has_one_curve_to_see_and_a_slider_for_the_others(tmp_path: Path) -> None:
     text = write_letter(folder_with(tmp_path, diagnosis())).read_text("utf-8")
-    assert text.count('class="size"') == 2 and text.count('class="size" style="display: none"') == 1
+    assert text.count('class="size"') == 4 and text.count('style="display: none"') == 2
     assert 'type="range"' in text and "plotly" not in text.split("<script>")[0]
     assert len(text) < 200_000
 

@@ -65,7 +65,7 @@
     const lines = [...box.querySelectorAll("svg .size")];
     const show = () => {
       const k = Number(slider.value);
-      lines.forEach((line, n) => { line.style.display = n === k ? "" : "none"; });
+      lines.forEach((line) => { line.style.display = Number(line.dataset.k) === k ? "" : "none"; });
       shown.textContent = data.labels[k];
     };
     slider.hidden = false;
