@@ -8,7 +8,6 @@ from hvdc_ident.report.html import number, share, table, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
 
-
 MOST = 36
 """Windows that are listed openly; more are folded under their count."""
 
