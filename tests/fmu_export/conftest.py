@@ -1,4 +1,4 @@
-"""One export of each model for all tests, compiled quickly instead of well."""
+"""One export of each model for all tests, compiled quickly instead of well, and with every warning an error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def fmu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., driver.Export
     @cache
     def made(name: str, version: str = "2.0") -> driver.Exported:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("CFLAGS", "-O0")
+            patch.setenv("CFLAGS", "-O0 -Wall -Wextra -pedantic -Werror")
             return driver.exported(getattr(cases, name)(), folder / f"{name}-{version[0]}.fmu", version)
 
     return made

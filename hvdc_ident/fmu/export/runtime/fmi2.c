@@ -77,7 +77,7 @@ EXPORT void *NAME(fmi2Instantiate)(Text name, fmi2Type type, Text guid, Text res
     }
     i->logging = logging;
     if (functions) {
-        i->logger = (void *)functions->logger;
+        i->logger = (void (*)(void))functions->logger;
         i->environment = functions->environment;
     }
     return i;
@@ -268,7 +268,7 @@ EXPORT fmi2Status NAME(fmi2GetContinuousStates)(void *c, double x[], size_t n) {
 
 EXPORT fmi2Status NAME(fmi2GetNominalsOfContinuousStates)(void *c, double values[], size_t n) {
     CHECK(~0, "fmi2GetNominalsOfContinuousStates");
-    for (size_t k = 0; k < NX && k < n; k++) values[k] = model_nominals[k];
+    if (n == NX) memcpy(values, model_nominals, NX * sizeof(double));
     return report(i, as_many(i, n, NX));
 }
 

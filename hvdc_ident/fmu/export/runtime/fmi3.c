@@ -79,7 +79,7 @@ static void *instance(Text name, Text token, int cosimulation, bool logging, voi
         return NULL;
     }
     i->logging = logging;
-    i->logger = (void *)logger;
+    i->logger = (void (*)(void))logger;
     i->environment = environment;
     return i;
 }
@@ -407,7 +407,7 @@ EXPORT Status NAME(fmi3GetContinuousStates)(void *c, double x[], size_t n) {
 
 EXPORT Status NAME(fmi3GetNominalsOfContinuousStates)(void *c, double values[], size_t n) {
     CHECK(~0, "fmi3GetNominalsOfContinuousStates");
-    for (size_t k = 0; k < NX && k < n; k++) values[k] = model_nominals[k];
+    if (n == NX) memcpy(values, model_nominals, NX * sizeof(double));
     return report(i, as_many(i, n, NX));
 }
 

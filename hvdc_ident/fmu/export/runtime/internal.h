@@ -62,7 +62,7 @@ typedef struct {
     size_t history_room, echo_room;
     int cosimulation;
     void *environment;
-    void *logger;
+    void (*logger)(void); /* of the type that the version of the standard says */
     int logging;
     char *name;
     char message[400];
