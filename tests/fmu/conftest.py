@@ -9,9 +9,9 @@ from hvdc_ident.fmu.host import Limits
 from hvdc_ident.fmu.model import read_fmu
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def fmu(tmp_path_factory):
-    """load(model, version=2, interface=None, limits=None): the model of an FMU written in C, loaded once."""
+    """load(model, version=2, interface=None, limits=None): the model of an FMU written in C, loaded once a file of tests."""
     if COMPILER is None:
         pytest.skip("no C compiler here: FMUs written in C cannot be built")
     folder, kept = tmp_path_factory.mktemp("fmus"), {}
