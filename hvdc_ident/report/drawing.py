@@ -30,9 +30,15 @@ def figure(width: float, height: float) -> Figure:
 def svg(fig: Figure, label: str) -> str:
     """The figure as an `<svg>` element, the same bytes each time; text stays text."""
     import matplotlib
+    from matplotlib.ticker import LogFormatter
 
     from hvdc_ident.report.html import text
 
+    for axes in fig.axes:
+        for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):
+            if scale == "log":  # powers of ten as plain numbers: formulas are not typeset
+                axis.set_major_formatter(LogFormatter())
+                axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
     style = {"svg.fonttype": "none", "svg.hashsalt": label, "font.family": "sans-serif", "text.parse_math": False}
     stream = io.StringIO()
     with matplotlib.rc_context(style):
