@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.machine import ARGUMENTS, Function
+from hvdc_ident.simulate.machine import ARGUMENTS, Function, body
 
 LARGEST = 20_000  # factors beyond which straight-line code no longer pays
 
@@ -163,4 +163,4 @@ def solve_text(elimination: Elimination, symbol: str, width: int, second: Sequen
             rows[i] = emit(f"fadd contract {kind} {rows[i]}, {product}")
         solve(rows, n, width)
     arguments = ", ".join(f"ptr %{a}" if a != "out" else "ptr noalias %out" for a in ARGUMENTS)
-    return f"define void @{symbol}({arguments}) nounwind {{\n" + "\n".join(lines) + "\n  ret void\n}"
+    return f"define void @{symbol}({arguments}) nounwind {{\n" + body(lines) + "\n  ret void\n}"

@@ -7,7 +7,7 @@ Derivatives of a tree grow with every use of a signal; on the graph each node is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 
 import sympy as sp
 
@@ -311,17 +311,17 @@ class Graph:
 
     def gradient(self, node: int) -> dict[int, int]:
         """The partial derivatives of a node with respect to every leaf it depends on: {leaf: node}; conditions are held."""
-        for n in self.reachable([node]):
-            if n not in self._gradients:
+        if node not in self._gradients:
+            for n in self.reachable([node], known=self._gradients):
                 self._gradients[n] = self._differentiate(n)
         return self._gradients[node]
 
-    def reachable(self, roots: Iterable[int]) -> list[int]:
-        """Every node the roots depend on, roots included, in an order of evaluation."""
+    def reachable(self, roots: Iterable[int], known: Container[int] = ()) -> list[int]:
+        """Every node the roots depend on, roots included, in an order of evaluation; not what is known, nor behind it."""
         seen, stack = set(), list(roots)
         while stack:
             n = stack.pop()
-            if n not in seen:
+            if n not in seen and n not in known:
                 seen.add(n)
                 stack.extend(self.arguments(n))
         return sorted(seen)

@@ -24,6 +24,8 @@ ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
 _LIBM = ("tan", "tanh", "asin", "acos", "atan", "atan2")
 _INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs")
 LANES = 4  # instants that a function over several of them takes at once
+BLOCK = 300  # instructions of a block of a long function
+LONG = 4000  # instructions; a shorter function is one block
 _serial = itertools.count()
 
 
@@ -117,6 +119,15 @@ def _compiled(text: str, hot: bool) -> llvm.ExecutionEngine:
     return engine
 
 
+def body(lines: Sequence[str]) -> str:
+    """The text of a function's instructions; a long one in blocks, for the compiler's effort grows with a block's square."""
+    if len(lines) <= LONG:
+        return "\n".join(lines)
+    pieces = ["\n".join(lines[k : k + BLOCK]) for k in range(0, len(lines), BLOCK)]
+    joined = (f"{piece}\n  br label %block{k}\nblock{k}:" for k, piece in enumerate(pieces[:-1]))
+    return "\n".join([*joined, pieces[-1]])
+
+
 def _number(value: float) -> str:
     return f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}"
 
@@ -146,7 +157,7 @@ class _Emitter:
         for place, row in f.rows:
             self._row(place, row)
         arguments = ", ".join(f"ptr noalias %{a}" if a == "out" else f"ptr readonly %{a}" for a in ARGUMENTS)
-        return f"define void @{self.symbol}({arguments}) nounwind {{\n" + "\n".join(self.lines) + "\n  ret void\n}"
+        return f"define void @{self.symbol}({arguments}) nounwind {{\n" + body(self.lines) + "\n  ret void\n}"
 
     def _emit(self, instruction: str) -> str:
         self.count += 1
