@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hvdc_ident.simulate.kernel import kernel
+from hvdc_ident.simulate.kernel import kernel, stamp
 from hvdc_ident.simulate.memory import address_of, indices, record, vector
 from hvdc_ident.simulate.outputs import remember, write_rows
 from hvdc_ident.simulate.segments import begin_segment, end_segment, prepare_segment
-from hvdc_ident.simulate.state import NODES, arrange
+from hvdc_ident.simulate.state import NODES, RUN, arrange
 from hvdc_ident.simulate.status import CONVERGED, INCONSISTENT, NOT_FINITE, STEP_LIMIT, STIFF
 from hvdc_ident.simulate.steps import attempt, make_dense
 from hvdc_ident.simulate.switches import AGAIN, NONE, find_switch, switch, widen
@@ -126,55 +126,71 @@ def _accept(r, factor):  # type: ignore[no-untyped-def]
     return CONVERGED if event == NONE else switch(r, event)
 
 
-@njit(cache=True, error_model="numpy")
-def integrate(state, work, span, tolerance, max_steps, y, w, p, constants, breaks, pointer, times, values, t_out, out, scale, hess_row, hess_column):  # type: ignore[no-untyped-def]
-    """Integrates from start to end; writes the outputs and their rows into out (n_out, no (1 + width)).
+def _entries(stamp):  # type: ignore[no-untyped-def]
+    """What Python calls, for the present state of the kernels' files."""
 
-    state: a RUN record as integers, with sizes, functions and method; on return it holds the counts. work: zeros, as many
-    doubles as `arrange` asks for. span: start and end. tolerance: relative, absolute. y: the flat start vector, consistent
-    to solver tolerance. constants: delay times, sampling periods and compute times with their rows.
-    Returns a status and the time reached.
-    """
-    r = record(address_of(state))
-    r.start, r.end = span
-    r.rtol, r.atol = tolerance
-    r.max_steps = max_steps
-    r.free = address_of(work)
-    arrange(r)
-    r.p, r.constants, r.scale = address_of(p), address_of(constants), address_of(scale)
-    r.breaks, r.n_breaks = address_of(breaks), breaks.size
-    r.pointer, r.times, r.values = address_of(pointer), address_of(times), address_of(values)
-    r.t_out, r.n_out, r.out = address_of(t_out), t_out.size, address_of(out)
-    r.hess_row, r.hess_column = address_of(hess_row), address_of(hess_column)
-    at = indices(r.at, r.nu)
-    for i in range(r.nu):
-        at[i] = pointer[i]
-    _begin(r, y, w)
-    # What has no size known beforehand: steps for delayed signals to look back to, jumps that will come back.
-    history = np.empty((64 if r.nd else 1, 2 + r.nd * NODES * (1 + r.width)))
-    echo = np.empty((16, 2 + r.width))
-    r.history = address_of(history)
-    while True:
-        echo = longer(echo, r.echoes, r.nd)
-        r.echo = address_of(echo)
-        if not begin_segment(r):
-            return INCONSISTENT, r.t
-        if not r.t < r.end:
-            return CONVERGED, r.t
-        prepare_segment(r)
-        while r.t < r.tb:
-            if r.nd:
-                history, echo = longer(history, r.kept, 1), longer(echo, r.echoes, r.nd)
-                r.history, r.echo = address_of(history), address_of(echo)
-            status = _step(r)
-            if status != CONVERGED:
-                return status, r.t
-        end_segment(r)
+    @njit(cache=True, error_model="numpy")
+    def integrate(state, work, span, tolerance, max_steps, y, w, p, constants, breaks, pointer, times, values, t_out, out, scale, hess_row, hess_column):  # type: ignore[no-untyped-def]
+        """Integrates from start to end; writes the outputs and their rows into out (n_out, no (1 + width)).
+
+        state: a RUN record as integers, with sizes, functions and method; on return it holds the counts. work: zeros, as many
+        doubles as `arrange` asks for. span: start and end. tolerance: relative, absolute. y: the flat start vector, consistent
+        to solver tolerance. constants: delay times, sampling periods and compute times with their rows.
+        Returns a status and the time reached.
+        """
+        r = record(address_of(state))
+        r.stamp = stamp
+        r.start, r.end = span
+        r.rtol, r.atol = tolerance
+        r.max_steps = max_steps
+        r.free = address_of(work)
+        arrange(r)
+        r.p, r.constants, r.scale = address_of(p), address_of(constants), address_of(scale)
+        r.breaks, r.n_breaks = address_of(breaks), breaks.size
+        r.pointer, r.times, r.values = address_of(pointer), address_of(times), address_of(values)
+        r.t_out, r.n_out, r.out = address_of(t_out), t_out.size, address_of(out)
+        r.hess_row, r.hess_column = address_of(hess_row), address_of(hess_column)
+        at = indices(r.at, r.nu)
+        for i in range(r.nu):
+            at[i] = pointer[i]
+        _begin(r, y, w)
+        # What has no size known beforehand: steps for delayed signals to look back to, jumps that will come back.
+        history = np.empty((64 if r.nd else 1, 2 + r.nd * NODES * (1 + r.width)))
+        echo = np.empty((16, 2 + r.width))
+        r.history = address_of(history)
+        while True:
+            echo = longer(echo, r.echoes, r.nd)
+            r.echo = address_of(echo)
+            if not begin_segment(r):
+                return INCONSISTENT, r.t
+            if not r.t < r.end:
+                return CONVERGED, r.t
+            prepare_segment(r)
+            while r.t < r.tb:
+                if r.nd:
+                    history, echo = longer(history, r.kept, 1), longer(echo, r.echoes, r.nd)
+                    r.history, r.echo = address_of(history), address_of(echo)
+                status = _step(r)
+                if status != CONVERGED:
+                    return status, r.t
+            end_segment(r)
+
+    @njit(cache=True, error_model="numpy")
+    def room(state):  # type: ignore[no-untyped-def]
+        """How many doubles of workspace a run of these sizes takes."""
+        r = record(address_of(state))
+        r.stamp = stamp
+        r.free = 0
+        return arrange(r) // 8
+
+    return integrate, room
 
 
-@njit(cache=True, error_model="numpy")
-def room(state):  # type: ignore[no-untyped-def]
-    """How many doubles of workspace a run of these sizes takes."""
-    r = record(address_of(state))
-    r.free = 0
-    return arrange(r) // 8
+integrate, room = _entries(stamp(RUN.descr))
+# The types of the arguments of `integrate` and `room`, so that both can be made before the first run.
+ROOM = "int64(int64[::1])"
+INTEGRATE = (
+    "Tuple((int64, float64))(int64[::1], float64[::1], UniTuple(float64, 2), UniTuple(float64, 2), int64, "
+    "float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], int64[::1], float64[::1], float64[::1], "
+    "float64[::1], float64[:, ::1], float64[::1], int64[::1], int64[::1])"
+)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -39,7 +37,7 @@ class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
     def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
-        announce_compilation()
+        prepare_integrators()
         self.structure = Structure(model, sensitivities, outputs)
         s = self.structure.sizes
         self._code = self.structure.compile()
@@ -248,20 +246,19 @@ class Engine:
         return jac
 
 
-def announce_compilation() -> None:
-    """Says on stderr that the integrators are being compiled, where this installation has not compiled them yet."""
-    from hvdc_ident.simulate.driver import integrate
+def prepare_integrators() -> None:
+    """Nothing; the integrators are loaded, or compiled where this installation has not compiled them as they are now."""
+    from numba.core.event import install_listener
 
-    if integrate.signatures:
-        return
-    cache = integrate._cache
-    folder = Path(cache.cache_path)
-    if not list(folder.glob("driver.integrate-*.nbi")):
-        print(
-            "hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...",
-            file=sys.stderr,
-            flush=True,
-        )
+    from hvdc_ident.simulate.announcement import Announcement
+    from hvdc_ident.simulate.driver import INTEGRATE, ROOM, integrate, room
+    from hvdc_ident.simulate.rest import REST, rest
+
+    if not integrate.signatures:
+        with install_listener("numba:compile", Announcement()):
+            rest.compile(REST)
+            room.compile(ROOM)
+            integrate.compile(INTEGRATE)
 
 
 @lru_cache(maxsize=64)

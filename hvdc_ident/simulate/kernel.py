@@ -1,9 +1,29 @@
-"""How the integrators' inner functions are compiled: cached, and without an entry from Python, which nobody uses."""
+"""How the integrators are compiled: once for an installation, and again where a file they are made from has changed."""
 
 from __future__ import annotations
 
+import hashlib
 from functools import partial
+from pathlib import Path
 
 from numba import njit
 
-kernel = partial(njit, cache=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# An inner function: kept without an entry from Python, which nobody uses. What is called from Python is cached as a whole.
+kernel = partial(njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+_FILES = (
+    "call", "driver", "exogenous", "kernel", "lanes", "linear", "memory", "outputs", "rest", "segments", "state", "status",
+    "steps", "switches", "tableaus", "unknowns",
+)  # fmt: skip
+
+
+def stamp(*facts: object) -> int:
+    """A number that changes with the files the kernels are made from, and with the facts.
+
+    The cache of machine code looks at the file of the outermost function alone, and at the values its closure holds:
+    holding this number makes it look at all of them.
+    """
+    digest = hashlib.sha256(repr(facts).encode())
+    for name in _FILES:
+        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
+    return int.from_bytes(digest.digest()[:7], "big")

@@ -271,7 +271,7 @@ class _Emitter:
 
 
 class _LanesEmitter(_Emitter):
-    """Writes a function that works on several instants at once, one a lane.
+    """Writes a function of plain nodes that works on several instants at once, one a lane.
 
     `y` holds a flat vector and `out` a result for every instant, `stride` doubles apart; `yd` holds the instants. All
     else (inputs, delayed and sampled signals, parameters, modes) is the same for all of them.
@@ -289,24 +289,7 @@ class _LanesEmitter(_Emitter):
             self._store("double", self._lane(value, lane), place + lane * self.stride[1])
 
     def _row(self, place: int, row: Row) -> None:
-        kind = f"<{self.width} x double>"
-        scalars = {c: self._value(node) for c, node in row.scalars.items()}
-        factors = [self._value(node) for node, _, _ in row.products]
-        for lane in range(LANES):
-            total = "zeroinitializer"
-            for column, value in scalars.items():
-                total = self._emit(f"insertelement {kind} {total}, double {self._lane(value, lane)}, i32 {column}")
-            for (node, argument, offset), factor in zip(row.products, factors, strict=True):
-                vector = self._vector(argument, offset + (lane * self.stride[0] if argument == "y" else 0))
-                product = vector
-                if self.graph.value(node) != 1.0:
-                    mask = f"<{self.width} x i32> <" + ", ".join([f"i32 {lane}"] * self.width) + ">"
-                    splat = self._emit(f"shufflevector {self.kind} {factor}, {self.kind} undef, {mask}")
-                    product = self._emit(f"fmul contract {kind} {splat}, {vector}")
-                total = (
-                    product if total == "zeroinitializer" else self._emit(f"fadd contract {kind} {total}, {product}")
-                )
-            self._store(kind, total, place + lane * self.stride[1])
+        raise AssertionError("rows over the parameters fill the lanes themselves")
 
     def _lane(self, value: str, lane: int) -> str:
         return self._emit(f"extractelement {self.kind} {value}, i32 {lane}")

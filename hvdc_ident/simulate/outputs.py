@@ -31,7 +31,7 @@ def write_rows(r):  # type: ignore[no-untyped-def]
             count += 1
         if count == 0:
             return
-        if r.quiet and count > 2 and r.i_out + LANES <= r.n_out:  # four at once cost about as much as two or three
+        if r.quiet and count > 2 and r.i_out + LANES <= r.n_out:  # four at once cost about as much as two alone
             _write_four(r, t_out, count)
         else:
             for _ in range(count):
@@ -51,9 +51,13 @@ def _write_four(r, t_out, count):  # type: ignore[no-untyped-def]
     x0, x1 = (instants[0] - r.t) * scale, (instants[1] - r.t) * scale
     x2, x3 = (instants[2] - r.t) * scale, (instants[3] - r.t) * scale
     interpolate_four(r, x0, x1, x2, x3)
-    row = r.out + 8 * first * r.no * (1 + r.width)
-    call(r.do_rows, r.block, r.instants, r.w, r.wd, r.p, r.m, row)
-    r.i_out += count
+    if r.do_rows:
+        call(r.do_rows, r.block, r.instants, r.w, r.wd, r.p, r.m, r.out + 8 * first * max(r.no, 1))
+        r.i_out += count
+    else:
+        for k in range(count):
+            outside(r, instants[k], r.t)
+            write_row(r, r.block + 8 * r.stride * k)
 
 
 @kernel()

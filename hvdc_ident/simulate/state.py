@@ -69,7 +69,7 @@ RUN = np.dtype(
     [(f, np.int64) for f in (*SIZES, *(f"do_{n}" for n in NAMES), "do_rhs", "do_observe", "do_sources", *VECTORS)]
     + [(f, np.int64) for f in (*COUNTS, *FLAGS)]
     + [(f, np.float64) for f in INSTANTS]
-    + [("free", np.int64)]
+    + [(f, np.int64) for f in ("free", "stamp")]  # where the workspace goes on; what the kernels were made from
 )
 
 

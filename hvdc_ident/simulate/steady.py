@@ -20,7 +20,7 @@ def fallback(
 ) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
     from hvdc_ident.simulate.machine import evaluate
-    from hvdc_ident.simulate.rest import MODES, REST, REST_JAC, REST_P
+    from hvdc_ident.simulate.rest import MODES, RESIDUAL, REST_JAC, REST_P
 
     s = structure.sizes
     inner, extra = s.nx + s.nz, s.nd + s.nq
@@ -32,7 +32,7 @@ def fallback(
         y[:inner], w[1 + s.nu : 1 + s.nu + extra] = v[:inner], v[inner:]
         r, jac = np.zeros(n), np.zeros(n * n)
         evaluate(address[MODES], y, w, p, m, m)
-        evaluate(address[REST], y, w, p, m, r)
+        evaluate(address[RESIDUAL], y, w, p, m, r)
         evaluate(address[REST_JAC], y, w, p, m, jac)
         return r, jac.reshape(n, n)
 

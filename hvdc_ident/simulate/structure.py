@@ -251,18 +251,13 @@ class Structure:
             plain("swd", [self.rate(v, True) for v in g.switches]),
             plain("modes", modes, live=True),
             plain("out", self.observed, hot=not width),
-            Function(
-                "rows",
-                list(enumerate(self.observed)),
-                rows(self.observed, s.no),
-                hot=True,
-                stride=(padded(n * (1 + width)), s.no * (1 + width)),
-            ),
             plain("src", self.sources),
             plain("srcd", [self.rate(v, True) for v in self.sources]),
             both("const", self.timing),
             *self._rest(),
         ]
+        if not width:
+            result.append(Function("rows", list(enumerate(self.observed)), hot=True, stride=(padded(n), s.no)))
         if width:
             result += [
                 both("fs", self.rhs, hot=True),
