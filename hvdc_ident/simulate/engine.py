@@ -262,7 +262,7 @@ def prepare_integrators() -> None:
 
 
 @lru_cache(maxsize=64)
-def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Array, ...]:
+def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Any, ...]:
     """What an integration reads of its inputs: start values, breaks, then the pieces of all of them and their points."""
     # "At the first row" is what stood before anything happened: the value from the left.
     u = [
