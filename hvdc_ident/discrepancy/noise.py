@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -25,6 +26,12 @@ FEWEST = 8
 SURE = 3.3
 """Standard errors by which the records before the event must exceed a given noise to replace it."""
 SOFT = 1e-6
+LONG = 120
+"""Rows of a record from which more than one AR coefficient is told."""
+COMMON = 0.95
+"""Share of what sines of free phase explain that one of common phase must."""
+STANDS_OUT = 12.0
+"""Its power over that of the rest, as an F value."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,8 @@ def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[Noise]:
 
 
 def _noise(output: str, experiments: Sequence[Experiment]) -> Noise:
-    quiet = [r for e in experiments if (r := _before(e, output)).size >= FEWEST]
+    before = [(t, r) for e in experiments for t, r in [_before(e, output)] if r.size >= FEWEST]
+    quiet = without_tone([t for t, _ in before], [r for _, r in before])
     records = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
     step = _step(records)
     given = _given(output, experiments)
@@ -64,6 +72,8 @@ def _noise(output: str, experiments: Sequence[Experiment]) -> Noise:
         std = 0.0
     elif _even(experiments):
         model, error = _model(quiet, rows, power)
+        if len(model) == 1:  # a line takes more of slow noise than of white
+            std = float(np.sqrt(power / sum(_detrended(round(model[0], 2), min(r.size, 400))[1] for r in quiet)))
     if given is None and std <= max((noise_floor(r) for r in records), default=0.0):
         if step > 0.0:
             rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(records, step) ** 2))
@@ -98,34 +108,74 @@ def _given(output: str, experiments: Sequence[Experiment]) -> float | None:
     return value if value > 1.001 * SOFT * max([*ranges, 0.0]) else None
 
 
-def _before(experiment: Experiment, output: str) -> Array:
-    """The rows before the event, less their straight line."""
+def without_tone(times: Sequence[Array], records: Sequence[Array]) -> list[Array]:
+    """The records less the sine that all of them share at the same times, where there is one: that is no noise.
+
+    times: (n,) s each. A sine of common phase has to hold nearly all that sines of free phase would, and to stand out of
+    the rest; noise has no phase in common. A single record is left as it is.
+    """
+    if len(records) < 2 or min(t.size for t in times) < 3 * FEWEST:
+        return list(records)
+    span = max(float(np.ptp(t)) for t in times)
+    step = min(float(np.median(np.diff(t))) for t in times)
+    power = sum(float(r @ r) for r in records)
+    rows = sum(r.size for r in records)
+    best = (0.0, list(records))
+    for f in np.arange(1.5 / span, 0.4 / step, 0.2 / span):
+        waves = [np.column_stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]) for t in times]
+        free = sum(
+            float(r @ r - np.linalg.lstsq(w, r, rcond=None)[1].sum()) for w, r in zip(waves, records, strict=True)
+        )
+        whole = np.vstack(waves)
+        c = np.linalg.lstsq(whole, np.concatenate(records), rcond=None)[0]
+        left = [r - w @ c for w, r in zip(waves, records, strict=True)]
+        shared = power - sum(float(r @ r) for r in left)
+        if shared > COMMON * free and shared / 2.0 > STANDS_OUT * (power - shared) / rows and shared > best[0]:
+            best = (shared, left)
+    return best[1]
+
+
+def _before(experiment: Experiment, output: str) -> tuple[Array, Array]:
+    """The times and rows before the event, less their straight line."""
     assert experiment.measured is not None
     event = experiment.event if experiment.event is not None else event_time(experiment.inputs)
     if event is None:
-        return np.empty(0)
+        return np.empty(0), np.empty(0)
     keep = (experiment.time < event - 1e-12) & np.isfinite(experiment.measured[output])
     t, v = experiment.time[keep], experiment.measured[output][keep]
     if v.size < FEWEST:
-        return np.empty(0)
+        return np.empty(0), np.empty(0)
     x = t - t.mean()
     power = float(x @ x)
     rest = v - v.mean()
-    return np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
+    return t, np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
 
 
 def _model(quiet: Sequence[Array], rows: int, power: float) -> tuple[AR, float]:
     """The AR model of several records together; of a single coefficient the error, freed of the bias a fitted line makes."""
+    n = rows // len(quiet)
     longer = autoregression(quiet)
-    if len(longer) > 1:
+    if len(longer) > 1 and n >= LONG:
         return longer, 0.0
     raw = sum(float(r[1:] @ r[:-1]) for r in quiet) / power
-    pairs = rows - len(quiet)
-    # A line fitted to n rows lowers the coefficient by (2 + 4 rho)/n (Kendall 1954, for a trend).
-    n = rows / len(quiet)
-    rho = float(np.clip((raw + 2.0 / n) / (1.0 - 4.0 / n) if n > 12 else raw, -0.5, 0.985))
-    error = float(np.sqrt(max(1.0 - rho**2, 0.02) / pairs))
+    grid = np.linspace(-0.5, 0.985, 60)
+    seen = [_detrended(float(g), min(n, LONG))[0] for g in grid]
+    rho = float(np.interp(raw, seen, grid))
+    error = float(np.sqrt(max(1.0 - rho**2, 0.02) / (rows - len(quiet))))
     return ((rho,), error) if abs(rho) > 1.645 * error else ((), 0.0)
+
+
+@lru_cache(maxsize=512)
+def _detrended(rho: float, n: int) -> tuple[float, float]:
+    """What n rows of AR(1) noise of variance 1 without their straight line show: lag-1 coefficient, and sum of squares.
+
+    Expected values: tr(L M S M)/tr(M S M) and tr(M S M), with S the correlation and M what takes the line out.
+    """
+    s = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) if rho else np.eye(n)
+    q = np.linalg.qr(np.column_stack([np.ones(n), np.arange(n, dtype=float)]))[0]
+    m = np.eye(n) - q @ q.T
+    a = m @ s @ m
+    return float(np.trace(a, 1) / np.trace(a)), float(np.trace(a))
 
 
 def _step(records: Sequence[Array]) -> float:

@@ -10,12 +10,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import sympy as sp
 from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.grid import instants
 from hvdc_ident.discrepancy.kernel import propagate
 from hvdc_ident.discrepancy.tangent import Partials, Tangent, tangent
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.expression.functions import symbol
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.transform import slot
 from hvdc_ident.simulate import simulate
@@ -237,10 +239,10 @@ def _memory(parts: Tangent, plant: Model, time: Array, p: Array) -> tuple[NDArra
     nd = len(plant.delays)
     before = np.full((time.size, len(parts.memory)), -1, dtype=np.int64)
     share = np.zeros(before.shape)
-    at = dict(zip(plant.parameters, p.tolist(), strict=True))
+    at = {symbol(n): sp.Float(v, 17) for n, v in zip(plant.parameters, p.tolist(), strict=True)}
 
     def number(e: object) -> float:
-        return float(e.subs(at)) if hasattr(e, "subs") else float(e)  # type: ignore[arg-type]
+        return float(e.xreplace(at)) if isinstance(e, sp.Basic) else float(e)  # type: ignore[arg-type]
 
     lags = [number(d.time) for d in plant.delays.values()]
     taken = [(number(s.period), number(s.compute)) for s in plant.sampled.values()]

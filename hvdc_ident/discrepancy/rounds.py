@@ -31,6 +31,8 @@ from hvdc_ident.trajectory import Array
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
+AGREED = 10.0
+"""By how much chi2 of the held-out data has to fall for them to agree."""
 STEP = 0.05
 """Share of the gap that a second effect has to take away at least."""
 
@@ -222,11 +224,23 @@ def objections(search: Search, before: Refit, trial: Trial, scores: Scores, *, f
     if not now < was:
         return f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
     tables = _tables(before, refit) if search.material else None
-    if not material_gap(was, now, options.holdout_share, search.material, tables):
+    # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, and the fitted
+    # ones show the size.
+    agree = (was**2 - now**2) * _unseen_rows(refit) > AGREED
+    fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))
+    if not material_gap(was, now, options.holdout_share, search.material, tables) and not (
+        agree and not search.material and material_gap(*fitted, options.holdout_share, None, None)
+    ):
         return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
-    if not first and was - now < STEP * was:
+    if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
         return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
     return ""
+
+
+def _unseen_rows(refit: Refit) -> int:
+    """Rows of the data that judge: the held-out ones, or all of the fitted ones, each left out in turn."""
+    held = [e for e in refit.problem.experiments if e.role == "holdout" and e.outputs]
+    return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows
 
 
 def _tables(before: Refit, after: Refit) -> tuple[Mapping[str, float], Mapping[str, float]]:

@@ -28,7 +28,8 @@ def tones(nominal: Nominal) -> tuple[float, ...]:
             continue
         window = np.hanning(t.size)
         line = np.abs(np.fft.rfft((b.residual - b.residual.mean()) * window, 4 * t.size)) ** 2
-        spectra.append((np.fft.rfftfreq(4 * t.size, float(np.median(steps))), line / float(window @ window)))
+        axis = np.asarray(np.fft.rfftfreq(4 * t.size, float(np.median(steps))), dtype=float)
+        spectra.append((axis, line / float(window @ window)))
     if not spectra:
         return ()
     frequency = max((f for f, _ in spectra), key=len)

@@ -23,6 +23,9 @@ from hvdc_ident.trajectory import Array
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
 REFUTED_P = 0.01
+STRONG = 0.1
+"""Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
+that has no name: less is what a wrong idea of the noise makes."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +78,10 @@ def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned
     gap_there = material_gap(
         was, 1.0, options.holdout_share, search.material, (_largest(first), dict.fromkeys(search.material, 0.0))
     )
-    refused = [b for b in tests if b.p <= options.significance / max(len(tests), 1)]
-    if gap_there and (found.significant or refused):
+    refused = any(b.p <= options.significance and b.excess > STRONG * first.rows for b in tests)
+    fitted = float(np.sqrt(first.chi2 / first.rows)) > 1.0 + options.holdout_share
+    strong = found.significant and float(found.scores.t.max(initial=0.0)) > STRONG * first.rows
+    if (gap_there or (fitted and not search.material)) and (strong or refused):
         why = found.why or "the residuals are not noise"
         return Judgement(
             "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
