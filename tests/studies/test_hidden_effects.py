@@ -19,7 +19,7 @@ from tests.studies.study_module import STUDIES, load
 sys.path.insert(0, str(STUDIES / "hidden_effects"))
 
 from hidden import cases, judging, noise, sizes
-from hidden.diagnosing import experiments_of, free_of, model_of
+from hidden.diagnosing import diagnosed, experiments_of, free_of, model_of
 from hidden.operators import CATALOGUE
 from hidden.plants import DRIVE, STATION
 from hidden.simulator import Hidden, Run, Signal, simulate
@@ -240,3 +240,18 @@ def test_the_sparse_law_finds_a_law_that_is_there():
     found, terms = predicted(residuals, drivers, t)
     assert found is not None and terms <= 3
     assert np.abs(found - residuals[-1]).max() < 0.05 * np.abs(residuals[-1]).max()
+
+
+@pytest.mark.slow
+def test_a_large_effect_is_found_and_a_clean_record_is_left_alone(large):
+    line = diagnosed(large)
+    assert judging.outcome(line) in ("right", "covered"), line
+    held = line["held_out"]
+    assert held["augmented"] < 1.1 * held["oracle"] < 0.8 * held["refitted"]
+    clean = cases.made(replace(LARGE, part="clean", effects=(), size=0.0), 3)
+    assert clean is not None
+    quiet = diagnosed(clean)
+    assert quiet["verdict"] not in ("named", "ambiguous") and quiet["found"] == []
+    told = judging.summary([line, quiet])
+    assert told["clean"]["false_names"] == 0 and told["large"]["right_or_covered"] == 1.0
+    assert json.loads(json.dumps(told)) == told and "| lag |" in judging.report(told)

@@ -126,7 +126,7 @@ def _told(found: Any) -> dict[str, Any]:
     }
 
 
-def _misfit(model: Model, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
+def _misfit(model: Any, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
     """Root mean square of the held-out record's residuals in units of its true noise; None where the model cannot run."""
     held = experiments[2]
     assert held.measured is not None
