@@ -15,8 +15,8 @@ from hvdc_ident.trajectory import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(\.\d\d)\d+")  # hundredths of a point are not seen
-POINTS = 1200
+_LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(\.\d)\d+")  # tenths of a point are seen at most
+POINTS = 700
 MEASURED, BEFORE, AFTER, MARK = "#222222", "#d08020", "#1f5fa8", "#999999"
 
 
