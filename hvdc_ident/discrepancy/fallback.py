@@ -29,6 +29,8 @@ from hvdc_ident.trajectory import Array
 MOST = 3
 STABLE = 0.8
 AGAIN = 25
+CLOSE = 2.0
+"""What a term may leave, in noise units (of chi2 a row, and held out)."""
 PLACES = 6
 """Places, the best by regression, at which the form is tried by full simulation."""
 
@@ -163,6 +165,8 @@ def _inserted(
         and was - now > search.options.holdout_share
     ):
         return None
+    if refit.chi2 / refit.rows > CLOSE or now > CLOSE:
+        return None  # a formula is a claim: what it leaves has to be next to noise
     explained = first.chi2 - refit.chi2
     tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
     if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):

@@ -30,7 +30,7 @@ class Options:
     refits: int = 24
     most: int = 3
     holdout_share: float = 0.1
-    refuted: float = 0.03
+    refuted: float = 0.02
     starts: int = 2
     fallback: bool = True
     free_start: bool = False

@@ -53,6 +53,16 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             f"Something is missing; the best of the catalogue ({labels}) explains only {explained / excess:.0%} of the gap.",
             tests,
         )
+    was, now = unseen(first), unseen(last)
+    if was is not None and now is not None and was > 1.0 + options.holdout_share:
+        told = (was**2 - now**2) / (was**2 - 1.0)
+        if told < DOMINANT:
+            return Judgement(
+                "unnameable",
+                f"Something is missing; with {labels} the fitted records are explained but of the held-out gap only "
+                f"{max(told, 0.0):.0%}: the form is not the right one.",
+                tests,
+            )
     against = [b for b in tests if b.p <= REFUTED_P and b.excess > options.refuted * explained]
     if against:
         worst = max(against, key=lambda b: b.excess)
