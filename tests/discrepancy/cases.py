@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -106,7 +107,7 @@ def _solved(inputs: dict[str, InputSignal], lag: float, drag: Callable[[float], 
     jumps = sorted({float(b) for i in inputs.values() for b in i.breaks if 0 < b < TIME[-1]})
     edges = [0.0, *jumps, float(TIME[-1])]
     rows, s = np.zeros((TIME.size, 3)), start
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         inner = (a <= TIME) & (b >= TIME)
         ask = np.unique(np.concatenate([TIME[inner], [b - 1e-12]]))
         run = solve_ivp(slopes, (a, b - 1e-12), s, "Radau", t_eval=ask[ask <= b - 1e-12], rtol=1e-9, atol=1e-11)
