@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any
 
-from hvdc_ident.effects.base import Additions, Effect, EffectParameter, EffectUse, apply
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.effects.placing import EffectUse, apply
 from hvdc_ident.effects.probing import Probe, SlotSignal, alone, clearance, probes, resistances, sources
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
@@ -30,7 +31,7 @@ __all__ = [
     "sources",
 ]
 
-_NO_EFFECT = ("base", "probing")
+_NO_EFFECT = ("base", "placing", "probing")
 
 
 @cache

@@ -26,7 +26,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.effects.base import Effect, EffectParameter, EffectUse, Measure
+from hvdc_ident.effects.base import Effect, EffectParameter, Measure
+from hvdc_ident.effects.placing import EffectUse
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model, Output

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.effects.base import apply
+from hvdc_ident.effects.placing import apply
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.expression.functions import symbol

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.effects.base import EffectUse
+from hvdc_ident.effects.placing import EffectUse
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import digest

@@ -19,7 +19,8 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 from hidden.cases import PARTS, Design, designs, factorial, made  # noqa: E402
-from hidden.judging import report, summary  # noqa: E402
+from hidden.judging import summary  # noqa: E402
+from hidden.reporting import report  # noqa: E402
 
 SEED = 20
 """Of the reported cases. Thresholds were settled on others (--seed 1)."""

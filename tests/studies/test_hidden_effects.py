@@ -22,6 +22,7 @@ from hidden import cases, judging, noise, sizes
 from hidden.diagnosing import diagnosed, experiments_of, free_of, model_of
 from hidden.operators import CATALOGUE
 from hidden.plants import DRIVE, STATION
+from hidden.reporting import report
 from hidden.simulator import Hidden, Run, Signal, simulate
 
 STUDY = load("hidden_effects")
@@ -254,4 +255,4 @@ def test_a_large_effect_is_found_and_a_clean_record_is_left_alone(large):
     assert quiet["verdict"] not in ("named", "ambiguous") and quiet["found"] == []
     told = judging.summary([line, quiet])
     assert told["clean"]["false_names"] == 0 and told["large"]["right_or_covered"] == 1.0
-    assert json.loads(json.dumps(told)) == told and "| lag |" in judging.report(told)
+    assert json.loads(json.dumps(told)) == told and "| lag |" in report(told)
