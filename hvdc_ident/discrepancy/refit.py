@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -88,6 +88,31 @@ class Refit:
     def nominal(self) -> Nominal:
         """The refitted model as something to test further."""
         return Nominal(self.problem, self.theta, self.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a job found, without what it was given: small enough to be sent and kept. Fields as in `Refit`."""
+
+    theta: Array
+    chi2: float
+    rows: int
+    correlation: float
+    holdout: float | None
+    press: float | None
+    std: FrozenMap[float | None]
+    failure: str
+
+    def refit(self, job: Job) -> Refit:
+        """The refit of the job that found this."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Refit(job.model, job.placed, job.problem, job.noise, **own)
+
+
+def find(job: Job) -> Found:
+    """What `run` finds."""
+    refit = run(job)
+    return Found(**{f.name: getattr(refit, f.name) for f in fields(Found)})
 
 
 def added(

@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Job, Refit, added, run, unseen
+from hvdc_ident.discrepancy.refit import Job, Refit, added, find, unseen
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import (
     Pick,
@@ -190,10 +190,10 @@ def _trials(search: Search, before: Refit, found: Sequence[Candidate], picks: Se
         except HvdcIdentError as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
             trials.append(Trial(p, none, -np.inf))
-    outcomes = search.executor.map(run, jobs) if search.executor is not None else map(run, jobs)
-    for k, (p, refit) in enumerate(zip(of, outcomes, strict=True)):
+    outcomes = search.executor.map(find, jobs) if search.executor is not None else map(find, jobs)
+    for k, (p, job, outcome) in enumerate(zip(of, jobs, outcomes, strict=True)):
         search.tell(k + 1, len(jobs), f"{text}: {found[p.candidate].label}")
-        trials.append(Trial(p, refit, -np.inf))
+        trials.append(Trial(p, outcome.refit(job), -np.inf))
     return trials
 
 

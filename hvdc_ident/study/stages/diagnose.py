@@ -16,7 +16,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     from hvdc_ident.discrepancy import diagnose
     from hvdc_ident.discrepancy.sizes import size_curves
     from hvdc_ident.model.definition import Model
-    from hvdc_ident.study.at_work import workers_of
+    from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
     from hvdc_ident.study.schema import Diagnose
 
@@ -31,7 +31,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     if not report["identifiable"]:
         why = "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own"
         return Outcome({"status": "failed", "message": why}, failed=why)
-    with workers_of(options) as executor:
+    with executor_of(study, options, "diagnose") as executor:
         found = diagnose(
             study.model,
             study.experiments,
