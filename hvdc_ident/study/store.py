@@ -87,7 +87,6 @@ class Store:
         self._stack = contextlib.ExitStack()
         self._base: sqlite3.Connection | None = None
         self._last = self._put_at = 0.0
-        self._open = False
         self._folder = folder
 
     def __enter__(self) -> Store:
@@ -140,8 +139,9 @@ class Store:
         try:
             yield
         except sqlite3.DatabaseError as e:
+            self._undo()
             text = str(e)
-            if "disk is full" in text or "disk I/O" in text:
+            if "is full" in text or "disk I/O" in text:
                 hint = "free some space; what was kept is intact, and the same command goes on from there"
             elif "readonly" in text or "unable to open" in text:
                 hint = "a folder that can be written to, with --out DIR"
@@ -165,9 +165,8 @@ class Store:
     def _put(self, job: str, key: bytes, value: bytes) -> None:
         assert self._base is not None
         with self._clear():
-            if not self._open:
+            if not self._base.in_transaction:
                 self._base.execute("BEGIN IMMEDIATE")
-                self._open = True
             self._base.execute("INSERT OR REPLACE INTO kept VALUES (?, ?, ?)", (job, key, value))
             now = time.monotonic()
             if now - self._put_at > QUICK or now - self._last > EVERY:
@@ -175,10 +174,15 @@ class Store:
             self._put_at = now
 
     def _commit(self) -> None:
-        if self._open and self._base is not None:
+        if self._base is not None and self._base.in_transaction:
             self._base.execute("COMMIT")
-            self._open = False
         self._last = time.monotonic()
+
+    def _undo(self) -> None:
+        """Nothing is left open: after an error sqlite may have ended the transaction, or not."""
+        if self._base is not None and self._base.in_transaction:
+            with contextlib.suppress(sqlite3.DatabaseError):
+                self._base.execute("ROLLBACK")
 
 
 class Job:
