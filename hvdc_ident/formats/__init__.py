@@ -90,6 +90,16 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
 
     signals: names wanted, in that order; None for all of them.
     Raises WaveformError where the file cannot be used, UnknownNameError for a signal it does not have.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from hvdc_ident import read_waveforms
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "step.csv")
+    ...     _ = path.write_text("time,u [pu],y\\n0,1,0.4\\n0.1,1.5,0.4\\n")
+    ...     found = read_waveforms(path, ["y", "u"])
+    >>> found.names, found.unit("u"), found["u"].tolist()
+    (('y', 'u'), 'pu', [1.0, 1.5])
     """
     file = _usable_file(path)
     wanted = [signals] if isinstance(signals, str) else None if signals is None else list(signals)

@@ -45,6 +45,13 @@ def linearize(
     or the Jacobian "below" or "above" the limit. descriptor: keep the algebraic unknowns as states, with E.
 
     Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
+
+    >>> from hvdc_ident import linearize, load_model
+    >>> linear = linearize(load_model("vsc-hvdc-link"), inputs=["Vdcref1"], outputs=["Irorder1"])
+    >>> linear.A.shape, linear.D.shape
+    ((6, 6), (1, 1))
+    >>> [round(mode.frequency_hz, 2) for mode in linear.modes() if mode.frequency_hz > 0.1]
+    [4.87, 4.87]
     """
     at = find_operating_point(model) if point is None else point
     if not isinstance(model, Model):

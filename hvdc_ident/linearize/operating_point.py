@@ -112,6 +112,11 @@ def find_operating_point(
     All in the model's units; an input that is not named keeps the model's value.
 
     Raises UnknownNameError for a name the model lacks; SteadyStateError, with the worst equation, where there is none.
+
+    >>> from hvdc_ident import find_operating_point, load_model
+    >>> rest = find_operating_point(load_model("vsc-hvdc-link"), {"Pref2": 0.5})
+    >>> round(rest.outputs["P2"], 9), round(rest.outputs["Irorder1"], 3)
+    (0.5, -0.5)
     """
     if not isinstance(model, Model):
         from hvdc_ident.linearize.external import find_point

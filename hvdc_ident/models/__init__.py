@@ -77,6 +77,13 @@ def load_model(
     only FMUs you trust. interface: of an FMU that offers both (default: model exchange).
 
     Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
+
+    >>> from hvdc_ident import load_model
+    >>> link = load_model("vsc-hvdc-link")
+    >>> list(link.states)
+    ['Vdc1', 'Vdc2', 'xv', 'xp', 'xq1', 'xq2']
+    >>> link.parameters["KIVDC"].value, link.parameters["KIVDC"].unit
+    (734.7, 'pu/s')
     """
     text = str(source)
     if is_shipped(text):

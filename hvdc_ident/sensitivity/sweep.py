@@ -101,6 +101,11 @@ def sweep(
     are looked up and kept. A point that fails is a row with a reason and no number.
 
     Raises InputError for names, values, bounds or data that do not fit, ComputationError where the reference fails.
+
+    >>> from hvdc_ident import load_model, sweep
+    >>> found = sweep(load_model("vsc-hvdc-link"), [], {"KIVDC": [250.0, 750.0, 1500.0]}, want=["poles"])
+    >>> len(found), found.poles.shape
+    (3, (3, 6))
     """
     points = points_of(axes)
     base = FrozenMap(values or {})

@@ -58,6 +58,12 @@ def export(
     source: a study, a model (linearised at its steady state) or a linear model. linear: the linear model even where the
     ending is one of the nonlinear model's. fmu: version and kinds of an FMU. Raises StudyError for an ending that is not
     known, and where the model is not of the kind that the ending needs.
+
+    >>> import tempfile
+    >>> from hvdc_ident import export, load_model
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     export(load_model("vsc-hvdc-link"), f"{folder}/link.mat").name
+    'link.mat'
     """
     return write(source, path, linear, fmu).path
 

@@ -1,0 +1,23 @@
+"""The examples in the docstrings of the public verbs do what they show."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+
+import pytest
+
+WITH_EXAMPLES = (
+    "hvdc_ident.formats",
+    "hvdc_ident.linearize.jacobian",
+    "hvdc_ident.linearize.operating_point",
+    "hvdc_ident.models",
+    "hvdc_ident.sensitivity.sweep",
+    "hvdc_ident.study.export",
+)
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_examples(name: str) -> None:
+    found = doctest.testmod(importlib.import_module(name), raise_on_error=False)
+    assert found.attempted and not found.failed
