@@ -123,7 +123,7 @@ def added(
     Raises ModelError where the effect cannot be put there.
     """
     chosen = candidate.probes[probe]
-    values = _moved(candidate, chosen.values, chosen.free, factor)
+    values = moved(candidate, probe, factor)
     use = candidate.use(replace(chosen, values=FrozenMap(values)))
     before = set(model.parameters)
     larger = model.with_effects([use])
@@ -146,26 +146,25 @@ def _absent(candidate: Candidate, name: str, values: Mapping[str, float]) -> boo
     return q.optional and values[name] == q.neutral
 
 
-def _moved(
-    candidate: Candidate, values: Mapping[str, float], free: Mapping[str, tuple[float, float]], factor: float
-) -> dict[str, float]:
+def moved(candidate: Candidate, probe: int, factor: float) -> dict[str, float]:
     """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
-    entry, moved = effects()[candidate.effect], dict(values)
+    values, free = candidate.probes[probe].values, candidate.probes[probe].free
+    entry, found = effects()[candidate.effect], dict(values)
     size = float(np.clip(abs(factor), 0.2, 5.0)) if np.isfinite(factor) and factor else 1.0
-    if factor < 0 and "phase" in moved:
-        moved["phase"] += np.pi if moved["phase"] <= 0 else -np.pi
-    sign = -1.0 if factor < 0 and "phase" not in moved else 1.0
+    if factor < 0 and "phase" in found:
+        found["phase"] += np.pi if found["phase"] <= 0 else -np.pi
+    sign = -1.0 if factor < 0 and "phase" not in found else 1.0
     for n, q in entry.parameters.items():
         if q.neutral is None or n not in free or (q.optional and values[n] == q.neutral):
             continue
         neutral = values[q.neutral] if isinstance(q.neutral, str) else float(q.neutral)
         if np.isinf(neutral):
             continue
-        moved[n] = neutral + sign * size * (values[n] - neutral)
+        found[n] = neutral + sign * size * (values[n] - neutral)
     for n, (low, high) in free.items():
         margin = 1e-3 * (high - low) if low <= 0 else 0.0
-        moved[n] = float(np.clip(moved[n], low + margin if margin else low * 1.001, high - 1e-3 * (high - low)))
-    return moved
+        found[n] = float(np.clip(found[n], low + margin if margin else low * 1.001, high - 1e-3 * (high - low)))
+    return found
 
 
 def run(job: Job) -> Refit:

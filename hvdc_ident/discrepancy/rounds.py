@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Job, Refit, added, find, unseen
+from hvdc_ident.discrepancy.refit import Job, Refit, added, find, moved, unseen
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import (
     Pick,
@@ -203,7 +203,8 @@ def _job(before: Refit, candidate: Candidate, pick: Pick) -> Job:
     own = np.concatenate([before.theta[:k], start, before.theta[k:]])
     begins = [own]
     if abs(pick.factor) < 0.5 or abs(pick.factor) > 2.0:
-        plain = added(before.model, before.problem, candidate, pick.probe, np.sign(pick.factor) or 1.0)[3]
+        at = moved(candidate, pick.probe, float(np.sign(pick.factor)) or 1.0)
+        plain = np.array([at[n] for n in placed.bounds])
         begins.append(np.concatenate([before.theta[:k], plain, before.theta[k:]]))
     return Job(model, (*before.placed, placed), problem, tuple(begins), before.noise)
 

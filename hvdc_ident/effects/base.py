@@ -102,6 +102,16 @@ class Additions:
         self.model = replace(self.model, signals=self.model.signals | {name: Signal(value)})
         return symbol(name)
 
+    def signals(
+        self, labels: Sequence[str], values: Callable[[tuple[sp.Symbol, ...]], Sequence[sp.Expr]]
+    ) -> tuple[sp.Symbol, ...]:
+        """The symbols of new named signals that use each other; `values` gets them all. One model is made, not one a signal."""
+        names = [fresh(self.model, f"{self._prefix}_{label}") for label in labels]
+        symbols = tuple(symbol(n) for n in names)
+        added = {n: Signal(v) for n, v in zip(names, values(symbols), strict=True)}
+        self.model = replace(self.model, signals=self.model.signals | added)
+        return symbols
+
     def delay(self, of: sp.Expr, time: sp.Expr) -> sp.Symbol:
         """The symbol of u(t - time)."""
         name = fresh(self.model, f"{self._prefix}_delayed")

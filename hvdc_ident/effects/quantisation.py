@@ -41,14 +41,19 @@ def _floor(x: sp.Expr, add: Additions) -> sp.Expr:
     Found by folding, as a Gray-code converter does it: |x|, less half of the range, its magnitude, and so on. One switch
     a bit finds any of 2^BITS levels, and at each border exactly one of them turns, with nothing else jumping for a moment.
     """
-    folds = [x]
-    for bit in range(BITS - 2, -1, -1):
-        folds.append(add.signal(f"fold{bit}", sp.Abs(folds[-1]) - 2**bit))
-    level: sp.Expr = sp.Float(0.5)
-    for bit, fold in enumerate(reversed(folds)):
-        half = 2 ** (bit - 1) if bit else 0
-        level = add.signal(f"level{bit}", where(fold >= 0, 1, -1) * (level + half))
-    return level - sp.Float(0.5)
+    bits = range(BITS - 2, -1, -1)
+
+    def values(own: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+        folds = (x, *own[: BITS - 1])
+        levels = (sp.Float(0.5), *own[BITS - 1 :])
+        found = [sp.Abs(fold) - 2**bit for fold, bit in zip(folds, bits, strict=False)]
+        for bit, fold in enumerate(reversed(folds)):
+            half = 2 ** (bit - 1) if bit else 0
+            found.append(where(fold >= 0, 1, -1) * (levels[bit] + half))
+        return found
+
+    labels = [*(f"fold{bit}" for bit in bits), *(f"level{bit}" for bit in range(BITS))]
+    return add.signals(labels, values)[-1] - sp.Float(0.5)
 
 
 EFFECT = Effect(
