@@ -84,7 +84,10 @@ def candidates(
                 continue
             if effect.name == "droop" and doubled:
                 continue  # without its deadband a droop is a negative coupling, which is tried
-            found += _at(model, effect, at, joined, still, about, brought)
+            usable = brought
+            if effect.name == "conductance":  # of the slot's own signal it is a gain, which is tried
+                usable = tuple(b for b in brought if not _proportional(signals[at[0]], signals[b]))
+            found += _at(model, effect, at, joined, still, about, usable)
     return tuple(found)
 
 
@@ -116,6 +119,13 @@ def _at(
         for s in brought
         if s in open_to and s != at[0] and not (still and about[s].high == about[s].low)
     ]
+
+
+def _proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
+    """Whether one signal is the other times a number, in all experiments."""
+    u, v = np.concatenate(a), np.concatenate(b)
+    across = u * float(np.linalg.norm(v)) - float(np.sign(u @ v)) * v * float(np.linalg.norm(u))
+    return bool(np.linalg.norm(across) <= STILL * max(float(np.linalg.norm(u) * np.linalg.norm(v)), STILL))
 
 
 def _additive(effect: Effect) -> bool:

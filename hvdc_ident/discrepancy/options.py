@@ -18,7 +18,7 @@ class Options:
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
     refuted: share of what an effect explains that may be left, in structure, in the region it was put there for.
     starts: runs of the nominal multistart. fallback: whether a form outside the catalogue is looked for.
-    declared nuisances are estimated with the parameters; free_start: the start state is a nuisance too.
+    Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.
     """
 
     significance: float = 0.01
@@ -33,7 +33,6 @@ class Options:
     refuted: float = 0.02
     starts: int = 2
     fallback: bool = True
-    free_start: bool = False
 
     def __post_init__(self) -> None:
         if not (0 < self.significance < 1 and self.bootstraps * self.significance >= 1):
