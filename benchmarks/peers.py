@@ -135,12 +135,12 @@ def sundae_way(rtol: float = RTOL) -> Callable[..., np.ndarray]:
     return solve
 
 
-def ways() -> Iterator[tuple[str, Callable[..., np.ndarray]]]:
+def ways(rtol: float = RTOL) -> Iterator[tuple[str, Callable[..., np.ndarray]]]:
     """The integrators that are installed, by name."""
     for method in ("LSODA", "BDF", "Radau", "DOP853"):
-        yield f"scipy {method}", scipy_way(method)
+        yield f"scipy {method}", scipy_way(method, rtol)
     try:
-        yield "scikit-sundae CVODE", sundae_way()
+        yield "scikit-sundae CVODE", sundae_way(rtol)
     except ImportError:
         print("scikit-sundae is not installed")
 
@@ -164,18 +164,26 @@ def simulation() -> Iterator[Line]:
 
 
 def derivatives() -> Iterator[Line]:
-    """The same run with its derivatives by 8 gains: exact here, differences there (9 runs)."""
+    """The same run with its derivatives by 8 gains: exact here, differences of 9 tighter runs there."""
     plant, case = Plant(), experiment("step", TIME, {"Vdcref1": InputSignal.step(*STEP)})
     states, base = tuple(plant.names), plant.model.values
 
     def own(rtol: float = RTOL) -> np.ndarray:
         tolerance = Tolerance(rtol, rtol / 100)
-        return simulate(plant.model, case, outputs=states, sensitivities=link_bench.GAINS, tolerance=tolerance).gradients
+        return simulate(
+            plant.model, case, outputs=states, sensitivities=link_bench.GAINS, tolerance=tolerance
+        ).gradients
 
     exact = own(1e-11)
     scale = np.abs(exact).max(axis=(0, 1))
-    mine, off = link_bench.best(own, 15), (np.abs(own() - exact).max(axis=(0, 1)) / scale).max()
-    for name, way in ways():
+    seen = scale > 1e-9  # the gains of a power control that this step does not reach change nothing
+
+    def worst(found: np.ndarray) -> float:
+        """The largest error, relative to the largest derivative by that gain."""
+        return float((np.abs(found - exact).max(axis=(0, 1))[seen] / scale[seen]).max())
+
+    mine, off = link_bench.best(own, 15), worst(own())
+    for name, way in ways(RTOL / 100):  # coarser runs have no differences worth the name
         if name in ("scipy BDF", "scipy DOP853"):  # ten seconds, or too coarse to take differences of
             continue
 
@@ -186,7 +194,7 @@ def derivatives() -> Iterator[Line]:
                 columns.append((plant.run({g: base[g] + h}, way) - middle) / h)
             return np.stack(columns, axis=-1)
 
-        error = (np.abs(differences() - exact).max(axis=(0, 1)) / scale).max()
+        error = worst(differences())
         assert error < 0.5, f"{name} found other derivatives: {error}"
         theirs = link_bench.best(differences, 2, 0)
         yield Line("8 sensitivities", f"{name}, differences", mine, theirs, f"error {off:.0e} here, {error:.0e} there")
@@ -305,10 +313,11 @@ def by_fmpy(
     try:
         path = export_fmu(plant.model, folder / "link.fmu", version="2.0", kinds=("co-simulation",)).path
         unpacked, description = fmpy.extract(str(path)), fmpy.read_model_description(str(path))
-        signal = np.array(
-            [(0.0, STEP[1]), (STEP[0], STEP[1]), (STEP[0], STEP[2]), (TIME[-1], STEP[2])],
-            dtype=[("time", float), ("Vdcref1", float)],
-        )
+        signal = np.zeros(4, dtype=[("time", float), *((n, float) for n in plant.model.inputs)])
+        for n, i in plant.model.inputs.items():
+            signal[n] = i.value
+        signal["time"] = (0.0, STEP[0], STEP[0], TIME[-1])
+        signal["Vdcref1"] = (STEP[1], STEP[1], STEP[2], STEP[2])
         count = [0]
 
         def residual(theta: np.ndarray) -> np.ndarray:
