@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.errors import InputError
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.frequency import frequency_response
 from hvdc_ident.model.external import AnyModel
@@ -74,22 +74,43 @@ def _pairs(values: Array) -> list[list[float]]:
 def recorded(e: Experiment, name: str, output: str, noise: float) -> tuple[Array, Array]:
     """(n,) rad/s and (n,) complex: what the record shows, where the input's own spectrum stands clear of the noise.
 
-    Both records are differentiated first, so that a step between two levels has a finite spectrum.
+    Of both the derivative is transformed, so that a step between two levels has a finite spectrum: of the input, whose
+    course between the rows is known, exactly; of the output, known at its rows alone, as if it held nothing beyond half
+    their rate. Differences of both at the rows would show a delay of up to a row that is not there.
     """
     assert e.measured is not None
     keep = e.compared & np.isfinite(e.measured[output])
     t, y = e.time[keep], e.measured[output][keep]
     even = np.linspace(t[0], t[-1], t.size)
-    u, y = np.asarray(e.inputs[name](even)), np.interp(even, t, y)
     step = float(even[1] - even[0])
-    frequency = np.fft.rfftfreq(u.size - 1, step)
-    du, dy = np.fft.rfft(np.diff(u)), np.fft.rfft(np.diff(y))
-    inner = np.flatnonzero((frequency > 0) & (frequency < 0.4 / step) & (np.abs(du) > 0.02 * np.abs(du).max()))
+    omega = 2 * np.pi * np.fft.rfftfreq(t.size - 1, step)
+    du = derivative_spectrum(e.inputs[name], float(t[0]), float(t[-1]), omega)
+    inner = np.flatnonzero((omega > 0) & (omega < 0.8 * np.pi / step) & (np.abs(du) > 0.02 * np.abs(du).max()))
     if not inner.size:
         return np.empty(0), np.empty(0, dtype=complex)
     picked = np.unique(inner[np.unique(np.round(np.geomspace(1, inner.size, POINTS)).astype(int) - 1)])
-    h = dy[picked] / du[picked]
-    # The noise of a difference grows with frequency: what it drowns is left out.
-    floor = noise * np.sqrt(2.0 * u.size) * 2.0 * np.sin(np.pi * frequency[picked] * step) / np.abs(du[picked])
-    clear = np.abs(h) > floor
-    return 2 * np.pi * frequency[picked][clear], h[clear]
+    omega, du = omega[picked], du[picked]
+    middles = 0.5 * (even[1:] + even[:-1])
+    half = 0.5 * omega * step
+    dy = np.exp(-1j * np.outer(omega, middles)) @ np.diff(np.interp(even, t, y)) * (half / np.sin(half))
+    h = dy / du
+    # The noise of a derivative grows with frequency: what it drowns is left out.
+    clear = np.abs(h) > noise * np.sqrt(2.0 * t.size) * omega * step / np.abs(du)
+    return omega[clear], h[clear]
+
+
+def derivative_spectrum(signal: InputSignal, start: float, end: float, omega: Array) -> Array:
+    """(n,) complex: the Fourier integral of a signal's derivative from start to end, exact; omega: (n,) rad/s.
+
+    A jump counts with its height at its instant, a line with its slope between its ends.
+    """
+    inside = (signal.times > start) & (signal.times < end)
+    first, last = float(signal(np.nextafter(start, -np.inf))), float(signal(np.nextafter(end, -np.inf)))
+    at_start = float(signal(start))
+    times = np.concatenate([[start, start], signal.times[inside], [end]])
+    values = np.concatenate([[first, at_start], signal.values[inside], [last]])
+    t0, t1, rise = times[:-1], times[1:], np.diff(values)
+    # A line's integral is that of a jump in its middle, spread out: sinc, which is 1 for a jump.
+    spread = np.sinc(np.outer(omega, t1 - t0) / (2 * np.pi))
+    found = (np.exp(-0.5j * np.outer(omega, t0 + t1)) * spread) @ rise
+    return np.asarray(found)

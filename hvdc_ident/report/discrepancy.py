@@ -10,9 +10,12 @@ import numpy as np
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CHANNELS = 6
+ACROSS = 3
+"""Channels beside each other: more would be too small to read."""
 
 
 def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -36,29 +39,42 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
-    """Gain and phase over frequency, one column a channel: what the record shows, the nominal and the augmented model."""
+    """Gain above phase over frequency for each channel, three beside each other: the record, the nominal and the augmented model."""
     shown = [c for c in channels if c.get("omega")][:CHANNELS]
-    fig = figure(3.2 * max(len(shown), 1), 4.6)
-    grid = fig.subplots(2, max(len(shown), 1), sharex="col", squeeze=False)
-    looks = (("data", MEASURED, "record"), ("nominal", BEFORE, "refitted"), ("augmented", AFTER, "with effect"))
-    for column, c in enumerate(shown):
-        f = np.array(c["omega"]) / (2 * np.pi)
-        for key, colour, label in looks:
-            if not c.get(key):
-                continue
-            h = np.array(c[key])[:, 0] + 1j * np.array(c[key])[:, 1]
-            style: dict[str, Any] = (
-                {"linestyle": "none", "marker": ".", "markersize": 4} if key == "data" else {"linewidth": 1.3}
-            )
-            keep = np.abs(h) > 0
-            grid[0, column].semilogx(f[keep], 20 * np.log10(np.abs(h[keep])), color=colour, label=label, **style)
-            grid[1, column].semilogx(f[keep], np.degrees(np.unwrap(np.angle(h[keep]))), color=colour, **style)
-        grid[0, column].set_title(f"{c['input']} to {c['output']}", fontsize="small")
-        grid[1, column].set_xlabel("frequency, Hz")
+    wide, bands = min(max(len(shown), 1), ACROSS), max(-(-len(shown) // ACROSS), 1)
+    fig = figure(3.2 * wide, 4.6 * bands)
+    grid = fig.subplots(2 * bands, wide, squeeze=False)
+    for k, c in enumerate(shown):
+        above, below = grid[2 * (k // ACROSS), k % ACROSS], grid[2 * (k // ACROSS) + 1, k % ACROSS]
+        below.sharex(above)
+        _channel(above, below, c)
+        if k % ACROSS == 0:
+            above.set_ylabel("gain, dB")
+            below.set_ylabel("phase, degrees")
+    for k in range(len(shown), wide * bands):
         for row in (0, 1):
-            grid[row, column].grid(True, color=MARK, alpha=0.3)
+            grid[2 * (k // wide) + row, k % wide].set_axis_off()
     if shown:
-        grid[0, 0].set_ylabel("gain, dB")
-        grid[1, 0].set_ylabel("phase, degrees")
         grid[0, 0].legend(fontsize="small")
     return fig
+
+
+def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
+    """Nothing; draws one channel's gain and phase."""
+    looks = (("data", MEASURED, "record"), ("nominal", BEFORE, "refitted"), ("augmented", AFTER, "with effect"))
+    f = np.array(c["omega"]) / (2 * np.pi)
+    for key, colour, label in looks:
+        if not c.get(key):
+            continue
+        h = np.array(c[key])[:, 0] + 1j * np.array(c[key])[:, 1]
+        style: dict[str, Any] = (
+            {"linestyle": "none", "marker": ".", "markersize": 4} if key == "data" else {"linewidth": 1.3}
+        )
+        keep = np.abs(h) > 0
+        above.semilogx(f[keep], 20 * np.log10(np.abs(h[keep])), color=colour, label=label, **style)
+        below.semilogx(f[keep], np.degrees(np.unwrap(np.angle(h[keep]))), color=colour, **style)
+    above.set_title(f"{c['input']} to {c['output']}", fontsize="small")
+    above.tick_params(labelbottom=False)
+    below.set_xlabel("frequency, Hz")
+    for axes in (above, below):
+        axes.grid(True, color=MARK, alpha=0.3)
