@@ -92,6 +92,24 @@ def combinations_of(
     return tuple(found)
 
 
+def held_of(null: Array) -> frozenset[int]:
+    """The parameters to hold so that the others can be told: one for each direction, the last listed that will do.
+
+    null: (k, p) independent directions. Any set of columns in which they stay independent would do; the equations' route
+    keeps the earlier listed, and how strongly each is seen must not make the two routes differ.
+    """
+    left, held = null.copy(), set()
+    for i in reversed(range(null.shape[1])):
+        if not left.shape[0]:
+            break
+        left = left / np.abs(left[:, : i + 1]).max(axis=1, keepdims=True)
+        row = int(np.argmax(np.abs(left[:, i])))
+        if abs(left[row, i]) > SMALL:
+            held.add(i)
+            left = np.delete(left - np.outer(left[:, i] / left[row, i], left[row]), row, axis=0)
+    return frozenset(held)
+
+
 def partners(combinations: Sequence[Combination], held: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """For each member that is not held, the held ones of its combinations."""
     found: dict[str, tuple[str, ...]] = {}

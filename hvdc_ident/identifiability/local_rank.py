@@ -14,8 +14,8 @@ import numpy as np
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import sensitivity_error
-from hvdc_ident.identifiability.combinations import Combination, combinations_of
-from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR, independent, null_directions
+from hvdc_ident.identifiability.combinations import Combination, combinations_of, held_of
+from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR, null_directions
 from hvdc_ident.trajectory import Array
 
 METHOD = "numerical, local"
@@ -61,11 +61,8 @@ def local_rank(problem: Problem, seed: int = 0) -> LocalRank:
         return LocalRank(len(stacked), names, note=note)
     logs = [f.min > 0 for f in problem.free]
     combos = combinations_of(null, names, logs, [f.start for f in problem.free], "structural")
-    involved = [i for i, n in enumerate(names) if any(n in c.members for c in combos)]
-    scaled = _together(stacked)[:, : len(names)]
-    matrix = scaled.T @ scaled
-    kept = {involved[i] for i in independent(matrix[np.ix_(involved, involved)], error)}
-    told = tuple(n for i, n in enumerate(names) if i in kept or i not in involved)
+    held = held_of(null)
+    told = tuple(n for i, n in enumerate(names) if i not in held)
     return LocalRank(len(stacked), told, combos, note)
 
 

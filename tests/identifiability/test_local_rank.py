@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 import pytest
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.identifiability import identifiability
+from hvdc_ident.identifiability.combinations import held_of
 from hvdc_ident.identifiability.local_rank import local_rank
 from hvdc_ident.identifiability.structure import numerical_structure, structure
 from hvdc_ident.model.definition import Delay, Model, Sampled
@@ -82,9 +84,42 @@ def test_numbers_and_equations_agree() -> None:
     problem = problem_on(model, ["y"])
     by_equations, by_numbers = structure(model, problem), numerical_structure(problem)
     assert by_equations.method == "prime field" and not by_equations.local
-    assert len(by_equations.admissible) == len(by_numbers.admissible) == 3
+    assert by_equations.admissible == by_numbers.admissible and len(by_numbers.admissible) == 3
     assert {c.members for c in by_equations.combinations} == {c.members for c in by_numbers.combinations}
     assert set(by_numbers.combinations[0].seen) == {"b*kp", "b*ki"}
+
+
+SPRING = Model(
+    name="spring",
+    parameters={"k": 8.0, "m": 2.0, "d": 0.5},
+    inputs={"u": 0.0},
+    states={"x": "v", "v": "(k*u - d*v - k*x)/m"},
+    outputs={"y": "x"},
+)
+PUSH = InputSignal.corners([(0, 0.0), (1, 0.0), (1, 1.0), (4, 1.0), (4, -0.5)])
+
+
+@pytest.mark.parametrize("order", [*permutations("kmd")], ids="".join)
+def test_both_routes_hold_the_last_listed_that_will_do(order) -> None:
+    """k, m and d are seen in two ratios: any one will do to hold, however much more strongly another is seen."""
+    data = on_model(SPRING, "e", {"u": PUSH}, ["y"], 1e-3, rows=121)
+    free = tuple(Free(n, SPRING.values[n], SPRING.values[n] / 3, SPRING.values[n] * 3) for n in order)
+    problem = Problem(ModelSimulator(SPRING), (data,), free)
+    by_equations, by_numbers = structure(SPRING, problem), numerical_structure(problem)
+    assert by_equations.method == "prime field" and by_numbers.method == "numerical, local"
+    assert by_equations.admissible == by_numbers.admissible == order[:2]
+
+
+def test_of_several_directions_each_takes_the_last_listed_that_leaves_the_others_one() -> None:
+    """a*b and c*d seen, e and f apart: b and d are held; two that share a and b do not take both of theirs."""
+    null = np.array([[1.0, -1, 0, 0, 0, 0], [0, 0, 1, -1, 0, 0]])
+    assert held_of(null) == {1, 3}
+    assert held_of(np.array([[1, 1, -1, -1, 0, 0], [1, -1, 0, 0, 0, 0.0]])) == {1, 3}
+    assert held_of(np.array([[1.0, -1.0, 1.0]])) == {2} and held_of(np.array([[0.0, 1e-5, 0.0], [1, 0, 1e-7]])) == {
+        0,
+        1,
+    }
+    assert held_of(np.zeros((0, 3))) == frozenset()
 
 
 @dataclass
