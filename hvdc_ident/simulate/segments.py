@@ -49,8 +49,7 @@ def begin_segment(r):  # type: ignore[no-untyped-def]
         consistent(r, False)
     r.echo_now = r.published = 0
     if r.nq and not final:
-        _sample(r)
-        if not _publish(r):
+        if not _sample(r) or not _publish(r):
             return False
         r.tb = next_stop(r)
     if r.nd and (r.first or r.published or r.disturbed):
@@ -65,7 +64,11 @@ def begin_segment(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _sample(r):  # type: ignore[no-untyped-def]
-    """Takes the samples that are due: value and rows, at the instant's own dependence on the parameters."""
+    """Takes the samples that are due: value and rows, at the instant's own dependence on the parameters.
+
+    A sample whose compute time is the whole period is published first, but all are taken from the signals before that.
+    False: the unknowns have no solution with what is published.
+    """
     nd, nq, width = r.nd, r.nq, r.width
     tick, publish, ticks = vector(r.tick, nq), vector(r.publish, nq), vector(r.ticks, nq)
     constants = vector(r.constants, (nd + 2 * nq) * (1 + width))
@@ -73,12 +76,21 @@ def _sample(r):  # type: ignore[no-untyped-def]
     pending = vector(r.pending, nq)
     pending_p, publish_p = vector(r.pending_p, nq * width), vector(r.publish_p, nq * width)
     row0 = nd + 2 * nq
+    due, whole = False, False
+    for i in range(nq):
+        if tick[i] == r.t:
+            due = True
+            whole = whole or publish[i] == r.t
+    if not due:
+        return True
+    evaluate(r, r.do_sources, r.y, r.src)
+    rates(r)
+    evaluate(r, r.do_srcd, r.y, r.src_rate)
+    if whole and not _publish(r):
+        return False
     for i in range(nq):
         if tick[i] != r.t:
             continue
-        evaluate(r, r.do_sources, r.y, r.src)
-        rates(r)
-        evaluate(r, r.do_srcd, r.y, r.src_rate)
         pending[i] = src[nd + i]
         for c in range(width):
             own = ticks[i] * constants[row0 + (nd + i) * width + c]
@@ -87,6 +99,9 @@ def _sample(r):  # type: ignore[no-untyped-def]
         publish[i] = r.t + constants[nd + nq + i]
         ticks[i] += 1.0
         tick[i] = r.start + ticks[i] * constants[nd + i]
+        if abs(publish[i] - tick[i]) <= 1e-13 * max(1.0, abs(r.t)):
+            publish[i] = tick[i]  # one instant, so that rounding does not decide which comes first
+    return True
 
 
 @kernel()

@@ -33,6 +33,7 @@ VECTORS = (
     "yd", "w", "wd", "p", "m",  # arguments of the generated functions
     "jac", "matrix", "small", "hessian", "factor", "shift", "pivots", "small_pivots",  # linear algebra
     "floors", "totals", "scale",  # error weights and sums of each parameter
+    "z_before", "z_from", "z_step", "side",  # unknowns before a solve, a step of it, the modes where that begins
     "sv", "top", "slack", "sws",  # switches: values, largest so far, tolerance, rows
     "src", "src_rate", "src_left",  # sources of delays and samples; the delays' before the present segment
     "lag", "lag_p", "before",  # delays, their rows, the delayed signals before the start
@@ -103,6 +104,7 @@ def arrange(r):  # type: ignore[no-untyped-def]
     r.hessian, r.factor, r.shift = _take(r, r.hessians * r.width), _take(r, r.factors + 1), _take(r, 1)
     r.pivots, r.small_pivots = _take(r, r.n), _take(r, r.nz)
     r.floors, r.totals = _take(r, r.width), _take(r, r.width)
+    r.z_before, r.z_from, r.z_step, r.side = _take(r, r.nz), _take(r, r.nz), _take(r, r.nz), _take(r, r.ns)
     r.sv, r.top, r.slack, r.sws = _take(r, r.ns), _take(r, r.ns), _take(r, r.ns), _take(r, r.ns * rows)
     r.src, r.src_rate = _take(r, (r.nd + r.nq) * rows), _take(r, r.nd + r.nq)
     r.src_left = _take(r, r.nd + r.nq)

@@ -6,6 +6,6 @@ HINTS = {
     "step-limit": "raise max_steps, loosen rtol, or look for a very fast part of the model",
     "not-finite": "a value grew without bound or left a function's domain: check parameter values and limits",
     "chatter": "a limit switches on and off without end: add a hysteresis or a small lag where it acts",
-    "inconsistent": "the algebraic loop has no solution there: check the operating point, or give the unknown another start",
+    "inconsistent": "no solution of the algebraic loop was found there: check the operating point, or give the unknown another start",
     "stiff": "use the Rosenbrock method",
 }

@@ -1,8 +1,9 @@
-"""The slow way to a steady state, for models on which Newton's method alone fails: pseudo-transient, then least squares."""
+"""The slow way to a steady state, for models on which Newton's method alone fails: least squares, else pseudo-transient."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from hvdc_ident.trajectory import Array
 
 Equations = Callable[[Array], tuple[Array, Array]]
 ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
+CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
 
 
 def fallback(
@@ -36,21 +38,17 @@ def fallback(
         evaluate(address[REST_JAC], y, w, p, m, jac)
         return r, jac.reshape(n, n)
 
-    v = np.concatenate([guess, np.zeros(extra)])
+    near = _Region.of(structure, guess, extra)
+    begin = np.concatenate([guess, np.zeros(extra)])
     with np.errstate(all="ignore"):
-        v = _pseudo_transient(equations, v, s.nx)
-        v = _least_squares(equations, v)
+        # The rest next to the guess comes first; where there are several, following the model may end at a far one.
+        v = _least_squares(equations, begin, near)
+        if not near.is_rest(*equations(v), v):
+            v = _pseudo_transient(equations, begin, near, s.nx)
+            v = _least_squares(equations, v, near)
         r, jac = equations(v)
-        shares = np.abs(r) / _weights(jac, v)
-    if not (shares < ACCURACY).all():
-        worst = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
-        raise SteadyStateError(
-            "no steady state was found",
-            where=f"model '{structure.model.name}'",
-            expected="every derivative 0",
-            got=f"{_equation(structure, worst)} left with {r[worst]:.3g} (scaled {shares[worst]:.2g})",
-            hint="check the input levels and limits, give states a `guess` near the solution, or a `start`",
-        )
+        if not near.is_rest(r, jac, v):
+            raise _refused(structure, near, r, jac, v)
     if s.width:
         rows = np.zeros(n * s.width)
         evaluate(address[REST_P], y, w, p, m, rows)
@@ -59,12 +57,65 @@ def fallback(
     return y, w
 
 
-def _weights(jac: Array, v: Array) -> Array:
-    size = np.abs(jac) @ np.maximum(np.abs(v), 1e-3) if v.size else np.ones(0)
+@dataclass(frozen=True)
+class _Region:
+    """Where a rest is looked for: the sizes of states, unknowns and held values as far as the model's guesses tell them.
+
+    size: what is usual; a residual is judged against it, so that a value that grows without bound, as a dc voltage whose
+    power balance P / Vdc goes to 0, cannot make its own residual small. limit: what is out of question (infinite: not known).
+    """
+
+    size: Array
+    limit: Array
+
+    @classmethod
+    def of(cls, structure: Structure, guess: Array, extra: int) -> _Region:
+        given = [s.guess for s in structure.model.states.values()]
+        sizes = [1 / CLOSE if g is None else max(abs(g), 1.0) for g in given]
+        limits = [abs(g) / CLOSE if g else np.inf for g in given]
+        rest = np.maximum(np.abs(guess[len(given) :]), 1.0)
+        unknown = np.full(rest.size + extra, np.inf)
+        return cls(np.concatenate([sizes, rest, np.full(extra, 1 / CLOSE)]), np.concatenate([limits, unknown]))
+
+    def weights(self, jac: Array, v: Array) -> Array:
+        """What each equation's residual is measured by."""
+        return _positive(np.abs(jac) @ np.clip(np.abs(v), 1e-3, self.size))
+
+    def shares(self, r: Array, jac: Array, v: Array) -> Array:
+        """The scaled residuals, less what rounding alone leaves."""
+        rounding = 16 * np.finfo(float).eps * (np.abs(jac) @ np.abs(v))
+        return np.asarray(np.where(np.abs(r) <= rounding, 0.0, np.abs(r) / self.weights(jac, v)))
+
+    def is_rest(self, r: Array, jac: Array, v: Array) -> bool:
+        """Whether v solves the equations, within the limits."""
+        return bool((self.shares(r, jac, v) < ACCURACY).all() and (np.abs(v) <= self.limit).all())
+
+
+def _positive(size: Array) -> Array:
     return np.where(size > 0, size, 1.0)
 
 
-def _pseudo_transient(equations: Equations, v: Array, nx: int) -> Array:
+def _refused(structure: Structure, near: _Region, r: Array, jac: Array, v: Array) -> SteadyStateError:
+    """The error that names the state that runs away, or else the worst equation."""
+    shares = near.shares(r, jac, v)
+    worst = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
+    got = f"{_equation(structure, worst)} left with {r[worst]:.3g} (scaled {shares[worst]:.2g})"
+    far = np.abs(v) / near.limit
+    away = int(np.argmax(np.where(np.isfinite(far), far, np.inf))) if v.size else 0
+    if v.size and not far[away] <= 10 * CLOSE:
+        name = structure.states[away]
+        guess = structure.model.states[name].guess
+        got = f"state '{name}' runs away to {v[away]:.4g} from its guess {guess:g}; {got}"
+    return SteadyStateError(
+        "no steady state was found",
+        where=f"model '{structure.model.name}'",
+        expected="every derivative 0, at states near their guesses",
+        got=got,
+        hint="check the input levels and limits, give states a `guess` near the solution, or a `start`",
+    )
+
+
+def _pseudo_transient(equations: Equations, v: Array, near: _Region, nx: int) -> Array:
     """Implicit Euler steps whose length grows as the residual falls: follows the model to its rest."""
     mass = np.zeros(v.size)
     mass[:nx] = 1.0
@@ -77,8 +128,8 @@ def _pseudo_transient(equations: Equations, v: Array, nx: int) -> Array:
             h *= 0.3
             continue
         r_new, jac_new = equations(v + step)
-        before = float(np.linalg.norm(r / _weights(jac, v)))
-        after = float(np.linalg.norm(r_new / _weights(jac_new, v + step)))
+        before = float(np.linalg.norm(r / near.weights(jac, v)))
+        after = float(np.linalg.norm(r_new / near.weights(jac_new, v + step)))
         if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
             v, r, jac = v + step, r_new, jac_new
             h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
@@ -91,13 +142,13 @@ def _pseudo_transient(equations: Equations, v: Array, nx: int) -> Array:
     return v
 
 
-def _least_squares(equations: Equations, v: Array) -> Array:
+def _least_squares(equations: Equations, v: Array, near: _Region) -> Array:
     """Newton steps of least norm, for a Jacobian that is singular where a state does not matter."""
     for _ in range(50):
         r, jac = equations(v)
         if not (np.isfinite(r).all() and np.isfinite(jac).all()):
             return v
-        weight = _weights(jac, v)
+        weight = near.weights(jac, v)
         step = np.linalg.lstsq(jac / weight[:, None], -r / weight, rcond=1e-12)[0]
         before, damping = float(np.linalg.norm(r / weight)), 1.0
         while damping > 1e-4:

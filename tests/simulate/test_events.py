@@ -89,12 +89,13 @@ def test_a_delayed_step_moves_with_the_delay(method):
     np.testing.assert_allclose(result.gradient("x")[:, 0], np.where(s > 0, -np.exp(-np.abs(s)), 0), atol=1e-8)
 
 
+@pytest.mark.parametrize("compute", [0.03, 0.1])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_sampled_ramp_is_a_staircase(method):
-    """q holds u = t of the last sample, published c later: x' = q."""
+def test_a_sampled_ramp_is_a_staircase(method, compute):
+    """q holds u = t of the last sample, published c later, be it the whole period: x' = q."""
     model = Model(
         "held",
-        parameters={"Ts": 0.1, "c": 0.03},
+        parameters={"Ts": 0.1, "c": compute},
         inputs={"u": 0.0},
         states={"x": State("q", start=0)},
         sampled={"q": Sampled(u, Ts, c)},
@@ -103,17 +104,34 @@ def test_a_sampled_ramp_is_a_staircase(method):
     run = experiment("held", np.linspace(0.005, 0.995, 100), {"u": InputSignal.ramp(0.0, 0.0, 2.0, 2.0)})
     start = experiment("held", np.concatenate([[0.0], run.time]), run.inputs)
     result = simulate(model, start, sensitivities=("Ts", "c"), method=method, **TIGHT)
-    count = np.floor((run.time - 0.03) / 0.1 + 1e-9).clip(0)
+    count = np.floor((run.time - compute) / 0.1 + 1e-9).clip(0)
     np.testing.assert_allclose(result["q"][1:], 0.1 * count, atol=1e-12)
 
     def area(period, compute):
         ends = [np.clip(run.time - (k * period + compute), 0, None) * period for k in range(1, 12)]
         return np.sum(ends, axis=0)
 
-    np.testing.assert_allclose(result["x"][1:], area(0.1, 0.03), atol=1e-9)
+    np.testing.assert_allclose(result["x"][1:], area(0.1, compute), atol=1e-9)
     h = 1e-6
-    for k, (a, b) in enumerate((((0.1 + h, 0.03), (0.1 - h, 0.03)), ((0.1, 0.03 + h), (0.1, 0.03 - h)))):
+    for k, (a, b) in enumerate((((0.1 + h, compute), (0.1 - h, compute)), ((0.1, compute + h), (0.1, compute - h)))):
         np.testing.assert_allclose(result.gradient("x")[1:, k], (area(*a) - area(*b)) / 2 / h, atol=1e-8)
+
+
+@pytest.mark.parametrize("period", [0.1, 0.07, 1 / 3])
+def test_a_sample_is_taken_before_what_is_published_at_its_instant(period):
+    """q adds u = 1 to itself and shows it a whole period later: each sample sees the sum of two before, u every second time."""
+    model = Model(
+        "sum",
+        parameters={"Ts": period},
+        inputs={"u": 0.0},
+        states={"x": State("-x", start=0)},
+        sampled={"q": Sampled(sp.Symbol("q") + u, Ts, Ts)},
+        outputs={"q": "q"},
+    )
+    middle = period * (np.arange(40) + 0.5)
+    run = experiment("sum", np.concatenate([[0.0], middle]), {"u": InputSignal.step(0.25 * period, 0.0, 1.0)})
+    # Samples 1, 3, 5 ... and 2, 4, 6 ... are two sums that know nothing of each other: 1, 1, 2, 2, 3, 3 ... from sample 1 on.
+    np.testing.assert_allclose(simulate(model, run)["q"][1:], np.arange(40) // 2, atol=1e-12)
 
 
 def test_both_methods_and_a_closed_form_agree_on_an_oscillator():
