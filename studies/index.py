@@ -45,8 +45,9 @@ def _table_1(e: dict[str, Any]) -> str:
 def _table_2(e: dict[str, Any]) -> str:
     own, avm = (e["values"][d]["all three"] for d in ("the link itself", "the average-value link"))
     return (
-        f"{own['to the optimum']} of {own['starts']} starts find the true gains on the link's own waveforms, the others "
-        f"cannot be simulated or begin wrong; on the average-value link's KIVDC {number(avm['optimum']['KIVDC'], 3)}"
+        f"{own['to the optimum']} of {own['starts']} starts find the true gains on the link's own waveforms; "
+        f"{avm['to the optimum']} of {avm['starts']} end at KIVDC {number(avm['optimum']['KIVDC'], 3)} on the "
+        "average-value link's"
     )
 
 
