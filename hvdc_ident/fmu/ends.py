@@ -10,21 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.effects.placing import apply
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.expression.functions import symbol
 from hvdc_ident.fmu.grid import joined, kept_rows, refined, signal_of
+from hvdc_ident.fmu.passage import ALONG, added, entrance, exit_
 from hvdc_ident.fmu.run import bare, inputs_of, unit_of
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Output
-from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.engine import simulate as engine_run
 from hvdc_ident.simulate.recording import chains_of
@@ -37,7 +33,10 @@ if TYPE_CHECKING:
 FINE = 4000
 """Rows, at least, on which outputs are taken where an effect filters them."""
 NUDGE = 1e-3
-"""Size of the change, in ranges of the signal, by which derivatives pass through an effect or enter the FMU."""
+"""Size of the change, in ranges of the signal, by which derivatives enter the FMU."""
+
+BRIEF = 0.02
+"""Share of the run that the largest value of a slope would have to last for as much as the slope comes to in all."""
 
 
 def chains(experiment: Experiment) -> list[EffectUse]:
@@ -52,13 +51,10 @@ def with_effects(model: FmuModel, uses: Iterable[Any]) -> FmuModel:
         catalogue = effects()
         if use.effect not in catalogue:
             raise unknown_name("effect", use.effect, catalogue)
-        for place in use.at:
-            if _end(model, place) is None:
-                raise unknown_name("slot", place, model.slots, where=f"model '{model.name}', which is closed inside")
         named = replace(use, prefix=_free_prefix(model, use))
-        added = _added(model, named)
-        if added:
-            model = replace(model, effects=(*model.effects, named), parameters=model.parameters | added)
+        parameters = added(model, named)
+        if parameters:
+            model = replace(model, effects=(*model.effects, named), parameters=model.parameters | parameters)
     return model
 
 
@@ -68,56 +64,6 @@ def _free_prefix(model: FmuModel, use: EffectUse) -> str:
     names = effects()[use.effect].parameters
     tried = (first, *(f"{first}_{k}" for k in range(2, 10_000)))
     return next(p for p in tried if not any(f"{p}_{n}" in model.parameters for n in names))
-
-
-def _added(model: FmuModel, use: EffectUse) -> dict[str, Parameter]:
-    """The parameters that an effect brings; none where it is neutral. Raises ModelError where it cannot sit there."""
-    trial = replace(model, effects=(*model.effects, use))
-    found: dict[str, Parameter] = {}
-    for side in (_entrance(trial), _exit(trial)):
-        found |= {n: p for n, p in side.parameters.items() if n not in model.parameters}
-    return found
-
-
-def _end(model: FmuModel, place: str) -> tuple[str, int] | None:
-    """("input" | "output", its number) of a slot."""
-    name = place.removeprefix("outputs.")
-    if place in model.inputs:
-        return "input", list(model.inputs).index(place)
-    return ("output", list(model.outputs).index(name)) if name in model.outputs else None
-
-
-def _entrance(model: FmuModel) -> Model:
-    """Inputs u0, u1 ... that come out as y0, y1 ... after the effects at the FMU's inputs."""
-    return _passage(len(model.inputs), _at_end(model, "input"), tuple(i.value for i in model.inputs.values()))
-
-
-def _exit(model: FmuModel) -> Model:
-    """The FMU's outputs as u0, u1 ... that come out as y0, y1 ... after the effects at them."""
-    return _passage(len(model.outputs), _at_end(model, "output"), (0.0,) * len(model.outputs))
-
-
-def _at_end(model: FmuModel, end: str) -> tuple[EffectUse, ...]:
-    """The effects with those of their places that lie at one end, renamed."""
-    found = []
-    for use in model.effects:
-        ends = [e for p in use.at if (e := _end(model, p)) is not None and e[0] == end]
-        letter = "u" if end == "input" else "y"
-        if ends:
-            found.append(replace(use, at=tuple(f"{letter}{k}" for _, k in ends)))
-    return tuple(found)
-
-
-@lru_cache(maxsize=64)
-def _passage(count: int, uses: tuple[EffectUse, ...], values: tuple[float, ...]) -> Model:
-    model = Model(
-        name="ends",
-        inputs=FrozenMap({f"u{k}": Input(v) for k, v in enumerate(values)}),
-        outputs=FrozenMap({f"y{k}": Output(symbol(f"u{k}")) for k in range(count)}),
-    )
-    for use in uses:
-        model = apply(model, use, effects()[use.effect])
-    return model
 
 
 def simulate_with_effects(
@@ -146,7 +92,7 @@ class _Ends:
         self.model, self.experiment, self.tolerance, self.names = model, experiment, tolerance, names
         self.given = dict(given)
         self.values = {n: float(given.get(n, p.value)) for n, p in model.parameters.items()}
-        self.entrance, self.exit = _entrance(model), _exit(model)
+        self.entrance, self.exit = entrance(model), exit_(model)
         self.enters, self.leaves = bool(self.entrance.parameters), bool(self.exit.parameters)
         breaks = [b for s in experiment.inputs.values() for b in s.breaks.tolist()]
         self.breaks = np.unique(np.array(breaks))
@@ -161,8 +107,9 @@ class _Ends:
         raw = inside.trajectory.values
         gradients = {n: inside.gradients[:, :, k] for k, n in enumerate(own)}
         jumps = any(np.setdiff1d(s.breaks, self.breaks).size for s in inputs.values())
-        for n in at_entrance:  # a parameter may move a jump, as a delay does: no slope says that
-            gradients[n] = self._moving(n) if jumps else self._entering(inputs, slopes[n])
+        for n in at_entrance:  # a parameter may move a jump, as a delay does, or an edge: no slope says that
+            moves = jumps or any(_brief(s) for s in slopes[n].values())
+            gradients[n] = self._moving(n) if moves else self._entering(inputs, slopes[n])
         values, found = self._leave(raw, gradients, sensitivities)
         shape = (self.experiment.time.size, len(self.names), len(sensitivities))
         table = np.empty(shape)
@@ -255,13 +202,18 @@ class _Ends:
             found[n] = total
         return passed.trajectory.values, found
 
-    def _passed(self, raw: Array, sensitivities: tuple[str, ...] = ()) -> Simulation:
-        """The exit's run on given outputs of the FMU; what is no output passes as it is."""
+    def _passed(self, raw: Array, sensitivities: tuple[str, ...] = (), slope: Array | None = None) -> Simulation:
+        """The exit's run on given outputs of the FMU, and how these move with ALONG; what is no output passes as it is."""
         outputs = list(self.model.outputs)
         signals = {f"u{k}": signal_of(self.time, raw[:, self.raw.index(n)], self.breaks) for k, n in enumerate(outputs)}
+        if slope is not None:
+            signals |= {
+                f"s{k}": signal_of(self.time, slope[:, self.raw.index(n)], self.breaks) for k, n in enumerate(outputs)
+            }
         values = {n: self.values[n] for n in self.exit.parameters}
         inner = Experiment("exit", self.experiment.time, FrozenMap(signals))
-        run = engine_run(self.exit, inner, values, sensitivities, tolerance=self.tolerance)
+        leaving = self.exit if slope is None else exit_(self.model, along=True)
+        run = engine_run(leaving, inner, values, sensitivities, tolerance=self.tolerance)
         columns, slopes = [], []
         for n in self.names:
             if n in outputs:
@@ -270,19 +222,21 @@ class _Ends:
             else:
                 place = np.searchsorted(self.time, self.experiment.time, side="right") - 1
                 columns.append(raw[place, self.raw.index(n)])
-                slopes.append(np.zeros((place.size, len(sensitivities))))
+                own = np.zeros((place.size, len(sensitivities)))
+                slopes.append(own if slope is None else slope[place][:, [self.raw.index(n)]])
         trajectory = Trajectory(self.experiment.time, np.column_stack(columns), self.names)
         return Simulation(trajectory, sensitivities, np.stack(slopes, axis=1), run.statistics)
 
     def _along(self, raw: Array, slope: Array) -> Array:
-        """(n, names) change of what is recorded as the FMU's outputs move along the slope."""
-        ranges = np.maximum(np.ptp(raw, axis=0), np.maximum(1e-6 * np.abs(raw).max(axis=0), 1e-12))
-        size = float((np.abs(slope).max(axis=0) / ranges).max())
-        if size == 0.0:
-            return np.zeros((self.experiment.time.size, len(self.names)))
-        step = NUDGE / size
-        ends = [self._passed(raw + sign * step * slope).trajectory.values for sign in (1.0, -1.0)]
-        return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+        """(n, names) change of what is recorded as the FMU's outputs move along the slope, (rows, raw)."""
+        return self._passed(raw, (ALONG,), slope).gradients[:, :, 0]
+
+
+def _brief(slope: InputSignal) -> bool:
+    """Whether a slope is a few spikes: small enough to be a slope, they are lost in the tolerance of the FMU's run."""
+    size = np.abs(slope.values)
+    span = float(slope.times[-1] - slope.times[0])
+    return bool(span > 0 and np.trapezoid(size, slope.times) < BRIEF * span * size.max())
 
 
 def _moved(signal: InputSignal, slope: InputSignal, by: float) -> InputSignal:

@@ -33,7 +33,19 @@ CASES = [
         ],
         ["lag_u_T", "gain_twice_k"],
     ),
+    ([{"effect": "sample-hold", "at": "u", "parameters": {"Ts": 0.11, "compute": 0.03}}], ["sample_hold_u_Ts"]),
+    ([{"effect": "sample-hold", "at": "y", "parameters": {"Ts": 0.11, "compute": 0.03}}], ["sample_hold_y_Ts"]),
+    ([{"effect": "backlash", "at": "u", "parameters": {"width": 0.2}}], ["backlash_u_width"]),
+    ([{"effect": "backlash", "at": "y", "parameters": {"width": 0.2}}], ["backlash_y_width"]),
+    ([{"effect": "rate-limit", "at": "u", "parameters": {"rate": 1.5}}], ["rate_limit_u_rate"]),
+    ([{"effect": "rate-limit", "at": "y", "parameters": {"rate": 1.5}}], ["rate_limit_y_rate"]),
+    ([{"effect": "quantisation", "at": "u", "parameters": {"step": 0.3}}], ["quantisation_u_step"]),
+    ([{"effect": "quantisation", "at": "y", "parameters": {"step": 0.3}}], ["quantisation_y_step"]),
+    ([{"effect": "coupling", "at": "y", "from": "twice", "parameters": {"k": 0.3}}], ["coupling_y_k"]),
+    ([{"effect": "term", "at": "u", "expression": "c*u**2", "parameters": {"c": 0.3}}], ["term_u_c"]),
 ]
+EDGES = {"sample_hold_u_Ts": {"twice"}}
+"""Outputs of which a sample's move moves a corner: the derivative there is one-sided, and rows see either side."""
 
 
 @pytest.mark.parametrize(
@@ -50,8 +62,41 @@ def test_runs_and_derivatives_agree_with_the_twin(fmu, uses, names):
         scale = np.ptp(wanted[output])
         assert np.abs(found[output] - wanted[output]).max() < 2e-4 * scale
         for j, name in enumerate(["k", *names]):
+            if output in EDGES.get(name, ()):
+                continue
             a, b = found.gradient(output)[:, j], wanted.gradient(output)[:, j]
             assert np.sqrt(np.mean((a - b) ** 2)) < 5e-3 * np.sqrt(np.mean(b**2)) + 1e-6, name
+
+
+def test_a_term_and_a_droop_read_the_outputs_under_the_names_of_the_fmu(fmu):
+    plain = simulate(fmu(spring()), RUN)
+    y, twice = plain["y"], plain["twice"]
+    term = {"effect": "term", "at": "twice", "expression": "c*y*abs(twice)", "parameters": {"c": 0.3}}
+    assert simulate(fmu(spring()).with_effects([term]), RUN)["twice"] == pytest.approx(
+        twice + 0.3 * y * np.abs(twice), abs=1e-5
+    )
+    droop = {"effect": "droop", "at": "outputs.y", "from": "outputs.twice", "parameters": {"k": 0.2}}
+    found = simulate(fmu(spring()).with_effects([droop]), RUN)["y"]
+    assert found == pytest.approx(y - 0.2 * (twice - twice[0]), abs=1e-5)
+
+
+REFUSED = [
+    ({"at": "u", "from": "y"}, "input that reads the output 'y' would close a loop around the FMU.*inputs: u"),
+    ({"at": ["y", "u"], "from": "twice"}, "input that reads the output 'twice' would close a loop"),
+    ({"at": "y", "from": "u"}, "output cannot read the input 'u'.*outputs: y, twice"),
+    ({"at": "y", "from": "x"}, "closed inside.*no signal 'x'.*y, twice"),
+    ({"effect": "term", "at": "u", "expression": "k*y", "parameters": {"k": 1.0}}, "expression: .*loop around"),
+    ({"effect": "term", "at": "y", "expression": "k*u0", "parameters": {"k": 1.0}}, "no signal 'u0'"),
+    ({"effect": "gain", "at": "y", "from": "twice", "parameters": {"k": 1.1}}, "at y: .*brings no other signal in"),
+    ({"at": "y"}, "effect 'coupling' at y: the effect needs another signal"),
+    ({"at": "y", "from": "twice", "parameters": {"k": "d"}}, "cannot share a parameter.*a number, got 'd'"),
+]
+
+
+@pytest.mark.parametrize(("use", "message"), REFUSED)
+def test_what_an_effect_at_an_end_cannot_see_is_refused_in_the_names_of_the_fmu(fmu, use, message):
+    with pytest.raises((ModelError, UnknownNameError), match=message):
+        fmu(spring()).with_effects([{"effect": "coupling", "parameters": {"k": 0.3}, **use}])
 
 
 def test_a_recording_chain_is_an_effect_at_the_output(fmu):
