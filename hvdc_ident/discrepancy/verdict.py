@@ -10,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import Binned, adequacy
 from hvdc_ident.discrepancy.ambiguity import rivals
+from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Verdict
 from hvdc_ident.discrepancy.rounds import Search
@@ -19,6 +20,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.simulate import simulate
 from hvdc_ident.trajectory import Array
+from hvdc_ident.waveform import event_time
 
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
@@ -45,7 +47,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     if not outcome.kept:
         return _nothing(search, first, outcome, tests)
     explained = first.chi2 - last.chi2
-    excess = max(first.chi2 - first.rows, explained)
+    floor = noise_left(last)
+    excess = max(first.chi2 - floor * first.rows, explained)
     labels = ", ".join(p.candidate.label for p in last.placed)
     if explained < DOMINANT * excess:
         return Judgement(
@@ -54,8 +57,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             tests,
         )
     was, now = unseen(first), unseen(last)
-    if was is not None and now is not None and was > 1.0 + options.holdout_share:
-        told = (was**2 - now**2) / (was**2 - 1.0)
+    if was is not None and now is not None and was > (1.0 + options.holdout_share) * np.sqrt(floor):
+        told = (was**2 - now**2) / (was**2 - floor)
         if told < DOMINANT:
             return Judgement(
                 "unnameable",
@@ -79,6 +82,28 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             "ambiguous", f"Missing: {labels}, or one of {others} others that these data cannot tell from it.", tests
         )
     return Judgement("named", f"Missing: {labels}.", tests)
+
+
+def noise_left(last: Refit) -> float:
+    """The mean square that noise alone leaves in whitened residuals, from the rows before the events; at least 1.
+
+    It is 1 where the noise is as supposed. AR coefficients from few rows are not: with a standard deviation that is
+    given, a coefficient that is wrong by a tenth makes of whitened noise half or three times its size.
+    """
+    experiments = {e.name: e for e in last.problem.fitted_experiments}
+    rows: dict[str, int] = {}
+    quiet: dict[str, list[Array]] = {}
+    for b in last.nominal().blocks:
+        e = experiments[b.experiment]
+        event = e.event if e.event is not None else event_time(e.inputs)
+        rows[b.output] = rows.get(b.output, 0) + b.residual.size
+        if event is not None:
+            quiet.setdefault(b.output, []).append(b.residual[e.time[b.rows] < event - 1e-12])
+    total = 0.0
+    for output, count in rows.items():
+        own = np.concatenate(quiet.get(output) or [np.zeros(0)])
+        total += count * (float(np.mean(own**2)) if own.size >= FEWEST else 1.0)
+    return max(total / max(sum(rows.values()), 1), 1.0)
 
 
 def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned, ...]) -> Judgement:
