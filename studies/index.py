@@ -142,6 +142,15 @@ def _missing(e: dict[str, Any]) -> str:
     )
 
 
+def _tools(e: dict[str, Any]) -> str:
+    v = e["values"]
+    card, bare = v["as described"]["Dynawo"]["Vdc step"]["Ip1"], v["Dynawo without the measurement"]["Vdc step"]["Ip1"]
+    return (
+        f"the card follows Eurostag; Dynawo's dc voltage step only without the 10 ms measurement (RMSE of the current "
+        f"{1e3 * card:.0f}e-3 with, {1e3 * bare:.0f}e-3 without)"
+    )
+
+
 def _optimisers(e: dict[str, Any]) -> str:
     m = e["methods"]
     own, swarm = m["trust-region"]["evaluations"], m["particle-swarm"]["evaluations"]
@@ -164,6 +173,7 @@ HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "avm_modes": ("The modes of the average-value link", _modes),
     "dymola_waveform": ("The phasor link on Dymola's waveforms", _dymola),
     "dymola_missing": ("What the phasor link lacks on Dymola's waveforms", _missing),
+    "two_tools_one_link": ("One link in two tools", _tools),
     "optimisers": ("RaPId's optimisers on the link", _optimisers),
     "profile_coverage": ("How often the profile's interval holds the truth", _coverage),
 }
