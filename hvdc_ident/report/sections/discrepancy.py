@@ -18,7 +18,8 @@ def _render(results: Results) -> str:
     if not found.get("verdict"):
         return ""
     parts = [_lead(found), _effects(found), _sets(found), _gap(found), _gains(found), _where(found), _candidates(found)]
-    return "".join(parts)
+    notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
+    return "".join(parts) + notes
 
 
 def _lead(found: dict[str, Any]) -> str:
@@ -75,12 +76,13 @@ def _gap(found: dict[str, Any]) -> str:
     shrink = gap.get("shrink_holdout")
     line = (
         f"<p>Held out, the gap shrinks by {100 * shrink:.1f} %.</p>"
-        if shrink is not None and found.get("augmented_model")
+        if shrink is not None and (found.get("augmented_model") or found.get("effects"))
         else ""
     )
     frequency = [c for c in found.get("bode") or [] if c.get("omega")]
     second = svg(bode(frequency), "frequency responses of model and record") if frequency else ""
-    return f"<h3>Before and after (RMSE)</h3><figure>{picture}</figure>{line}{table(header, rows, words=(0, 1, 2))}<figure>{second}</figure>"
+    errors = table(header, rows, words=(0, 1, 2))
+    return f"<h3>Before and after (RMSE)</h3><figure>{picture}</figure>{line}{errors}<figure>{second}</figure>"
 
 
 def _gains(found: dict[str, Any]) -> str:

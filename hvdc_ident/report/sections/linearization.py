@@ -15,6 +15,13 @@ NEAREST = 5
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
 
+CHECKS = {
+    "symbolic": "complex steps",
+    "directional": "central differences",
+    "finite-difference": "differences of another step size",
+}
+"""What a Jacobian of each method was compared with."""
+
 
 def _render(results: Results) -> str:
     data = results.get("linearization")
@@ -32,7 +39,7 @@ def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
     return (
         f"<p>{len(data['modes'])} modes; the operating point is <strong>{verdict}</strong>, rightmost real part "
         f"{number(right)} 1/s. Largest scaled residual {number(point.get('residual'), 2)}; the Jacobian differs from "
-        f"complex steps by {number(data.get('jacobian_error'), 2)}.</p>"
+        f"{CHECKS[data.get('method', 'symbolic')]} by {number(data.get('jacobian_error'), 2)}.</p>"
     )
 
 
