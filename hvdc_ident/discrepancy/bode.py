@@ -84,7 +84,7 @@ def recorded(e: Experiment, name: str, output: str, noise: float) -> tuple[Array
     even = np.linspace(t[0], t[-1], t.size)
     step = float(even[1] - even[0])
     omega = 2 * np.pi * np.fft.rfftfreq(t.size - 1, step)
-    du = derivative_spectrum(e.inputs[name], float(t[0]), float(t[-1]), omega)
+    du = derivative_spectrum(e.inputs[name], float(t[0]), float(t[-1]), np.asarray(omega, dtype=float))
     inner = np.flatnonzero((omega > 0) & (omega < 0.8 * np.pi / step) & (np.abs(du) > 0.02 * np.abs(du).max()))
     if not inner.size:
         return np.empty(0), np.empty(0, dtype=complex)

@@ -51,7 +51,7 @@ def test_later_groups_hold_what_earlier_ones_found() -> None:
 
 
 def test_one_report_in_json_with_advice_for_who_needs_it() -> None:
-    model, data, free = case()
+    model, _, free = case()
     still = [Free("a", 0.8, 0.799, 0.801), *free[1:]]  # its range is too small to be seen in coarse data
     coarse = [on_model(model, "e", STEP, ["y", "control"], 0.05)]
     groups = [Group(("kp", "ki"), ("control",)), Group(("b", "a"), ("y",))]

@@ -85,7 +85,7 @@ def test_the_exported_card_is_the_model(study, tmp_path):
     assert load_model(tmp_path / "out.toml").states == load_model(tmp_path / "smib.toml").states
 
 
-@pytest.mark.parametrize("to", ["out.xyz", "out", "out.fmu"])
+@pytest.mark.parametrize("to", ["out.xyz", "out", "out.docx"])
 def test_an_unknown_ending_is_bad_input(study, tmp_path, to):
     result = run("export", study, "--to", tmp_path / to)
     assert result.exit_code == 2 and "expected one of" in result.output
