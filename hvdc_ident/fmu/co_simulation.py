@@ -20,8 +20,10 @@ def run(
     """(n, outputs) at the instants. Two equal instants are before and after a jump.
 
     Inputs are held at their mean over a step, or follow their slope where the FMU can, and stand at their own value
-    where outputs are read. Steps end at every row and every break of an input; an FMU of fixed steps takes its own
-    step, and rows between are joined by lines.
+    where outputs are read. Only FMI 2.0 has such slopes: FMI 3.0 gives an input during a step only to FMUs that ask for
+    it by intermediate updates, which are not used here, so a ramp is stairs of the rows' width there. Steps end at every
+    row and every break of an input; an FMU of fixed steps takes its own step (where it states none, the shortest
+    interval), a jump within one enters as the mean over it, and rows between are joined by lines.
     """
     stops = _stops(plant, signals, time)
     plant.begin(values, signals.at(stops[:1], "left")[0], float(time[0]), float(stops[-1]), tolerance)
@@ -58,7 +60,10 @@ def _stops(plant: Plant, signals: Signals, time: Array) -> Array:
     if even and (plant.description.step is None or np.isclose(gaps[0], step, rtol=1e-9)):
         return wanted
     count = int(np.ceil((end - begin) / step - 1e-9))
-    return np.asarray(begin + step * np.arange(count + 1), dtype=float)
+    grid = begin + step * np.arange(count + 1)
+    # A row or jump that rounding alone keeps off a step's end is at it: a jump just before it would be averaged away.
+    near = wanted[np.clip(np.searchsorted(wanted, grid - 1e-6 * step), 0, wanted.size - 1)]
+    return np.asarray(np.where(np.abs(near - grid) <= 1e-6 * step, near, grid), dtype=float)
 
 
 def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
