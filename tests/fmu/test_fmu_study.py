@@ -58,7 +58,7 @@ def study(folder, interface):
     from hvdc_ident import simulate
     from hvdc_ident.experiment import InputSignal, experiment
 
-    random, time = np.random.default_rng(3), np.linspace(0.0, 5.0, 126)
+    random, time = np.random.default_rng(3), np.linspace(0.0, 5.0, 101)
     for name, level in (("step", 1.0), ("back", -0.7)):
         u = InputSignal.step(1.0, 0.0, level)
         run = simulate(TWIN.with_values(TRUE), experiment(name, time, {"u": u}))

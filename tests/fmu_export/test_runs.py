@@ -42,8 +42,9 @@ def worst(found, expected):
     return float((np.abs(found - expected) / (np.abs(expected).max(axis=0) + 1e-3)).max())
 
 
-@pytest.mark.parametrize("version", ["2.0", "3.0"])
-@pytest.mark.parametrize("name", sorted(STEPS))
+@pytest.mark.parametrize(
+    ("name", "version"), [("link", "2.0"), ("augmented", "2.0"), ("remembering", "3.0"), ("zoo", "2.0"), ("zoo", "3.0")]
+)
 def test_co_simulation_of_steps(fmu, name, version):
     f = fmu(name, version)
     outputs = list(f.model.outputs)
