@@ -18,9 +18,12 @@ from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
+from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
+PATIENCE = Tolerance(max_steps=20_000)
+"""Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-6, reduction=1e-7, step=1e-7)
 
 
@@ -136,7 +139,7 @@ def added(
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
     free = tuple(Free(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    more = replace(problem, simulator=ModelSimulator(larger), free=(*problem.free, *free))
+    more = replace(problem, simulator=ModelSimulator(larger, PATIENCE), free=(*problem.free, *free))
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
     return larger, more, placed, np.array([f.start for f in free])
 

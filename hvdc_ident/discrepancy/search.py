@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
-from hvdc_ident.discrepancy.refit import Job, Placed, Refit, run
+from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
 from hvdc_ident.discrepancy.rounds import Round, Search, Trial, one_round
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.errors import HvdcIdentError
@@ -144,7 +144,7 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         names = dict(zip(p.names, new, strict=True))
         free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
         again.append(replace(p, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    problem = replace(here.problem, simulator=ModelSimulator(model), free=tuple(free))
+    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free))
     nuisance = here.theta[len(here.problem.free) :]
     gains = [at[f.name] for f in first.problem.free]
     begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])

@@ -10,15 +10,19 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.model.definition import Model, State
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate.engine import simulate
+from hvdc_ident.simulate.engine import Tolerance, simulate
 from hvdc_ident.simulate.result import Simulation
 
 
 @dataclass(frozen=True, eq=False)
 class ModelSimulator:
-    """The model with its engine: parameters, and runs with sensitivities. It travels to other processes."""
+    """The model with its engine: parameters, and runs with sensitivities. It travels to other processes.
+
+    tolerance: of every run (default: the engine's own).
+    """
 
     model: AnyModel
+    tolerance: Tolerance | None = None
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -40,6 +44,9 @@ class ModelSimulator:
     ) -> Simulation:
         """A run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
         try:
-            return simulate(self.model, experiment, values, sensitivities, outputs=experiment.outputs or None)
+            return simulate(
+                self.model, experiment, values, sensitivities,
+                outputs=experiment.outputs or None, tolerance=self.tolerance,
+            )  # fmt: skip
         except SteadyStateError as e:
             raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
