@@ -53,7 +53,11 @@ class Exported:
             modelIdentifier=kind.modelIdentifier,
             instanceName="test",
         )
-        made.instantiate()
+        try:
+            made.instantiate()
+        except Exception:
+            made.freeLibrary()
+            raise
         try:
             yield Run(self, made)
         finally:
