@@ -60,6 +60,6 @@ def test_the_demo_is_the_same_for_a_seed_and_holds_together(tmp_path: Path) -> N
     assert (first.parent / "p-01-step.csv").read_bytes() != (third.parent / "p-01-step.csv").read_bytes()
     tomllib.loads(first.read_text())
     study = load_study(first)
-    assert list(study.candidates) == ["KIP", "KIQ", "KPVDC", "KIVDC"] and len(study.experiments) == 12
+    assert list(study.candidates) == ["KIP", "KIQ", "KPVDC", "KIVDC"] and len(study.experiments) == 9
     for notes in study.noise.values():
         assert all(n.source == "given" and n.std == 1e-4 for n in notes.values())
