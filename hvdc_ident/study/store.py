@@ -1,8 +1,10 @@
 """Finished work kept in the folder of results, so that a second run does only what is missing.
 
 One sqlite file (write-ahead log) holds bytes by job and key. A job is a hash of all that decides its results: model,
-data, settings, code. What was committed survives a kill at any instant; what was not is done again, with the same
-result. One process at a time works in a folder: the operating system's lock, which ends with the process.
+data, settings, code. Every piece is a transaction of its own, which the operating system has when `put` returns: a kill
+at any instant loses nothing of it. No disk is waited for, so that costs 17 us of processor time a piece more than many
+pieces at a time. The disk has it when the log is merged, every 4 MB and at the end: a power cut may take the last of it,
+never the file. One process at a time works in a folder: the operating system's lock, which ends with the process.
 """
 
 from __future__ import annotations
@@ -10,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -21,10 +22,14 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.files import digest, make_folder
 
 FOLDER, FILE = ".store", "results.sqlite"
-EVERY = 0.2  # s of quick work between two commits, at most
-QUICK = 0.01  # s: a piece of work that took longer is committed at once
 MOST_KEYS = 500  # of one query
 SCHEMA = 1
+PRAGMAS = (
+    "page_size = 1024",  # what a small piece writes to the log
+    "journal_mode = WAL",
+    "synchronous = NORMAL",  # the disk is waited for when the log is merged, not at each piece
+    "wal_autocheckpoint = 4000",  # pages, 4 MB
+)
 
 _HELD: dict[Path, list[int]] = {}
 """Folders this process holds: [handle, how often it was asked for]."""
@@ -86,7 +91,6 @@ class Store:
         self.path = folder / FOLDER / FILE
         self._stack = contextlib.ExitStack()
         self._base: sqlite3.Connection | None = None
-        self._last = self._put_at = 0.0
         self._folder = folder
 
     def __enter__(self) -> Store:
@@ -97,18 +101,15 @@ class Store:
         except BaseException:
             self._stack.close()
             raise
-        self._last = self._put_at = time.monotonic()
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
             if self._base is not None:
                 with self._clear():
-                    self._commit()
+                    self._base.close()
         finally:
-            if self._base is not None:
-                self._base.close()
-                self._base = None
+            self._base = None
             self._stack.close()
 
     def job(self, *parts: str) -> Job:
@@ -119,8 +120,8 @@ class Store:
         with self._clear():
             base = sqlite3.connect(self.path, isolation_level=None)
             try:
-                base.execute("PRAGMA journal_mode = WAL")
-                base.execute("PRAGMA synchronous = NORMAL")
+                for pragma in PRAGMAS:
+                    base.execute(f"PRAGMA {pragma}")
                 version = base.execute("PRAGMA user_version").fetchone()[0]
                 if version not in (0, SCHEMA):
                     raise InputError("the store is of another version", where=str(self.path), hint="remove this file")
@@ -139,7 +140,6 @@ class Store:
         try:
             yield
         except sqlite3.DatabaseError as e:
-            self._undo()
             text = str(e)
             if "is full" in text or "disk I/O" in text:
                 hint = "free some space; what was kept is intact, and the same command goes on from there"
@@ -165,24 +165,7 @@ class Store:
     def _put(self, job: str, key: bytes, value: bytes) -> None:
         assert self._base is not None
         with self._clear():
-            if not self._base.in_transaction:
-                self._base.execute("BEGIN IMMEDIATE")
             self._base.execute("INSERT OR REPLACE INTO kept VALUES (?, ?, ?)", (job, key, value))
-            now = time.monotonic()
-            if now - self._put_at > QUICK or now - self._last > EVERY:
-                self._commit()
-            self._put_at = now
-
-    def _commit(self) -> None:
-        if self._base is not None and self._base.in_transaction:
-            self._base.execute("COMMIT")
-        self._last = time.monotonic()
-
-    def _undo(self) -> None:
-        """Nothing is left open: after an error sqlite may have ended the transaction, or not."""
-        if self._base is not None and self._base.in_transaction:
-            with contextlib.suppress(sqlite3.DatabaseError):
-                self._base.execute("ROLLBACK")
 
 
 class Job:
@@ -196,7 +179,7 @@ class Job:
         return self._store._get(self.name, keys)
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Nothing; the value is kept. A kill at any instant afterwards loses a fifth of a second of quick work at most."""
+        """Nothing; the value is kept: a kill of this process at any instant afterwards does not lose it."""
         self._store._put(self.name, key, value)
 
 

@@ -29,8 +29,7 @@ def no_larger_than(size: int):
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
-def test_a_full_disk_is_said_and_the_run_goes_on_when_there_is_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "EVERY", 0.0)
+def test_a_full_disk_is_said_and_the_run_goes_on_when_there_is_room(tmp_path):
     path = cases.write_study(tmp_path, points=300)
     out, log = tmp_path / "out", tmp_path / "work.log"
     forks.run("sweep", path, "--out", tmp_path / "whole")

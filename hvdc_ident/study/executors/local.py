@@ -24,7 +24,7 @@ from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.study.executors.ended import Ended, in_order
 
 BATCH = 0.2  # s of work sent to a worker at a time
-REPORT = 0.05  # s between two reports of a worker
+REPORT = 1e-4  # s of finished work a worker may hold back: a kill of the parent loses no more of it
 START = 180.0  # s a worker may take to begin
 DEATHS = 2  # of workers at the same item before it is given up
 IDLE = -1
