@@ -8,7 +8,6 @@ one LLVM vector, which the compiler turns into the machine's own vector instruct
 from __future__ import annotations
 
 import ctypes
-import itertools
 import struct
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +17,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate.objects import compiled, kept, loaded
 from hvdc_ident.trajectory import Array
 
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
@@ -26,7 +26,6 @@ _INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs")
 LANES = 4  # instants that a function over several of them takes at once
 BLOCK = 300  # instructions of a block of a long function
 LONG = 4000  # instructions; a shorter function is one block
-_serial = itertools.count()
 
 
 @dataclass(frozen=True)
@@ -63,24 +62,16 @@ class Code:
         written: Mapping[str, Callable[[str], str]] | None = None,
     ) -> None:
         """written: further hot functions as text, by name; each is called with the symbol it has to define."""
-        serial = next(_serial)
-        written = written or {}
-        names = {n: f"hvdcident_{serial}_{n}" for n in (*(f.name for f in functions), *written)}
         self._engines: list[llvm.ExecutionEngine] = []
         self.address: dict[str, int] = {}
         for hot in (True, False):
-            chosen = [f for f in functions if f.hot == hot]
-            text = "\n".join(
-                [
-                    *_declarations(),
-                    *(function_text(graph, f, names[f.name], width) for f in chosen),
-                    *(t(names[n]) for n, t in written.items() if hot),
-                ]
-            )
-            engine = _compiled(text, hot)
-            self._engines.append(engine)
-            kept = [f.name for f in chosen] + (list(written) if hot else [])
-            self.address |= {n: engine.get_function_address(names[n]) for n in kept}
+            texts = {f.name: function_text(graph, f, _symbol(f.name), width) for f in functions if f.hot == hot}
+            if hot:
+                texts |= {n: text(_symbol(n)) for n, text in (written or {}).items()}
+            if texts:
+                engine = _engine("\n".join([*_declarations(), *texts.values()]), hot)
+                self._engines.append(engine)
+                self.address |= {n: engine.get_function_address(_symbol(n)) for n in texts}
         # Freed with this object, but not at the end of the process, when LLVM may be gone before it.
         weakref.finalize(self, _close, self._engines).atexit = False
 
@@ -90,33 +81,21 @@ def _close(engines: list[llvm.ExecutionEngine]) -> None:
         engine.close()
 
 
+def _symbol(name: str) -> str:
+    return f"hvdcident_{name}"
+
+
+def _engine(text: str, hot: bool) -> llvm.ExecutionEngine:
+    """The engine of a module; a cold one is compiled quickly instead of well, which halves the time of a new structure."""
+    # The graph is free of common parts and its rows are vectors already: little is left for the optimiser.
+    return loaded(kept(f"{hot}\0{text}", lambda: compiled(text, effort=2 if hot else 0, combine=hot)))
+
+
 def _declarations() -> list[str]:
     lines = [f"declare double @llvm.{f}.f64(double)" for f in _INTRINSIC]
     lines += ["declare double @llvm.pow.f64(double, double)", "declare double @atan2(double, double)"]
     lines += [f"declare <{LANES} x double> @llvm.sqrt.v{LANES}f64(<{LANES} x double>)"]
     return lines + [f"declare double @{f}(double)" for f in _LIBM if f != "atan2"]
-
-
-def _compiled(text: str, hot: bool) -> llvm.ExecutionEngine:
-    """The engine of a module; a cold one is compiled quickly instead of well, which halves the time of a new structure."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    module = llvm.parse_assembly(text, llvm.create_context())
-    module.verify()
-    target = llvm.Target.from_default_triple()
-    machine = target.create_target_machine(
-        opt=2 if hot else 0, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten()
-    )
-    module.triple = llvm.get_default_triple()
-    # The graph is free of common parts and its rows are vectors already: little is left for the optimiser. The ready-made
-    # pipelines would also keep 60 KiB of every module for ever.
-    if hot:
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_instruction_combine_pass()
-        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2)))
-    engine = llvm.create_mcjit_compiler(module, machine)
-    engine.finalize_object()
-    return engine
 
 
 def body(lines: Sequence[str]) -> str:

@@ -1,0 +1,136 @@
+"""Object code kept on disk: what was compiled once for a processor is loaded from then on, also by other processes.
+
+A file's name is the digest of everything its content depends on (the text that was compiled, how, by which compiler,
+for which processor), so that a file is never out of date: what has changed goes by another name. The content begins
+with its own digest; what is damaged is compiled anew. A folder that cannot be written to costs time, nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import uuid
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import llvmlite
+import llvmlite.binding as llvm
+
+ROOM = 128 * 2**20  # bytes kept in a folder; beyond, the half that was not used for the longest time goes
+_PREFIX, _DIGEST = "code-", hashlib.sha256().digest_size
+
+
+def folders() -> Iterator[Path]:
+    """Where object code may lie, best place first: as numba's own files do, beside the sources, else with the user's caches."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given:
+        yield Path(given)
+        return
+    yield Path(__file__).parent / "__pycache__"
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hvdc_ident"
+
+
+def kept(facts: str, make: Callable[[], bytes]) -> bytes:
+    """The object code that the facts determine: from disk where it is there and whole, else made and kept."""
+    name = _PREFIX + hashlib.sha256("\0".join((*_surroundings(), facts)).encode()).hexdigest()
+    for folder in folders():
+        found = _read(folder / name)
+        if found is not None:
+            return found
+    code = make()
+    for folder in folders():
+        if _write(folder / name, code):
+            break
+    return code
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    if content[:_DIGEST] != _seal(path.name, content[_DIGEST:]):
+        return None
+    with contextlib.suppress(OSError):  # of a folder that may only be read, nothing is cleared either
+        os.utime(path)
+    return content[_DIGEST:]
+
+
+def _write(path: Path, code: bytes) -> bool:
+    """Whether the file is there now: whole, or the folder is as it was."""
+    part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(_seal(path.name, code) + code)
+        part.replace(path)
+        _clear(path.parent)
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        return False
+    return True
+
+
+def _seal(name: str, code: bytes) -> bytes:
+    return hashlib.sha256(name.encode() + code).digest()
+
+
+def _clear(folder: Path) -> None:
+    """Nothing; the folder's object code takes no more than ROOM afterwards. Parts that a killed process left are among it."""
+    with os.scandir(folder) as entries:
+        files = [(e.stat().st_mtime, e.stat().st_size, e.path) for e in entries if e.name.startswith(_PREFIX)]
+    total = sum(size for _, size, _ in files)
+    if total <= ROOM:
+        return
+    for _, size, path in sorted(files):
+        Path(path).unlink(missing_ok=True)
+        total -= size
+        if total <= ROOM // 2:
+            return
+
+
+@cache
+def _surroundings() -> tuple[str, ...]:
+    """What every object code depends on beside its own text: the compiler, the processor, and how this file uses them."""
+    return (
+        llvmlite.__version__,
+        ".".join(map(str, llvm.llvm_version_info)),
+        llvm.get_default_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+        hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
+    )
+
+
+def _machine(effort: int) -> llvm.TargetMachine:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple().create_target_machine(
+        opt=effort, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten()
+    )
+
+
+def compiled(text: str, effort: int, combine: bool = False) -> bytes:
+    """The object code of a module of LLVM IR. effort: 0 (quick) to 3; combine: simplify the instructions before."""
+    machine = _machine(effort)
+    module = llvm.parse_assembly(text, llvm.create_context())
+    module.verify()
+    module.triple = llvm.get_default_triple()
+    # The ready-made pipelines would also keep 60 KiB of every module for ever.
+    if combine:
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_instruction_combine_pass()
+        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=effort)))
+    return bytes(machine.emit_object(module))
+
+
+def loaded(code: bytes) -> llvm.ExecutionEngine:
+    """The object code in executable memory, until the engine is closed; its functions by `get_function_address`."""
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly("", llvm.create_context()), _machine(0))
+    engine.set_object_cache(getbuffer_func=lambda module: code)
+    engine.finalize_object()
+    engine.set_object_cache()  # it has read the code
+    return engine
