@@ -14,6 +14,7 @@ from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
+from hvdc_ident.simulate.integrators import integrators
 from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.result import Simulation, Statistics
 from hvdc_ident.simulate.status import HINTS
@@ -37,7 +38,7 @@ class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
     def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
-        prepare_integrators()
+        self._integrators = integrators()
         self.structure = Structure(model, sensitivities, outputs)
         s = self.structure.sizes
         self._code = self.structure.compile()
@@ -70,18 +71,19 @@ class Engine:
 
         Raises SteadyStateError where Newton's method and its fallbacks find none.
         """
-        from hvdc_ident.simulate.rest import FOUND, rest
-        from hvdc_ident.simulate.steady import fallback
-
         s = self.structure.sizes
+        p = np.ascontiguousarray(p, dtype=float)
         n, extra = s.nx + s.nz, s.nd + s.nq
         m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
         for guess in self._guesses:
             y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width))
             y[:n], w[0], w[1 : 1 + s.nu] = guess, time, u
             jac = np.zeros((n + extra, n + extra))
-            if rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst) == FOUND:
+            given = (self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst)
+            if _status(self._integrators.rest(*given)) == 0:
                 return y, w
+        from hvdc_ident.simulate.steady import fallback
+
         return fallback(self.structure, self._address, p, u, self._guesses[0], time)
 
     @cached_property
@@ -90,10 +92,11 @@ class Engine:
         m = self.structure.model
         given = [s.guess for s in m.states.values()]
         tail = [m.algebraic[n].start for n in self.structure.unknowns]
+        if all(g is not None for g in given):
+            return [np.array([*given, *tail], dtype=float)]
         random = np.random.default_rng(0)
         fills = [np.zeros(len(given)), np.ones(len(given)), *(random.normal(size=(4, len(given))))]
-        guesses = [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]
-        return guesses[:1] if all(g is not None for g in given) else guesses
+        return [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]
 
     def constants(self, p: Array) -> Array:
         """Delay times, sampling periods and compute times, with their rows over the parameters."""
@@ -140,24 +143,25 @@ class Engine:
 
         inputs: one InputSignal an input. first: where the run starts, s (default: the first time).
         """
-        from hvdc_ident.simulate.driver import integrate
-
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
+        p = np.ascontiguousarray(p, dtype=float)
         u, *tables = _tables(tuple(inputs), begin, end)
         y, w = self.start(p, u, begin)
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
-        sizes = np.ones(max(s.np, 1)) if scale is None else scale
-        tol = tolerance
-        t_out = time if time.flags.carray else time.copy()
+        sizes = np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float)
+        allowed = np.array([tolerance.rtol, tolerance.atol])
+        t_out = np.ascontiguousarray(time, dtype=float)
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
             state, work = self._state(not explicit)
-            status, reached = integrate(
-                state, work, (begin, end), (tol.rtol, tol.atol), tol.max_steps, y, w, p, constants, *tables,
+            span = np.array([begin, end])
+            answer = self._integrators.integrate(
+                state, work, span, allowed, tolerance.max_steps, y, w, p, constants, *tables,
                 t_out, out, sizes, self._hess_row, self._hess_column,
             )  # fmt: skip
+            status = _status(answer)
             if STATUS[status] == "stiff" and method == "auto":
                 self._explicit = explicit = False
                 continue
@@ -167,7 +171,7 @@ class Engine:
         if status:
             raise SimulationError(
                 f"the simulation of model '{self.structure.model.name}' stopped: {STATUS[status]}",
-                where=f"t = {reached:.6g} s",
+                where=f"t = {span[0]:.6g} s",
                 got=f"{statistics.accepted} steps accepted, {statistics.rejected} rejected, {statistics.events} switches",
                 hint=HINTS[STATUS[status]],
             )
@@ -190,7 +194,6 @@ class Engine:
 
     def _template(self, rosenbrock: bool) -> tuple[Any, int]:
         """The record before a run, and how many doubles of workspace a run takes."""
-        from hvdc_ident.simulate.driver import room
         from hvdc_ident.simulate.state import COUNTED, RUN, place
 
         s = self.structure.sizes
@@ -213,7 +216,7 @@ class Engine:
         for name, value in given.items():
             state[place(name)] = value
         self._counted = [place(name) for name in COUNTED]
-        return state, int(room(state.copy()))
+        return state, self._integrators.room(state.copy())
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """Whether the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
@@ -246,19 +249,11 @@ class Engine:
         return jac
 
 
-def prepare_integrators() -> None:
-    """Nothing; the integrators are loaded, or compiled where this installation has not compiled them as they are now."""
-    from numba.core.event import install_listener
-
-    from hvdc_ident.simulate.announcement import Announcement
-    from hvdc_ident.simulate.driver import INTEGRATE, ROOM, integrate, room
-    from hvdc_ident.simulate.rest import REST, rest
-
-    if not integrate.signatures:
-        with install_listener("numba:compile", Announcement()):
-            rest.compile(REST)
-            room.compile(ROOM)
-            integrate.compile(INTEGRATE)
+def _status(answer: int) -> int:
+    """The status in what one of the integrators answered."""
+    if answer == 0:
+        raise MemoryError
+    return answer - 1
 
 
 @lru_cache(maxsize=64)

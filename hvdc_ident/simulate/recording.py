@@ -6,14 +6,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-from hvdc_ident.effects import EffectUse
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.transform import fresh, rewritten
 from hvdc_ident.parameters import Parameter
+
+if TYPE_CHECKING:
+    from hvdc_ident.effects import EffectUse
 
 
 def with_recording(model: Model, experiment: Experiment) -> Model:
@@ -30,6 +33,8 @@ def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[
 
 def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
     """The recording chains as effects at the outputs: what the instrument does to the signal, in its order."""
+    from hvdc_ident.effects import EffectUse
+
     chains = []
     for output, chain in instrument.items():
         for name in ("window-mean", "delay"):

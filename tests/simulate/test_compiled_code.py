@@ -66,7 +66,7 @@ def test_outputs_of_a_plain_run_and_of_one_with_sensitivities_are_what_their_tex
 
 def test_the_cache_knows_every_file_that_is_compiled():
     folder = Path(room.__file__).parent
-    compiled = {"@kernel", "@njit", "@intrinsic", "@elementwise"}
+    compiled = {"@kernel", "@njit", "@intrinsic", "@elementwise", "cfunc("}
     found = {p.stem for p in folder.glob("*.py") if any(word in p.read_text() for word in compiled)}
     assert found <= set(_FILES)
     assert all((folder / f"{name}.py").exists() for name in _FILES)
