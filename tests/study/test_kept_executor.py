@@ -13,7 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvdc_ident.errors import ComputationError
+from hvdc_ident.fit import Free
+from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.profile import profiles
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.study.executors import LocalPool
 from hvdc_ident.study.executors.kept import KeptExecutor
@@ -105,3 +108,49 @@ def test_only_dataclasses_of_the_package_are_made(name):
 def test_what_cannot_be_kept_says_so():
     with pytest.raises(ComputationError, match="cannot be kept"):
         list(KeptExecutor(Shelf()).map(lambda x: Path(), [1]))
+
+
+class Valley:
+    """Rosenbrock's two residuals, counted; ends the program at the evaluation `stop_at`."""
+
+    def __init__(self, stop_at=None):
+        self.count, self.stop_at = 0, stop_at
+
+    def __call__(self, t):
+        self.count += 1
+        if self.count == self.stop_at:
+            raise KeyboardInterrupt
+        return np.array([1 - t[0], 10 * (t[1] - t[0] ** 2)]), np.array([[-1.0, 0], [-20 * t[0], 10]])
+
+
+def walked(valley, shelf):
+    unknowns = (Free("x", 0.0), Free("y", 0.0))
+    return profiles(LeastSquares(unknowns, valley), np.array([1.0, 1.0]), executor=KeptExecutor(shelf))
+
+
+def test_a_profile_goes_on_from_its_last_step():
+    whole, steps = Valley(), Shelf()
+    expected = walked(whole, steps)
+    assert len(steps) > 20 and whole.count > len(steps)
+    longest = max(unpacked(v).evaluations for v in steps.values())
+    for stop_at in range(1, whole.count, 7):
+        shelf, first, second = Shelf(), Valley(stop_at), Valley()
+        with pytest.raises(KeyboardInterrupt):
+            walked(first, shelf)
+        found = walked(second, shelf)
+        assert first.count + second.count <= whole.count + longest  # no more than the running step again
+        assert second.count == whole.count - sum(unpacked(v).evaluations for v in kept_before(shelf, first))
+        for name, profile in expected.by_name.items():
+            assert found.by_name[name].thetas.tobytes() == profile.thetas.tobytes()
+            assert found.by_name[name].ci95 == profile.ci95
+
+
+def kept_before(shelf, first):
+    """The steps that were finished when the first run ended: the shelf keeps them in the order they were put."""
+    kept, spent = [], 0
+    for value in shelf.values():
+        spent += unpacked(value).evaluations
+        if spent >= first.count:
+            break
+        kept.append(value)
+    return kept

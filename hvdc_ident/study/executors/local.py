@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import operator
 import os
 import pickle
 import signal
@@ -26,6 +27,7 @@ from hvdc_ident.study.executors.ended import Ended, in_order
 BATCH = 0.2  # s of work sent to a worker at a time
 REPORT = 1e-4  # s of finished work a worker may hold back: a kill of the parent loses no more of it
 START = 180.0  # s a worker may take to begin
+MOST = 1000  # items sent to a worker at a time
 DEATHS = 2  # of workers at the same item before it is given up
 IDLE = -1
 
@@ -97,7 +99,8 @@ class OpenPool:
 
     def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Ended]:
         """What became of each item, as it ends."""
-        session = _Session(self._settings, pickle.dumps(function), iter(enumerate(items)), self._idle)
+        share = -(-operator.length_hint(items) // (2 * self._settings.workers))
+        session = _Session(self._settings, pickle.dumps(function), iter(enumerate(items)), self._idle, share or MOST)
         try:
             yield from session.ends()
         finally:
@@ -112,8 +115,10 @@ class OpenPool:
 class _Session:
     """One run of a pool."""
 
-    def __init__(self, pool: LocalPool, function: bytes, items: Iterator[tuple[int, Any]], idle: list[_Worker]) -> None:
-        self.pool, self.function, self.items, self.idle = pool, function, items, idle
+    def __init__(
+        self, pool: LocalPool, function: bytes, items: Iterator[tuple[int, Any]], idle: list[_Worker], most: int
+    ) -> None:
+        self.pool, self.function, self.items, self.idle, self.most = pool, function, items, idle, min(most, MOST)
         self.workers: list[_Worker] = []
         self.again: deque[tuple[int, Any]] = deque()
         self.deaths: dict[int, int] = {}
@@ -163,7 +168,7 @@ class _Session:
 
     def _batch(self) -> list[tuple[int, Any]]:
         """The next items: one that has ended a worker goes alone."""
-        size = max(1, min(1000, int(BATCH / self.cost))) if self.cost > 0 else 1
+        size = max(1, min(self.most, int(BATCH / self.cost))) if self.cost > 0 else 1
         batch: list[tuple[int, Any]] = []
         while len(batch) < size:
             if self.again:
@@ -302,15 +307,19 @@ def _serve(connection: Connection, current: Any, memory: int | None, parent: int
 
             resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     work: Callable[[Any], Any] | None = None
+    loaded = b""
     with contextlib.suppress(OSError, EOFError):
         while True:
             message = connection.recv_bytes()
+            if message == loaded:  # the same work again, with all it has compiled
+                connection.send((0.0, []))
+                continue
             content = pickle.loads(message)
             if isinstance(content, list):
                 assert work is not None  # the function comes before its items
                 _run_batch(connection, work, content, current)
             else:
-                work = content
+                work, loaded = content, message
                 connection.send((0.0, []))
 
 
