@@ -6,12 +6,12 @@ event decide; given standard deviations stand unless those records are plainly n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
+from hvdc_ident.discrepancy.colour import TANH, Colour, Likelihood, likelihood, together
 from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.problem import Problem
@@ -25,6 +25,8 @@ FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
 SURE = 3.3
 """Standard errors by which the records before the event must exceed a given noise to replace it."""
+GIVEN = "given"
+"""The source of a standard deviation that stands as it was given."""
 SOFT = 1e-6
 LONG = 120
 """Rows of a record from which more than one AR coefficient is told."""
@@ -38,8 +40,9 @@ STANDS_OUT = 12.0
 class Noise:
     """The noise of one output. std: in its unit, None where the data are deterministic (the misfit stands in).
 
-    model: its AR coefficients from row to row, () where it is white; error: the standard error of a single one. step:
-    what values are rounded to, 0 for nothing. source: where it comes from, in words. rows: how many before an event.
+    model: its AR coefficients from row to row, () where it is white; error: the standard error of artanh of a single
+    one. step: what values are rounded to, 0 for nothing. source: where it comes from, in words. rows: how many before an
+    event.
     """
 
     std: float | None
@@ -51,41 +54,98 @@ class Noise:
 
 
 def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[Noise]:
-    """The noise of every measured output, from all its records together."""
+    """The noise of every measured output, from all its records together; AR coefficients from all outputs together."""
     outputs = dict.fromkeys(o for e in experiments for o in e.outputs)
-    return FrozenMap({o: _noise(o, [e for e in experiments if o in e.outputs]) for o in outputs})
+    quiet = {o: _quiet(o, [e for e in experiments if o in e.outputs]) for o in outputs}
+    short = {o: likelihood(q.records) for o, q in quiet.items() if q.moves and q.even and not q.longer}
+    colours = _colours(quiet, short)
+    return FrozenMap({o: _noise(q, colours.get(o, Colour()), short.get(o)) for o, q in quiet.items()})
 
 
-def _noise(output: str, experiments: Sequence[Experiment]) -> Noise:
+@dataclass(frozen=True, eq=False)
+class Quiet:
+    """The records of one output before the events, less line and common sine, and what is told of them.
+
+    std: their standard deviation if they were white; moves: whether there is noise in them at all. given: the standard
+    deviation told; step: what the whole records are rounded to; rounded: their noise when below that. floor: the least a
+    record can hold. longer: an AR model of several coefficients, where there are rows enough. even: evenly spaced rows.
+    """
+
+    records: tuple[Array, ...]
+    std: float
+    moves: bool
+    given: float | None
+    step: float
+    rounded: float
+    floor: float
+    longer: AR
+    even: bool
+
+    @property
+    def rows(self) -> int:
+        """All of them."""
+        return sum(r.size for r in self.records)
+
+
+def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
     before = [(t, r) for e in experiments for t, r in [_before(e, output)] if r.size >= FEWEST]
-    quiet = without_tone([t for t, _ in before], [r for _, r in before])
-    records = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
-    step = _step(records)
-    given = _given(output, experiments)
-    rows = sum(r.size for r in quiet)
-    power = sum(float(r @ r) for r in quiet)
-    scale = max((float(np.abs(r).max()) for r in records if r.size), default=1.0)
-    std = float(np.sqrt(power / max(rows - 2 * len(quiet), 1))) if rows else 0.0
-    model: AR = ()
-    error = 0.0
-    if std <= 1e-12 * scale or (given is not None and std < 1e-3 * given):
-        std = 0.0
-    elif _even(experiments):
-        model, error = _model(quiet, rows, power)
-        if len(model) == 1:  # a line takes more of slow noise than of white
-            std = float(np.sqrt(power / sum(_detrended(round(model[0], 2), min(r.size, 400))[1] for r in quiet)))
-    if given is None and std <= max((noise_floor(r) for r in records), default=0.0):
+    records = tuple(without_tone([t for t, _ in before], [r for _, r in before]))
+    whole = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
+    step, given, even = _step(whole), _given(output, experiments), _even(experiments)
+    rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(whole, step) ** 2)) if step > 0.0 else 0.0
+    floor = max((noise_floor(r) for r in whole), default=0.0)
+    rows, power = sum(r.size for r in records), sum(float(r @ r) for r in records)
+    scale = max((float(np.abs(r).max()) for r in whole if r.size), default=1.0)
+    std = float(np.sqrt(power / max(rows - 2 * len(records), 1))) if rows else 0.0
+    moves = std > 1e-12 * scale and (given is None or std >= 1e-3 * given) and (given is not None or std > floor)
+    longer = autoregression(records) if moves and even and rows >= LONG * len(records) else ()
+    return Quiet(records, std, moves, given, step, rounded, floor, longer if len(longer) > 1 else (), even)
+
+
+def _colours(quiet: Mapping[str, Quiet], short: Mapping[str, Likelihood]) -> dict[str, Colour]:
+    """The AR(1) coefficient of each output: told by the records alone first, then with the standard deviations given."""
+    if not short:
+        return {}
+    alone = dict(zip(short, together(np.array([s.profile for s in short.values()])), strict=True))
+    known = {o: quiet[o].given for o in short if alone[o].tanh and _agrees(short[o], quiet[o].given)}
+    rows = [s.profile if (g := known.get(o)) is None else s.at(g) for o, s in short.items()]
+    sharper = dict(zip(short, together(np.array(rows)), strict=True))
+    return {o: sharper[o] if alone[o].tanh and sharper[o].tanh else alone[o] for o in short}
+
+
+def _agrees(found: Likelihood, given: float | None) -> bool:
+    """Whether a standard deviation that was given may be the records'."""
+    return given is not None and _lack(found, given)[0] < SURE**2
+
+
+def _lack(found: Likelihood, given: float) -> tuple[float, bool]:
+    """By how much twice the log-likelihood falls with the standard deviation given, and whether the records are above it."""
+    best = np.unravel_index(np.argmax(found.values), found.values.shape)
+    return 2.0 * float(found.values.max() - found.at(given).max()), bool(found.std[best[1]] > given)
+
+
+def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> Noise:
+    given, rows, step = quiet.given, quiet.rows, quiet.step
+    std = quiet.std if quiet.moves else 0.0
+    if given is None and std <= quiet.floor:
         if step > 0.0:
-            rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(records, step) ** 2))
-            return Noise(rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+            return Noise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
         return Noise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
+    model = (colour.rho,) if colour.tanh else quiet.longer
+    if colour.tanh and found is not None:
+        std = found.best_std(colour.tanh)
     if given is None:
-        return Noise(std, model, error, step, "the records before the event", rows)
-    rho = sum(model) if len(model) != 1 else model[0]
-    independent = max(rows * (1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0)
-    if std > given * (1.0 + SURE / np.sqrt(2.0 * independent)):
-        return Noise(std, model, error, step, "the records before the event, noisier than what was given", rows)
-    return Noise(given, model, error, step, "given", rows)
+        return Noise(std, model, colour.error, step, "the records before the event", rows)
+    if colour.tanh and found is not None:
+        lack, above = _lack(found, given)
+        noisier = above and lack > SURE**2
+    else:
+        rho = sum(model)
+        independent = max(rows * (1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0)
+        noisier = std > given * (1.0 + SURE / np.sqrt(2.0 * independent))
+    if noisier:
+        return Noise(std, model, colour.error, step, "the records before the event, noisier than what was given", rows)
+    return Noise(given, model, colour.error, step, GIVEN, rows)
 
 
 def _even(experiments: Sequence[Experiment]) -> bool:
@@ -151,33 +211,6 @@ def _before(experiment: Experiment, output: str) -> tuple[Array, Array]:
     return t, np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
 
 
-def _model(quiet: Sequence[Array], rows: int, power: float) -> tuple[AR, float]:
-    """The AR model of several records together; of a single coefficient the error, freed of the bias a fitted line makes."""
-    n = rows // len(quiet)
-    longer = autoregression(quiet)
-    if len(longer) > 1 and n >= LONG:
-        return longer, 0.0
-    raw = sum(float(r[1:] @ r[:-1]) for r in quiet) / power
-    grid = np.linspace(-0.5, 0.985, 60)
-    seen = [_detrended(float(g), min(n, LONG))[0] for g in grid]
-    rho = float(np.interp(raw, seen, grid))
-    error = float(np.sqrt(max(1.0 - rho**2, 0.02) / (rows - len(quiet))))
-    return ((rho,), error) if abs(rho) > 1.645 * error else ((), 0.0)
-
-
-@lru_cache(maxsize=512)
-def _detrended(rho: float, n: int) -> tuple[float, float]:
-    """What n rows of AR(1) noise of variance 1 without their straight line show: lag-1 coefficient, and sum of squares.
-
-    Expected values: tr(L M S M)/tr(M S M) and tr(M S M), with S the correlation and M what takes the line out.
-    """
-    s = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) if rho else np.eye(n)
-    q = np.linalg.qr(np.column_stack([np.ones(n), np.arange(n, dtype=float)]))[0]
-    m = np.eye(n) - q @ q.T
-    a = m @ s @ m
-    return float(np.trace(a, 1) / np.trace(a)), float(np.trace(a))
-
-
 def _step(records: Sequence[Array]) -> float:
     """What the records are rounded to; 0 where they are not."""
     steps = []
@@ -207,7 +240,8 @@ def draws(
     """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
 
     fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
-    drawn too, within its error: what is not known of the noise widens what noise can do.
+    drawn too, within its error: what is not known of the noise widens what noise can do. Where the standard deviation is
+    not given it goes with the coefficient, for the steps from row to row are what is sure.
     """
     times = {e.name: e.time for e in problem.fitted_experiments}
     outputs = list(dict.fromkeys(b.output for b in blocks))
@@ -218,8 +252,10 @@ def draws(
         model = np.repeat(np.array(n.model)[:, None], count, axis=1)
         if len(n.model) == 1:  # one draw an output: its records share the noise
             spread = np.random.default_rng([seed, 2, outputs.index(b.output)]).standard_normal(count)
-            model = np.clip(model + n.error * spread, -0.6, 0.99)
+            model = np.tanh(np.clip(np.arctanh(model) + n.error * spread, TANH[0], TANH[-1]))
         e = _coloured(random.standard_normal((y.size, count)), model)
+        if len(n.model) == 1 and n.source != GIVEN:
+            e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
         if n.step:
             size = max((n.std or 0.0) ** 2 - n.step**2 / 12.0, 0.0) ** 0.5
             placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
