@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.discrepancy.candidates import Candidate, candidates
+from hvdc_ident.discrepancy.candidates import Candidate, candidates, kind_of
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Job, Refit, added, find, moved, unseen
+from hvdc_ident.discrepancy.scan import joined, scan
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import (
     Pick,
@@ -24,6 +25,7 @@ from hvdc_ident.discrepancy.select import (
 )
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.tones import tones
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit.estimate import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
@@ -136,6 +138,46 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     return _refitted(search, before, number, paths, found, scores, picks)
 
 
+def excess(refit: Refit) -> bool:
+    """Whether a model leaves more than noise, by size."""
+    rows = refit.rows * (1.0 - refit.correlation) / (1.0 + refit.correlation)
+    return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / max(rows, 4.0)))
+
+
+def _scanned(
+    search: Search, before: Refit, number: int, paths: Mapping[str, Path], found: tuple[Candidate, ...], scores: Scores
+) -> tuple[tuple[Candidate, ...], Scores, tuple[Pick, ...]]:
+    """Candidates and scores with the sizes that a closer look found, and the picks to refit for them."""
+    dense = candidates(
+        before.model,
+        slot_signals(paths),
+        [a.time for a in paths.values()],
+        search.effects,
+        search.places,
+        closer=True,
+    )
+    known = {(c.effect, c.at): k for k, c in enumerate(found)}
+    dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(before, c))
+    if not dense:
+        return found, scores, ()
+    text = f"round {number}: a closer look at {', '.join(dict.fromkeys(c.effect for c in dense))}"
+    seen = scan(before, dense, search.options.bootstraps, search.seed + number, search.executor, search.progress, text)
+    found = joined(found, [s.candidate for s in seen.spots])
+    at = [known[s.candidate.effect, s.candidate.at] for s in seen.spots]
+    columns = tuple(Column(k, len(found[k].probes) - 1) for k in at)
+    scores = scores.joined(replace(seen.scores, columns=columns, beside=seen.largest))
+    picks = [Pick(c.candidate, c.probe, 1.0, s.score) for c, s in zip(columns, seen.spots, strict=True)]
+    return found, scores, tuple(picks)
+
+
+def _worth_a_scan(before: Refit, candidate: Candidate) -> bool:
+    """Whether many sizes are run: at one slot that moves; not of levels at a state, which seldom come to rest."""
+    if len(candidate.at) > 1 or candidate.still:
+        return False
+    memory = effects()[candidate.effect].states != "none"
+    return memory or kind_of(before.model, candidate.at[0]) != "state"
+
+
 def _refitted(
     search: Search,
     before: Refit,
@@ -156,8 +198,12 @@ def _refitted(
     best = [found[t.pick.candidate] for t in sound[:2]]
     more = neighbours(looked, found, done, best, max(options.refits // 3, 2))
     trials += _trials(search, before, found, more, f"round {number}: refits beside the best")
-    failed = tuple(t for t in trials if t.refit.failure)
     sound = [t for t in trials if not t.refit.failure]
+    if all(excess(t.refit) for t in sound):
+        found, scores, extra = _scanned(search, before, number, paths, found, scores)
+        trials += _trials(search, before, found, extra, f"round {number}: refits of the closer look")
+        sound = [t for t in trials if not t.refit.failure]
+    failed = tuple(t for t in trials if t.refit.failure)
     if not sound:
         return Round(
             before, paths, found, scores, (), failed, same, None, "no candidate could be refitted", True, None

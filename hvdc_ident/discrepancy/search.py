@@ -10,8 +10,8 @@ import numpy as np
 from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
-from hvdc_ident.discrepancy.rounds import Round, Search, Trial, one_round
-from hvdc_ident.effects import EffectUse
+from hvdc_ident.discrepancy.rounds import Round, Search, Trial, excess, one_round
+from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
@@ -54,8 +54,7 @@ def forward(search: Search, first: Refit) -> Outcome:
 
 def is_noise(refit: Refit, search: Search) -> bool:
     """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
-    rows = refit.rows * (1.0 - refit.correlation) / (1.0 + refit.correlation)
-    if refit.chi2 / refit.rows > 1.0 + 3.0 * np.sqrt(2.0 / max(rows, 4.0)):
+    if excess(refit):
         return False
     tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
     return all(b.p > 0.05 for b in tests)
@@ -144,7 +143,8 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         names = dict(zip(p.names, new, strict=True))
         free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
         again.append(replace(p, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free))
+    unsettled = any(effects()[p.use.effect].restless for p in placed)
+    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
     nuisance = here.theta[len(here.problem.free) :]
     gains = [at[f.name] for f in first.problem.free]
     begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])

@@ -38,7 +38,11 @@ def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:
         c = column.candidate
         if t[k] > 0 and (c not in best or t[k] > t[best[c]]):
             best[c] = k
-    picks = [Pick(c, scores.columns[k].probe, float(expected[k]), float(t[k])) for c, k in best.items()]
+    picks = [
+        # The size of an effect that is scanned is met or it is not.
+        Pick(c, scores.columns[k].probe, 1.0 if effects()[found[c].effect].scanned else float(expected[k]), float(t[k]))
+        for c, k in best.items()
+    ]
     # Of equal scores the simpler: fewer places first, as listed.
     return tuple(sorted(picks, key=lambda p: (-round(p.score, 6), len(found[p.candidate].at), p.candidate)))
 

@@ -25,10 +25,12 @@ FOLLOW = 2e-4
 Measure = Literal[
     "one",
     "time",
+    "record/n",
     "time*R",
     "rate",
     "range",
     "peak",
+    "peak/n",
     "excursion",
     "range/time",
     "range/source",
@@ -47,6 +49,8 @@ class EffectParameter:
     measure: what a size is counted in when the effect is looked for; probes: the sizes worth trying, counted so;
     search: the bounds of a refit, counted so (None: those of the measure). near: instead, a factor up and down from the
     probe. held: a refit leaves it where it stands. companion: an optional one that is tried with the others only.
+    scan: the sizes of a closer look, where neighbouring sizes have little in common and no slope leads from one to the
+    next; counted in scanned_in (None: the measure).
     """
 
     value: float
@@ -57,6 +61,8 @@ class EffectParameter:
     description: str = ""
     measure: Measure = "one"
     probes: tuple[float, ...] = ()
+    scan: tuple[float, ...] = ()
+    scanned_in: Measure | None = None
     search: tuple[float, float] | None = None
     near: float | None = None
     optional: bool = False
@@ -144,6 +150,7 @@ class Effect:
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: whether it brings another signal in (`from`). needs_expression: whether its form is given with it,
     with coefficients of the user's own names. resistance: the parameter for which a resistance of the model stands in.
+    restless: whether it moves the model by itself, so that a record of it does not begin at rest.
     """
 
     name: str
@@ -158,6 +165,12 @@ class Effect:
     needs_source: bool = False
     needs_expression: bool = False
     resistance: str = ""
+    restless: bool = False
+
+    @property
+    def scanned(self) -> bool:
+        """Whether looking for it takes a closer look at many sizes."""
+        return any(q.scan for q in self.parameters.values())
 
     def is_neutral(self, values: Mapping[str, float | str]) -> bool:
         """Whether the effect is not there: a parameter switches it off, or none of the optional ones acts."""

@@ -104,10 +104,12 @@ Size = Callable[[float, SlotSignal, SlotSignal, Mapping[str, float]], float]
 _SIZES: dict[Measure, Size] = {
     "one": lambda x, u, source, p: x,
     "time": lambda x, u, source, p: u.time(x),
+    "record/n": lambda x, u, source, p: 5.0 * u.slow / x,
     "time*R": lambda x, u, source, p: u.time(x) * p["R"],
     "rate": lambda x, u, source, p: 1.0 / u.time(x),
     "range": lambda x, u, source, p: x * u.range,
     "peak": lambda x, u, source, p: x * u.peak,
+    "peak/n": lambda x, u, source, p: u.peak / x,
     "excursion": lambda x, u, source, p: u.peak + (x - 1.0) * u.excursion,
     "range/time": lambda x, u, source, p: u.range / u.time(x),
     "range/source": lambda x, u, source, p: x * u.range / source.range,
@@ -117,10 +119,12 @@ _SIZES: dict[Measure, Size] = {
 _SEARCH: dict[Measure, tuple[float, float]] = {
     "one": (-10.0, 10.0),
     "time": (-0.5, 1.3),
+    "record/n": (1e4, 2.0),
     "time*R": (-0.5, 1.3),
     "rate": (1.3, -0.5),
     "range": (-2.0, 2.0),
     "peak": (0.1, 20.0),
+    "peak/n": (5000.0, 0.3),
     "excursion": (0.02, 1.5),
     "range/time": (1.3, -0.5),
     "range/source": (-2.0, 2.0),
@@ -151,9 +155,16 @@ class Probe:
 
 
 def probes(
-    effect: Effect, signal: SlotSignal, source: SlotSignal | None = None, given: Mapping[str, float] | None = None
+    effect: Effect,
+    signal: SlotSignal,
+    source: SlotSignal | None = None,
+    given: Mapping[str, float] | None = None,
+    *,
+    closer: bool = False,
 ) -> tuple[Probe, ...]:
     """Sizes worth trying at a slot with this signal; none for a term, whose form has to be found first.
+
+    closer: the many of a closer look, for the parameters that ask for one.
 
     source: the signal that the effect brings in, where it does. given: values that are settled, such as a resistance
     of the model. An effect made of optional parts only is tried with each of them and with all.
@@ -162,6 +173,8 @@ def probes(
         return ()
     other = source or signal
     settled = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
+    if closer:
+        settled |= {n: replace(q, probes=q.scan, measure=q.scanned_in or q.measure) for n, q in effect.parameters.items() if q.scan}
     effect = replace(effect, parameters=effect.parameters | settled)
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}
     absent = {n: 0.0 for n, q in effect.parameters.items() if q.optional}

@@ -65,9 +65,10 @@ EFFECT = Effect(
                 0.01,
                 neutral=0.0,
                 description="distance of two levels",
-                measure="range",
-                probes=(0.02, 0.07, 0.2),
-                search=(1e-3, 1.0),
+                measure="peak/n",
+                probes=(3.0, 10.0, 30.0, 100.0, 300.0),
+                # A level of n is told from the next where the signal is at its peak: even steps in n, a part of a level each.
+                scan=tuple(0.8 + 0.4 * k for k in range(250)),
             )
         }
     ),

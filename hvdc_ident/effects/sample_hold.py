@@ -19,7 +19,9 @@ EFFECT = Effect(
     parameters=FrozenMap(
         {
             "Ts": EffectParameter(
-                1e-4, neutral=0.0, unit="s", description="sampling period", measure="time", probes=(0.1, 0.4, 0.7)
+                1e-4, neutral=0.0, unit="s", description="sampling period", measure="time", probes=(0.1, 0.4, 0.7),
+                # Samples of a record: as many are told from a third more of one, until a sample is but a few rows.
+                scan=(*(4.0 + 0.3 * k for k in range(220)), *(70.0 * 1.05**k for k in range(45))), scanned_in="record/n",
             ),
             # At most one period: a bound that moves with Ts, so a refit leaves it.
             "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period", held=True),
