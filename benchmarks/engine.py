@@ -9,6 +9,11 @@ of several runs; only ratios of one run mean anything on a shared machine.
 
 from __future__ import annotations
 
+import os
+import resource
+import subprocess
+import sys
+import tempfile
 import time
 from itertools import pairwise
 
@@ -174,24 +179,71 @@ def _casadi(e, values, rules):
     return sp.lambdify(free, e, modules=[rules, "math"])(*(values[v.name] for v in free))
 
 
-def fresh_structure():
-    """Seconds from a model definition nobody compiled yet to its first trajectory with sensitivities."""
+def fresh_structure(slot):
+    """Seconds (CPU, wall) from a model definition nobody compiled yet to its first trajectory with sensitivities."""
     link = load_model("vsc-hvdc-link")
-    start = time.process_time()
-    model = link.with_effects(
-        [
-            {"effect": "lag", "at": ["P2_m"], "parameters": {"T": 2e-3}},
-            {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.9}},
-        ]
-    )
-    simulate(model, CASE, sensitivities=GAINS)
-    return time.process_time() - start
+    kept = os.environ.get("NUMBA_CACHE_DIR")
+    with tempfile.TemporaryDirectory() as empty:
+        os.environ["NUMBA_CACHE_DIR"] = empty  # code from an earlier run of this file is on disk
+        start = time.process_time(), time.perf_counter()
+        model = link.with_effects(
+            [
+                {"effect": "lag", "at": [slot], "parameters": {"T": 2e-3}},
+                {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.9}},
+            ]
+        )
+        simulate(model, CASE, sensitivities=GAINS)
+        taken = time.process_time() - start[0], time.perf_counter() - start[1]
+    del os.environ["NUMBA_CACHE_DIR"]
+    if kept is not None:
+        os.environ["NUMBA_CACHE_DIR"] = kept
+    return taken
+
+
+FIRST_RUN = f"""
+import numpy as np
+from hvdc_ident import load_model, simulate
+from hvdc_ident.experiment import InputSignal, experiment
+inputs = {{n: InputSignal.step(*s) for n, s in {STEPS}.items()}}
+case = experiment("steps", np.linspace(0.0, 1.5, 3001), inputs)
+simulate(load_model("vsc-hvdc-link"), case, sensitivities={GAINS})
+"""
+
+
+HELP = "import sys; sys.argv = ['hvdc-ident', '--help']; from hvdc_ident.cli import main; main()"
+
+
+def fresh_process(*arguments):
+    """Seconds (CPU, wall) of a new process of Python from its start to its end."""
+
+    def used():
+        children = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return children.ru_utime + children.ru_stime, time.perf_counter()
+
+    start = used()
+    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+    return tuple(after - before for before, after in zip(start, used(), strict=True))
+
+
+def least(figures):
+    """The least CPU and the least wall time of several runs, as text."""
+    cpu, wall = map(min, zip(*figures, strict=True))
+    return f"{cpu:.2f} s CPU, {wall:.2f} s wall"
+
+
+def starts():
+    """Prints what comes before the first result: of a process, of a structure, of the command."""
+    simulate(load_model("vsc-hvdc-link"), CASE, sensitivities=GAINS)
+    print("new process, its start to the end of the link's first run with 8 sensitivities, code on disk:", end=" ")
+    print(least([fresh_process("-c", FIRST_RUN) for _ in range(10)]))
+    print("new structure, definition to the end of its first run with 8 sensitivities:", end=" ")
+    print(least([fresh_structure(slot) for slot in ("P2_m", "Q1_m", "Q2_m", "Vdc1_m", "Idc")]))
+    print("hvdc-ident --help:", least([fresh_process("-c", HELP) for _ in range(5)]))
 
 
 def main():
     link = load_model("vsc-hvdc-link")
-    simulate(link, CASE, sensitivities=GAINS)
-    print(f"new structure, definition to first trajectory with 8 sensitivities: {fresh_structure():.2f} s")
+    starts()
     for label, model, methods in (("stiff", link, ("auto",)), ("smooth", smooth(link), ("auto", "explicit"))):
         for rtol in (1e-6, 1e-8):
             for names in ((), GAINS):

@@ -1,4 +1,4 @@
-"""Memory over many runs of one structure and over many structures: resident KiB before and after.
+"""Memory over many runs of one structure and over many structures, compiled and from disk: resident KiB before and after.
 
 python benchmarks/memory.py [RUNS] [STRUCTURES]
 """
@@ -6,7 +6,9 @@ python benchmarks/memory.py [RUNS] [STRUCTURES]
 from __future__ import annotations
 
 import gc
+import os
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -35,12 +37,15 @@ def main(runs: int = 10_000, structures: int = 1_000) -> None:
     print(f"{runs} runs: {before} -> {resident()} KiB")
     names = list(link.parameters)
     pairs = [(a, b, c) for a in names for b in names for c in names if len({a, b, c}) == 3]
-    for three in pairs[:50]:
-        Engine(link, three)
-    before = resident()
-    for three in pairs[50 : 50 + structures]:
-        Engine(link, three)
-    print(f"{structures} structures: {before} -> {resident()} KiB")
+    with tempfile.TemporaryDirectory() as empty:
+        os.environ["NUMBA_CACHE_DIR"] = empty
+        for three in pairs[:50]:
+            Engine(link, three)
+        for source in ("compiled", "from disk"):
+            before = resident()
+            for three in pairs[50 : 50 + structures]:
+                Engine(link, three)
+            print(f"{structures} structures, {source}: {before} -> {resident()} KiB", flush=True)
 
 
 if __name__ == "__main__":
