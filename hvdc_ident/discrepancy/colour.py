@@ -23,6 +23,8 @@ SPREADS = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6)
 """By how much the outputs' artanh(rho) may differ among each other, as a standard deviation."""
 COLOURED = 1.645
 """Standard errors that a coefficient has to lie off 0 to be one."""
+IN_COMMON = 11.5
+"""Twice the log-likelihood by which the records' sum has to differ from their differences to hold something in common."""
 LONGEST = 500
 """Rows of a record that are taken as one; a longer one is cut."""
 
@@ -83,6 +85,24 @@ def likelihood(records: Sequence[Array], degree: int = 1) -> Likelihood:
             + squares[:, None] * np.exp(-log_variance)[None, :]
         )
     return Likelihood(values, np.exp(0.5 * log_variance))
+
+
+def without_common(records: Sequence[Array]) -> list[Array]:
+    """The differences of the records, as records of the same noise, where what they have in common is no noise; else all.
+
+    A model at rest may ripple (a quantiser or a backlash in its loop), in every record alike. Orthonormal combinations
+    of records of independent noise are such records too: their sum, which holds the ripple, and their differences.
+    """
+    lengths = {r.size for r in records}
+    if len(records) < 2 or len(lengths) > 1 or min(lengths) < 8 or not any(np.any(r) for r in records):
+        return list(records)
+    count = len(records)
+    turn = np.linalg.qr(np.column_stack([np.ones(count), np.eye(count)[:, 1:]]))[0]
+    turned = list((np.column_stack(records) @ turn).T)
+    if not all(np.any(r) for r in turned):
+        return list(records)
+    parts = [float(likelihood(r).values.max()) for r in (turned[:1], turned[1:], turned)]
+    return turned[1:] if 2.0 * (parts[0] + parts[1] - parts[2]) > IN_COMMON else list(records)
 
 
 def _squares(same: Array, degree: int) -> tuple[int, Array, Array]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.discrepancy.colour import TANH, Colour, Likelihood, likelihood, together
+from hvdc_ident.discrepancy.colour import TANH, Colour, Likelihood, likelihood, together, without_common
 from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.problem import Problem
@@ -64,7 +64,7 @@ def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[Noise]:
 
 @dataclass(frozen=True, eq=False)
 class Quiet:
-    """The records of one output before the events, less line and common sine, and what is told of them.
+    """The records of one output before the events, less line and what they have in common, and what is told of them.
 
     std: their standard deviation if they were white; moves: whether there is noise in them at all. given: the standard
     deviation told; step: what the whole records are rounded to; rounded: their noise when below that. floor: the least a
@@ -89,11 +89,12 @@ class Quiet:
 
 def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
     before = [(t, r) for e in experiments for t, r in [_before(e, output)] if r.size >= FEWEST]
-    records = tuple(without_tone([t for t, _ in before], [r for _, r in before]))
+    quiet = without_tone([t for t, _ in before], [r for _, r in before])
     whole = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
     step, given, even = _step(whole), _given(output, experiments), _even(experiments)
     rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(whole, step) ** 2)) if step > 0.0 else 0.0
     floor = max((noise_floor(r) for r in whole), default=0.0)
+    records = tuple(without_common(quiet) if even else quiet)
     rows, power = sum(r.size for r in records), sum(float(r @ r) for r in records)
     scale = max((float(np.abs(r).max()) for r in whole if r.size), default=1.0)
     std = float(np.sqrt(power / max(rows - 2 * len(records), 1))) if rows else 0.0

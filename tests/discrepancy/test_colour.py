@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
-from hvdc_ident.discrepancy.colour import RHO, TANH, likelihood, together
+from hvdc_ident.discrepancy.colour import RHO, TANH, likelihood, together, without_common
 from hvdc_ident.discrepancy.noise import Noise, draws, noise_of
 from hvdc_ident.fit import Problem
 from hvdc_ident.frozen import FrozenMap
@@ -124,3 +124,15 @@ def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
         steps.append(float(np.std(np.log(power))))
     assert steps[0] < 0.3
     assert steps[1] > 1.5 * steps[0]
+
+
+def test_a_ripple_that_all_records_share_is_no_noise() -> None:
+    noise = list(process(0.9, (50, 3), 11).T)
+    ripple = 0.8 * np.where(np.arange(50) % 3 == 0, 1.0, -0.5)
+    rippling = [r + ripple for r in noise]
+    assert together(likelihood(rippling).profile[None])[0].rho < 0.75
+    left = without_common(rippling)
+    assert len(left) == 2
+    assert together(likelihood(left).profile[None])[0].rho == pytest.approx(0.9, abs=0.08)
+    alike = sum(len(without_common(list(process(0.9, (50, 3), seed).T))) == 3 for seed in range(20))
+    assert alike >= 18
