@@ -22,6 +22,10 @@ from hvdc_ident.sensitivity.fisher import independent, null_directions
 from hvdc_ident.trajectory import Array
 
 
+NEAR = 0.05
+"""Share of the rows' interval: a row this near to a jump of an input lies on it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Nominal:
     """A model at its optimum, and what a test of it needs.
@@ -56,12 +60,17 @@ class Nominal:
         columns = np.vstack([b.jacobian for b in self.blocks])
         if self.extra is not None:
             columns = np.hstack([columns, self.extra])
-        norms = np.linalg.norm(columns, axis=0)
-        columns = columns[:, norms > 0] / norms[norms > 0]
-        if not columns.shape[1]:
-            return np.zeros((columns.shape[0], 0))
-        u, s, _ = np.linalg.svd(columns, full_matrices=False)
-        return np.asarray(u[:, s > 1e-7 * s[0]])
+        if self.problem.unsettled:
+            columns = np.hstack([columns, self.problem.starts(self.theta)])
+        return _orthonormal(columns)
+
+    @cached_property
+    def starts(self) -> Array:
+        """(N, k) orthonormal, and to the basis: what unknown starts of the states can make of the residual besides."""
+        if self.problem.unsettled:
+            return np.zeros((self.residual.size, 0))
+        left = self.projected(_unit(self.problem.starts(self.theta)))
+        return _orthonormal(left[:, np.linalg.norm(left, axis=0) > 1e-6])
 
     @property
     def values(self) -> dict[str, float]:
@@ -81,6 +90,20 @@ class Nominal:
             assert measured is not None
             found.append(measured[b.output][b.rows] - b.misfit)
         return found
+
+
+def _unit(columns: Array) -> Array:
+    """The columns that are not 0, of length 1."""
+    norms = np.linalg.norm(columns, axis=0)
+    return np.asarray(columns[:, norms > 0] / norms[norms > 0])
+
+
+def _orthonormal(columns: Array) -> Array:
+    unit = _unit(columns)
+    if not unit.shape[1]:
+        return unit
+    u, s, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(u[:, s > 1e-7 * s[0]])
 
 
 def nominal(
@@ -107,7 +130,7 @@ def nominal(
         problem = gated(problem, gate(report))
     # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
     told = tuple(
-        e.with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))
+        off_jumps(e).with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))
         for e in problem.experiments
     )
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
@@ -127,6 +150,28 @@ def nominal(
         for o, n in noise.items()
     }
     return Nominal(optimum.problem, optimum.theta, FrozenMap(stated)), tuple(notes)
+
+
+def off_jumps(experiment: Experiment) -> Experiment:
+    """The experiment without the measured rows that lie on a jump of an input.
+
+    Whether such a row shows the value before or after, or where a quick part of the plant then is, no recorder tells: one
+    row can weigh as much as all that a missing effect does to the others.
+    """
+    if experiment.measured is None:
+        return experiment
+    time = experiment.time
+    steps = np.diff(time)
+    near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    jumps = [t for s in experiment.inputs.values() for t in s.times[1:][(np.diff(s.times) == 0) & (np.diff(s.values) != 0)]]
+    on = np.zeros(time.size, dtype=bool)
+    for t in jumps:
+        on |= np.abs(time - t) <= near
+    if not on.any() or on.all():
+        return experiment
+    values = np.array(experiment.measured.values)
+    values[on] = np.nan
+    return experiment.with_(measured=replace(experiment.measured, values=values))
 
 
 def _stated(experiment: Experiment, output: str, noise: Noise) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates, kind_of
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Job, Refit, added, find, moved, unseen
+from hvdc_ident.discrepancy.refit import Job, Refit, added, find, held_out, moved, unseen
 from hvdc_ident.discrepancy.scan import joined, scan
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import (
@@ -35,6 +35,8 @@ LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
 AGREED = 10.0
 """By how much chi2 of the held-out data has to fall for them to agree."""
+SILENT = 30.0
+"""Squared difference of held-out answers, in noise units, below which those data cannot judge an effect."""
 STEP = 0.05
 """Share of the gap that a second effect has to take away at least."""
 
@@ -271,9 +273,9 @@ def objections(search: Search, before: Refit, trial: Trial, scores: Scores, *, f
     if not now < was:
         return f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
     tables = _tables(before, refit) if search.material else None
-    # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, and the fitted
-    # ones show the size.
-    agree = (was**2 - now**2) * _unseen_rows(refit) > AGREED
+    # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
+    # nothing to say, and the fitted ones show the size.
+    agree = (was**2 - now**2) * _unseen_rows(refit) > AGREED or _silent(before, refit)
     fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))
     if not material_gap(was, now, options.holdout_share, search.material, tables) and not (
         agree and not search.material and material_gap(*fitted, options.holdout_share, None, None)
@@ -288,6 +290,14 @@ def _unseen_rows(refit: Refit) -> int:
     """Rows of the data that judge: the held-out ones, or all of the fitted ones, each left out in turn."""
     held = [e for e in refit.problem.experiments if e.role == "holdout" and e.outputs]
     return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows
+
+
+def _silent(before: Refit, after: Refit) -> bool:
+    """Whether the held-out experiments would look the same with the effect and without."""
+    one, two = (held_out(r.problem, r.theta) for r in (before, after))
+    if not one or not two:
+        return False
+    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < SILENT
 
 
 def _tables(before: Refit, after: Refit) -> tuple[Mapping[str, float], Mapping[str, float]]:

@@ -26,8 +26,10 @@ from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
-PLACES = 4
-"""Places of an effect, the best by score, that are looked at closer still."""
+SPOTS = 6
+"""Sizes of an effect, the best by score at any place, around which is looked closer still."""
+PLACES = 3
+"""Places of an effect that are refitted then."""
 BETWEEN = 10
 """Sizes between one of the scan and its neighbour, then."""
 QUICK = Tolerance(rtol=1e-5, atol=1e-8, max_steps=600)
@@ -74,7 +76,7 @@ def scan(
     """The best sizes of effects that are scanned, and how large a score noise alone gives among so many."""
     right = _right_sides(before.nominal(), bootstraps, seed)
     rough = _looked(before, dense, right, executor, progress, text)
-    best = [_neighbourhood(dense[c.candidate], c.probe) for c in _best(dense, rough)]
+    best = [_neighbourhood(dense[c.candidate], c.probe) for c in _tops(dense, rough)]
     fine = _looked(before, best, right, executor, progress, f"{text}, closer still")
     chosen = _best(best, fine)
     at = [fine.columns.index(c) for c in chosen]
@@ -92,19 +94,30 @@ def _right_sides(nominal: Nominal, bootstraps: int, seed: int) -> Array:
     return np.hstack(parts)
 
 
+def _tops(found: Sequence[Candidate], scores: Scores) -> list[Column]:
+    """The best sizes of every effect at any place, neighbours of better ones left out."""
+    kept: dict[str, list[Column]] = {}
+    for c in _falling(scores):
+        same = kept.setdefault(found[c.candidate].effect, [])
+        near = any(k.candidate == c.candidate and abs(k.probe - c.probe) <= 1 for k in same)
+        if len(same) < SPOTS and not near:
+            same.append(c)
+    return [c for group in kept.values() for c in group]
+
+
 def _best(found: Sequence[Candidate], scores: Scores) -> list[Column]:
     """The best size at each of the best places of every effect."""
-    t = scores.t
-    best: dict[int, int] = {}
-    for k, column in enumerate(scores.columns):
-        if t[k] > 0 and (column.candidate not in best or t[k] > t[best[column.candidate]]):
-            best[column.candidate] = k
-    kept: dict[str, list[Column]] = {}
-    for i, k in sorted(best.items(), key=lambda item: -t[item[1]]):
-        same = kept.setdefault(found[i].effect, [])
-        if len(same) < PLACES:
-            same.append(scores.columns[k])
-    return [c for group in kept.values() for c in group]
+    kept: dict[str, dict[tuple[str, ...], Column]] = {}
+    for c in _falling(scores):
+        places = kept.setdefault(found[c.candidate].effect, {})
+        if len(places) < PLACES:
+            places.setdefault(found[c.candidate].at, c)
+    return [c for places in kept.values() for c in places.values()]
+
+
+def _falling(scores: Scores) -> list[Column]:
+    """The columns with something to score, the best first."""
+    return [scores.columns[k] for k in np.argsort(-scores.t, kind="stable") if scores.t[k] > 0]
 
 
 def _looked(
