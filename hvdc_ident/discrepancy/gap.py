@@ -43,13 +43,13 @@ def _pooled(problem: Problem, theta: Array) -> float | None:
         blocks = problem.blocks(theta, derivatives=False)
     except SimulationError:
         return None
-    return float(np.sqrt(np.mean(np.concatenate([b.residual for b in blocks]) ** 2)))
+    return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks]))))
 
 
 def _held(refit: Refit) -> float | None:
     """The held-out residual of the given gains; None without held-out experiments, or where a run fails."""
     blocks = held_out(refit.problem, refit.theta)
-    return float(np.sqrt(np.mean(np.concatenate([b.residual for b in blocks]) ** 2))) if blocks else None
+    return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks])))) if blocks else None
 
 
 def with_given(refitted: Refit, start: Mapping[str, float]) -> Refit:

@@ -24,7 +24,7 @@ SEGMENTS = 6
 
 def localise(model: Model | None, nominal: Nominal) -> dict[str, Any]:
     """Shares of the gap beyond noise, by what it can be sorted by. model: for the blocks, where there are equations."""
-    power = {(b.experiment, b.output): float(b.residual @ b.residual) - b.residual.size for b in nominal.blocks}
+    power = {(b.experiment, b.output): b.chi2 - b.residual.size for b in nominal.blocks}
     return {
         "outputs": _shares(power, 1),
         "experiments": _shares(power, 0),
@@ -51,7 +51,7 @@ def _times(nominal: Nominal) -> tuple[Array, Array]:
     """(N,) seconds from the event, and (N,) squared residuals beyond noise."""
     experiments = {e.name: e for e in nominal.problem.fitted_experiments}
     since = [experiments[b.experiment].time[b.rows] - _event(experiments[b.experiment]) for b in nominal.blocks]
-    return np.concatenate(since), nominal.residual**2 - 1.0
+    return np.concatenate(since), np.concatenate([b.squares for b in nominal.blocks]) - 1.0
 
 
 def _event(e: Experiment) -> float:

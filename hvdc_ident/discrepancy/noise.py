@@ -16,6 +16,7 @@ from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.whitening import AR, autoregression, segments
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
@@ -34,6 +35,12 @@ COMMON = 0.95
 """Share of what sines of free phase explain that one of common phase must."""
 STANDS_OUT = 12.0
 """Its power over that of the rest, as an F value."""
+COARSE = 1.0
+"""Noise of less than so many steps does not hide the rounding; above, that is white noise of step/sqrt(12) beside it."""
+FINEST = 0.1
+"""The least noise below a quantiser, in steps, for a model is not exact to less."""
+SLOW = 0.5
+"""Lag-1 coefficient from which the noise of a rounded record is coloured, and not white noise that flickers."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +59,23 @@ class Noise:
     source: str
     rows: int
 
+    @property
+    def below(self) -> float:
+        """The standard deviation of the noise before rounding, in the output's unit; 0 where rounding is all there is."""
+        return float(max((self.std or 0.0) ** 2 - self.step**2 / 12.0, 0.0) ** 0.5)
+
+    @property
+    def rounding(self) -> Rounding | None:
+        """How the record is rounded, where white noise does not hide it."""
+        coarse = self.step > 0 and self.std is not None and not self.model and self.below < COARSE * self.step
+        return Rounding(self.step, max(self.below, FINEST * self.step)) if coarse else None
+
 
 def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[Noise]:
     """The noise of every measured output, from all its records together; AR coefficients from all outputs together."""
     outputs = dict.fromkeys(o for e in experiments for o in e.outputs)
     quiet = {o: _quiet(o, [e for e in experiments if o in e.outputs]) for o in outputs}
-    short = {o: likelihood(q.records) for o, q in quiet.items() if q.moves and q.even and not q.longer}
+    short = {o: likelihood(q.records) for o, q in quiet.items() if q.moves and q.even and not q.longer and not q.coarse}
     colours = _colours(quiet, short)
     return FrozenMap({o: _noise(q, colours.get(o, Colour()), short.get(o)) for o, q in quiet.items()})
 
@@ -85,6 +103,13 @@ class Quiet:
     def rows(self) -> int:
         """All of them."""
         return sum(r.size for r in self.records)
+
+    @property
+    def coarse(self) -> bool:
+        """Whether what moves is white noise too small to hide the rounding."""
+        power = sum(float(r @ r) for r in self.records)
+        slow = sum(float(r[1:] @ r[:-1]) for r in self.records) > SLOW * power
+        return self.step > 0.0 and self.std < COARSE * self.step and not (self.moves and slow)
 
 
 def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
@@ -128,6 +153,11 @@ def _lack(found: Likelihood, given: float) -> tuple[float, bool]:
 def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> Noise:
     given, rows, step = quiet.given, quiet.rows, quiet.step
     std = quiet.std if quiet.moves else 0.0
+    if quiet.coarse and (given is None or given < quiet.rounded):
+        # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked.
+        return Noise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+    if quiet.coarse:
+        return Noise(given, (), 0.0, step, GIVEN, rows)
     if given is None and std <= quiet.floor:
         if step > 0.0:
             return Noise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
@@ -258,9 +288,13 @@ def draws(
         if len(n.model) == 1 and n.source != GIVEN:
             e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
         if n.step:
-            size = max((n.std or 0.0) ** 2 - n.step**2 / 12.0, 0.0) ** 0.5
             placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
-            e = (np.round((placed + size * e) / n.step) * n.step - placed) / b.sigma
+            e = np.round((placed + n.below * e) / n.step) * n.step - placed
+            rounding = problem.treatment.rounded(b.output)
+            if rounding is not None:
+                found.append(rounding.residual(e)[0])
+                continue
+            e = e / b.sigma
         found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
     return found
 

@@ -51,8 +51,8 @@ class Nominal:
 
     @property
     def chi2(self) -> float:
-        """The sum of squared residuals."""
-        return float(self.residual @ self.residual)
+        """The sum of squared residuals, as `Block.chi2`."""
+        return float(self.residual @ self.residual) + sum(b.spare * b.residual.size for b in self.blocks)
 
     @cached_property
     def basis(self) -> Array:
@@ -134,7 +134,8 @@ def nominal(
         for e in problem.experiments
     )
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
-    problem = replace(problem, experiments=told, rho=FrozenMap(models))
+    rounding = {o: r for o, n in noise.items() if (r := n.rounding) is not None}
+    problem = replace(problem, experiments=told, rho=FrozenMap(models), rounding=FrozenMap(rounding))
     optimum, result = pilot(problem, starts=starts, seed=seed, executor=executor)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []

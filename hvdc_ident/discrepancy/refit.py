@@ -53,7 +53,7 @@ class Job:
 class Refit:
     """What a refit came to. failure: why it has no result, empty where it has one.
 
-    chi2: sum of squared residuals; rows: their number; correlation: lag-1 autocorrelation left in them. holdout: root
+    chi2: sum of squared residuals (`Block.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them. holdout: root
     mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press: the same for
     parts of the fitted ones predicted from the rest.
     std: standard deviation of each effect parameter, by its name in the model.
@@ -198,7 +198,7 @@ def judged(refit: Refit) -> Refit:
     names = refit.problem.names
     spans = np.array([u.span for u in refit.problem.unknowns])
     known = uncertainty(blocks, names, spans, dict.fromkeys(refit.problem.outputs, "given"))
-    chi2 = sum(float(b.residual @ b.residual) for b in blocks)
+    chi2 = sum(b.chi2 for b in blocks)
     rows = sum(b.residual.size for b in blocks)
     wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
     own = [n for p in refit.placed for n in p.names.values() if n in names]
@@ -211,9 +211,9 @@ def judged(refit: Refit) -> Refit:
 
 def _correlation(blocks: Sequence[Block]) -> float:
     """The lag-1 autocorrelation of all residuals, 0 where it is negative or what chance gives."""
-    power = sum(float(b.residual @ b.residual) for b in blocks)
+    power = sum(float(b.score @ b.score) for b in blocks)
     rows = sum(b.residual.size for b in blocks)
-    found = sum(float(b.residual[1:] @ b.residual[:-1]) for b in blocks) / power if power else 0.0
+    found = sum(float(b.score[1:] @ b.score[:-1]) for b in blocks) / power if power else 0.0
     return found if found > 2.0 / np.sqrt(rows) else 0.0
 
 
@@ -224,7 +224,7 @@ def holdout(problem: Problem, theta: Array) -> float | None:
         return None
     if not blocks:
         return float("inf")
-    return float(np.sqrt(np.mean(np.concatenate([b.residual for b in blocks]) ** 2)))
+    return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks]))))
 
 
 def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:
@@ -269,7 +269,8 @@ def press(blocks: Sequence[Block], parts: int = 4) -> float | None:
         shift = np.linalg.lstsq(rest, (j.T @ r) / d, rcond=1e-9)[0] / d
         predicted = r + j @ shift
         total, rows = total + float(predicted @ predicted), rows + r.size
-    return float(np.sqrt(total / rows)) if rows else None
+    spare = sum(b.spare * b.residual.size for b in blocks)
+    return float(np.sqrt((total + spare) / rows)) if rows else None
 
 
 def unseen(refit: Refit) -> float | None:

@@ -8,7 +8,7 @@ a distribution that a bootstrap from the refitted nominal gives: whatever is sco
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -167,20 +167,22 @@ class Whitening:
 
     name: str
     treatment: Treatment
-    parts: tuple[tuple[str, int, NDArray[np.intp], float, Array], ...]
+    parts: tuple[tuple[Block, int, Array], ...]
 
     @classmethod
     def of(cls, blocks: Sequence[Block], experiment: Experiment, nominal: Nominal) -> Whitening:
-        parts = [
-            (b.output, experiment.outputs.index(b.output), b.rows, b.sigma, experiment.time[b.rows]) for b in blocks
-        ]
+        slim = [replace(b, jacobian=b.jacobian[:0]) for b in blocks]  # a job is sent to where it is done
+        parts = [(b, experiment.outputs.index(b.output), experiment.time[b.rows]) for b in slim]
         return cls(experiment.name, nominal.problem.treatment, tuple(parts))
 
     def __call__(self, y: Array) -> Array:
         """(rows, nc) of y (o, R, nc)."""
-        return np.concatenate(
-            [self.treatment.applied(y[k, rows] / s, time, o, self.name) for o, k, rows, s, time in self.parts]
-        )
+        return np.concatenate([self._rows(b, y[k, b.rows], time) for b, k, time in self.parts])
+
+    def _rows(self, b: Block, y: Array, time: Array) -> Array:
+        if b.slope is not None:
+            return np.asarray(y * b.slope[:, None])
+        return self.treatment.applied(y / b.sigma, time, b.output, self.name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,7 +97,7 @@ def noise_left(last: Refit) -> float:
         e = experiments[b.experiment]
         event = e.event if e.event is not None else event_time(e.inputs)
         rows[b.output] = rows.get(b.output, 0) + b.residual.size
-        if event is not None:
+        if event is not None and b.slope is None:  # one level between two steps is no measure of the others
             quiet.setdefault(b.output, []).append(b.residual[e.time[b.rows] < event - 1e-12])
     total = 0.0
     for output, count in rows.items():

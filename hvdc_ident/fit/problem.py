@@ -16,6 +16,7 @@ from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
 from hvdc_ident.fit.nuisance import unknown_of, unknowns
 from hvdc_ident.fit.prior import Prior, prior_rows
 from hvdc_ident.fit.residual import Block, Treatment, residual_blocks
+from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band
 from hvdc_ident.fit.unknown import Coordinates, Free
@@ -33,6 +34,7 @@ class Problem:
     the simulator's own value. why: the reason for each held one. conditional_on: for a free parameter the held ones
     without which it could not be told.
     rho: the noise model to whiten with by output: an AR(1) coefficient or a tuple of AR coefficients.
+    rounding: by output whose record is rounded to steps that its noise does not hide; its residuals then know of it.
     weights: standard deviation by output that replaces the experiments' own noise, in the output's unit.
     guard: rows this close to a break of an input are not compared, s. band: Hz; given, the residual is the misfit's
     spectrum there. loss: what a residual costs. priors: by unknown ("EXPERIMENT:NUISANCE" for a nuisance).
@@ -52,11 +54,12 @@ class Problem:
     band: Band | None = None
     loss: Loss = LOSSES["linear"]
     priors: FrozenMap[Prior] = field(default_factory=FrozenMap)
+    rounding: FrozenMap[Rounding] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         for name in ("experiments", "free"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name in ("held", "why", "conditional_on", "rho", "weights", "priors"):
+        for name in ("held", "why", "conditional_on", "rho", "weights", "priors", "rounding"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         self._check()
 
@@ -142,7 +145,7 @@ class Problem:
     def treatment(self) -> Treatment:
         """What is done to misfits before they are residuals."""
         models = {o: (m,) if isinstance(m, float | int) else tuple(m) for o, m in self.rho.items()}
-        return Treatment(FrozenMap(models), self.guard, self.band)
+        return Treatment(FrozenMap(models), self.guard, self.band, self.rounding)
 
     def blocks(self, theta: Array, *, derivatives: bool = True, in_time: bool = False) -> tuple[Block, ...]:
         """The residuals of each output in each experiment; jacobians have a column for every unknown.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.nuisance import observe
+from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band, transformed
 from hvdc_ident.fit.whitening import AR, segments, whitened
@@ -26,6 +27,8 @@ class Block:
     residual: (n,) misfit/sigma, treated; positive where the measurement lies above the model. No unit.
     jacobian: (n, p) d residual/d unknown, so minus the treated sensitivity over sigma.
     rows: (m,) the experiment's rows that are compared.
+    slope: (m,) d residual/d misfit, per unit of the output, where the record is rounded; else None: it is 1/sigma, treated.
+    spare: what the mean square of a rounded record's residuals lacks of 1 where only noise is left.
     """
 
     experiment: str
@@ -35,11 +38,28 @@ class Block:
     sigma: float
     residual: Array
     jacobian: Array
+    slope: Array | None = None
+    spare: float = 0.0
 
     @property
     def rmse(self) -> float:
         """Root mean square of the misfit, in the output's unit."""
         return float(np.sqrt(np.mean(self.misfit**2)))
+
+    @property
+    def squares(self) -> Array:
+        """(n,) squared residuals, of mean 1 under noise: their sums differ from -2 log likelihood by a constant."""
+        return np.asarray(self.residual**2 + self.spare)
+
+    @property
+    def chi2(self) -> float:
+        """The sum of the squares."""
+        return float(self.residual @ self.residual) + self.spare * self.residual.size
+
+    @property
+    def score(self) -> Array:
+        """(n,) what each row says of its level, of mean 0 under noise also where the level lies askew between two steps."""
+        return self.residual if self.slope is None else self.residual * self.slope * self.sigma
 
 
 def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> NDArray[np.intp]:
@@ -69,12 +89,14 @@ class Treatment:
     """What is done to misfits before they are residuals.
 
     whitening: the noise model by output. guard: rows this close to a break of an input are left out, s. band: Hz; given,
-    residuals are the misfit's spectrum within it; None, they are samples in time.
+    residuals are the misfit's spectrum within it; None, they are samples in time. rounding: by output whose record is
+    rounded; its residuals are samples in time and not whitened.
     """
 
     whitening: FrozenMap[AR] = field(default_factory=FrozenMap)
     guard: float = 0.0
     band: Band | None = None
+    rounding: FrozenMap[Rounding] = field(default_factory=FrozenMap)
 
     def applied(self, signal: Array, time: Array, output: str, where: str) -> Array:
         """The signal over the compared instants, (m,) or (m, p), as a residual: (n,) or (n, p)."""
@@ -82,6 +104,11 @@ class Treatment:
         if any(model):
             signal = whitened(signal, model, segments(time, where))
         return signal if self.band is None else transformed(signal, time, self.band, where)
+
+    def rounded(self, output: str) -> Rounding | None:
+        """How an output is rounded, where its residuals are to know of it: not in a spectrum, nor where they are whitened."""
+        known = self.rounding.get(output)
+        return None if self.band is not None or any(self.whitening.get(output, ())) else known
 
 
 def residual_blocks(
@@ -110,5 +137,11 @@ def residual_blocks(
         weight, time, where = sigma[output], experiment.time[rows], f"experiment '{experiment.name}'"
         residual = treatment.applied(misfit / weight, time, output, where)
         jacobian = treatment.applied(-seen.gradient[output][rows] / weight, time, output, where)
-        blocks.append(Block(experiment.name, output, rows, misfit, weight, residual, jacobian))
+        block = Block(experiment.name, output, rows, misfit, weight, residual, jacobian)
+        rounding = treatment.rounded(output)
+        if rounding is not None:
+            residual, slope = rounding.residual(misfit)
+            jacobian = -seen.gradient[output][rows] * slope[:, None]
+            block = replace(block, residual=residual, jacobian=jacobian, slope=slope, spare=rounding.spare)
+        blocks.append(block)
     return tuple(blocks)

@@ -152,7 +152,7 @@ def _samples(blocks: Sequence[Block], p: int) -> tuple[dict[str, float], dict[st
     total = sum(b.residual.size for b in blocks)
     rho, effective = {}, {}
     for output in dict.fromkeys(b.output for b in blocks):
-        records = [b.residual for b in blocks if b.output == output]
+        records = [b.score for b in blocks if b.output == output]
         n = sum(r.size for r in records)
         rho[output] = autocorrelation(records, p * n / total)
         effective[output] = n * (1.0 - rho[output]) / (1.0 + rho[output])
