@@ -139,7 +139,10 @@ def added(
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
     free = tuple(Free(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    more = replace(problem, simulator=ModelSimulator(larger, PATIENCE), free=(*problem.free, *free))
+    unsettled = problem.unsettled or effects()[candidate.effect].restless
+    more = replace(
+        problem, simulator=ModelSimulator(larger, PATIENCE), free=(*problem.free, *free), unsettled=unsettled
+    )
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
     return larger, more, placed, np.array([f.start for f in free])
 
@@ -198,7 +201,8 @@ def judged(refit: Refit) -> Refit:
     names = refit.problem.names
     spans = np.array([u.span for u in refit.problem.unknowns])
     known = uncertainty(blocks, names, spans, dict.fromkeys(refit.problem.outputs, "given"))
-    chi2 = sum(b.chi2 for b in blocks)
+    # What unknown starts took is what chance would have left there: refits with and without them are then compared fairly.
+    chi2 = sum(b.chi2 + b.taken for b in blocks)
     rows = sum(b.residual.size for b in blocks)
     wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
     own = [n for p in refit.placed for n in p.names.values() if n in names]
@@ -224,7 +228,8 @@ def holdout(problem: Problem, theta: Array) -> float | None:
         return None
     if not blocks:
         return float("inf")
-    return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks]))))
+    power = sum(b.chi2 + b.taken for b in blocks)
+    return float(np.sqrt(power / sum(b.residual.size for b in blocks)))
 
 
 def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:

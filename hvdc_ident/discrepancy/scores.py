@@ -132,7 +132,9 @@ def scored(
         else None
     )
     residual = nominal.projected(nominal.residual[:, None])
-    parts = [residual, nominal.basis]
+    restless = np.array([effects()[found[c.candidate].effect].restless for c in columns], dtype=bool)
+    starts = nominal.starts if restless.any() else np.zeros((residual.shape[0], 0))
+    parts = [residual, nominal.basis, starts]
     if noise is not None:
         parts.append(nominal.projected(noise))
     right = np.hstack(parts)
@@ -155,10 +157,17 @@ def scored(
     products = np.sum([o[0] for o in outcomes], axis=0)
     squares = np.sum([o[1] for o in outcomes], axis=0)
     change = np.max([o[2] for o in outcomes], axis=0)
-    k = nominal.basis.shape[1]
-    left = np.maximum(squares - np.sum(products[:, 1 : 1 + k] ** 2, axis=1), 0.0)
+    k, m = nominal.basis.shape[1], starts.shape[1]
+    raw, under = products[:, 0], products[:, 1 + k + m :]
+    left = squares - np.sum(products[:, 1 : 1 + k] ** 2, axis=1)
+    # What moves the model by itself meets records that do not begin at rest: their starts are for it to make good.
+    besides = np.where(restless[:, None], products[:, 1 + k : 1 + k + m], 0.0)
+    left = np.maximum(left - np.sum(besides**2, axis=1), 0.0)
+    raw = raw - besides @ (starts.T @ residual[:, 0])
+    if noise is not None:
+        under = under - besides @ (starts.T @ parts[-1])
     either = np.array([two_sided(found[c.candidate]) for c in columns], dtype=bool)
-    return Scores(columns, products[:, 0], squares, left, products[:, 1 + k :], change <= LOOSE, either)
+    return Scores(columns, raw, squares, left, under, change <= LOOSE, either)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +225,7 @@ def _products(job: Job) -> tuple[Array, Array, Array]:
 def signature_rows(
     nominal: Nominal, found: Sequence[Candidate], paths: Mapping[str, Path], chosen: Sequence[Column]
 ) -> Array:
-    """(n, N) whitened signatures of some columns over all blocks, without what the parameters make good."""
+    """(n, N) whitened signatures of some columns over all blocks, without what parameters, and starts, make good."""
     plan = tasks(found, chosen, _largest(paths))
     whole = []
     for e in nominal.problem.fitted_experiments:
@@ -226,4 +235,8 @@ def signature_rows(
         for index, y, _ in signatures(paths[e.name], plan):
             part[index] = whitening(y).T
         whole.append(part)
-    return nominal.projected(np.hstack(whole).T).T
+    rows = nominal.projected(np.hstack(whole).T).T
+    restless = [k for k, c in enumerate(chosen) if effects()[found[c.candidate].effect].restless]
+    if restless:
+        rows[restless] -= (rows[restless] @ nominal.starts) @ nominal.starts.T
+    return rows

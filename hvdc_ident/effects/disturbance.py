@@ -50,4 +50,5 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} carries a sine of {amplitude} at {frequency}, phase {phase}",
     excited_by="a record without any step, longer than several periods",
+    restless=True,
 )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
@@ -20,6 +21,7 @@ from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band
 from hvdc_ident.fit.unknown import Coordinates, Free
+from hvdc_ident.fit.unsettled import centred, loose_states, recentred
 from hvdc_ident.fit.whitening import AR
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
@@ -38,6 +40,8 @@ class Problem:
     weights: standard deviation by output that replaces the experiments' own noise, in the output's unit.
     guard: rows this close to a break of an input are not compared, s. band: Hz; given, the residual is the misfit's
     spectrum there. loss: what a residual costs. priors: by unknown ("EXPERIMENT:NUISANCE" for a nuisance).
+    unsettled: whether the records, held-out ones too, begin elsewhere than at rest; what unknown starts of the states
+    can make good is then taken out of residuals and jacobians (`fit.unsettled`).
     Theta, wherever it appears, holds the unknowns in the order of `unknowns`, each in its own unit.
     Raises StudyError or UnknownNameError where the parts do not fit.
     """
@@ -54,6 +58,7 @@ class Problem:
     band: Band | None = None
     loss: Loss = LOSSES["linear"]
     priors: FrozenMap[Prior] = field(default_factory=FrozenMap)
+    unsettled: bool = False
     rounding: FrozenMap[Rounding] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
@@ -166,16 +171,39 @@ class Problem:
                 parts.append(replace(block, jacobian=jacobian))
         return tuple(parts)
 
+    def starts(self, theta: Array) -> Array:
+        """(N, k): how the residuals answer the states' starts that are not known, one column a state and experiment."""
+        return np.asarray(block_diag(*(self._begun(e, theta)[1] for e in self.fitted_experiments)))
+
+    def _begun(self, e: Experiment, theta: Array, treatment: Treatment | None = None) -> tuple[Experiment, Array]:
+        """The experiment with the starts that suit its records best, and how its residuals answer them, (n, k)."""
+        own, nuisance = self.values(theta), self.nuisances(e, theta)
+        loose = loose_states(self.simulator, e)
+
+        def blocks(at: Experiment) -> tuple[Block, ...]:
+            return residual_blocks(
+                self.simulator, at, own, loose, self.sigma[e.name], nuisance=nuisance,
+                treatment=treatment or self.treatment,
+            )  # fmt: skip
+
+        at = centred(self.simulator, e, own, loose, nuisance) if loose else e
+        seen = blocks(at)
+        if loose:
+            at = recentred(at, seen, loose)
+        return at, np.vstack([b.jacobian[:, : len(loose)] for b in seen])
+
     def _experiment(self, e: Experiment, theta: Array, derivatives: bool, treatment: Treatment) -> tuple[Block, ...]:
+        loose = loose_states(self.simulator, e) if self.unsettled else ()
         return residual_blocks(
             self.simulator,
-            e,
+            self._begun(e, theta, treatment)[0] if loose else e,
             self.values(theta),
             tuple(f.name for f in self.free),
             self.sigma[e.name],
             nuisance=self.nuisances(e, theta),
             treatment=treatment,
             derivatives=derivatives,
+            loose=loose,
         )
 
     def nuisances(self, e: Experiment, theta: Array) -> dict[str, float]:

@@ -14,6 +14,7 @@ from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band, transformed
+from hvdc_ident.fit.unsettled import freed
 from hvdc_ident.fit.whitening import AR, segments, whitened
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
@@ -27,6 +28,8 @@ class Block:
     residual: (n,) misfit/sigma, treated; positive where the measurement lies above the model. No unit.
     jacobian: (n, p) d residual/d unknown, so minus the treated sensitivity over sigma.
     rows: (m,) the experiment's rows that are compared.
+    taken: how many independent directions the elimination of unknown starts has taken out of the experiment's blocks,
+    told with the first of them: chance then leaves so much less in the sum of squares.
     slope: (m,) d residual/d misfit, per unit of the output, where the record is rounded; else None: it is 1/sigma, treated.
     spare: what the mean square of a rounded record's residuals lacks of 1 where only noise is left.
     """
@@ -38,6 +41,7 @@ class Block:
     sigma: float
     residual: Array
     jacobian: Array
+    taken: int = 0
     slope: Array | None = None
     spare: float = 0.0
 
@@ -121,15 +125,20 @@ def residual_blocks(
     nuisance: Mapping[str, float] | None = None,
     treatment: Treatment | None = None,
     derivatives: bool = True,
+    loose: Sequence[str] = (),
 ) -> tuple[Block, ...]:
     """One block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
 
     sigma: standard deviation by output, in its unit. derivatives: whether jacobians are wanted; else they have no column.
+    loose: states, given starts by the experiment, that are taken for unknown and eliminated (`fit.unsettled`).
     Raises SimulationError where the run fails, StudyError where nothing can be compared.
     """
     treatment = treatment or Treatment()
-    seen = observe(simulator, experiment, values, sensitivities, nuisance, derivatives=derivatives)
-    blocks = []
+    wanted = sensitivities if derivatives else ()
+    k = len(wanted)
+    given = dict(nuisance or {})
+    seen = observe(simulator, experiment, values, (*wanted, *loose), given, derivatives=derivatives or bool(loose))
+    blocks, raw = [], []
     for output in experiment.outputs:
         rows = compared_rows(experiment, output, treatment.guard)
         assert experiment.measured is not None
@@ -144,4 +153,5 @@ def residual_blocks(
             jacobian = -seen.gradient[output][rows] * slope[:, None]
             block = replace(block, residual=residual, jacobian=jacobian, slope=slope, spare=rounding.spare)
         blocks.append(block)
-    return tuple(blocks)
+        raw.append(-seen.gradient[output][rows, k : k + len(loose)])
+    return freed(blocks, raw, slice(k, k + len(loose))) if loose else tuple(blocks)
