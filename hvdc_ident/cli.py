@@ -443,10 +443,11 @@ def models(json: Json = False, quiet: Quiet = False) -> None:
 @app.command()
 @guarded
 def effects(json: Json = False, quiet: Quiet = False) -> None:
-    """The catalogue of effects, one line each."""
+    """The catalogue of effects, one line each, with sizes that show on a per-unit signal."""
     from hvdc_ident.effects import effects as known
 
-    _catalogue("effects", {name: effect.summary for name, effect in known().items()}, json=json)
+    lines = {name: effect.summary if json else f"{effect.summary}; {effect.shown}" for name, effect in known().items()}
+    _catalogue("effects", lines, json=json)
 
 
 @app.command()

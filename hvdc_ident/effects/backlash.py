@@ -37,6 +37,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} follows with a play of {width}",
     excited_by="slow ramps both ways, with turns at several levels",
+    example=FrozenMap({"width": 0.02}),
     states="y, one a slot",
     confusable=FrozenMap(
         {

@@ -147,6 +147,7 @@ class Effect:
 
     places: kinds of slot where it may sit. states: those it adds, a sentence's part for people. sentence: for the
     report, with {at}, {from} and the parameters by name. excited_by: the experiment that makes it visible.
+    example: values that show on a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: whether it brings another signal in (`from`). needs_expression: whether its form is given with it,
     with coefficients of the user's own names. resistance: the parameter for which a resistance of the model stands in.
@@ -159,6 +160,7 @@ class Effect:
     rewrite: Rewrite
     sentence: str
     excited_by: str
+    example: FrozenMap[float]
     places: tuple[str, ...] = SLOT_KINDS
     states: str = "none"
     confusable: FrozenMap[str] = field(default_factory=FrozenMap)
@@ -171,6 +173,12 @@ class Effect:
     def scanned(self) -> bool:
         """Whether looking for it takes a closer look at many sizes."""
         return any(q.scan for q in self.parameters.values())
+
+    @property
+    def shown(self) -> str:
+        """The example in words, with units."""
+        units = {n: q.unit for n, q in self.parameters.items()}
+        return "e.g. " + ", ".join(f"{n} = {v:g} {units.get(n, '')}".rstrip() for n, v in self.example.items())
 
     def is_neutral(self, values: Mapping[str, float | str]) -> bool:
         """Whether the effect is not there: a parameter switches it off, or none of the optional ones acts."""

@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} loses {g} times {from}",
     excited_by="several levels of the other signal",
+    example=FrozenMap({"g": 0.02}),
     confusable=FrozenMap(
         {
             "coupling": "several start levels: the coupling counts from the start value",

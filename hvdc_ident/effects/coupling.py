@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} takes {k} of the change of {from}",
     excited_by="steps that move the other signal without the slot's own",
+    example=FrozenMap({"k": 0.2}),
     states="the other signal's start value, one a slot",
     confusable=FrozenMap(
         {

@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} is 0 within +-{width} and smaller by that beyond",
     excited_by="slow ramps both ways through 0",
+    example=FrozenMap({"width": 0.02}),
     confusable=FrozenMap(
         {
             "quantisation": "slow ramps both ways: one flat piece at 0 against many",

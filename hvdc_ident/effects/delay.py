@@ -26,6 +26,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} arrives {T} late",
     excited_by="a step through the slot, recorded at several samples per delay",
+    example=FrozenMap({"T": 0.002}),
     states="the signal's history over T",
     confusable=FrozenMap(
         {

@@ -50,5 +50,6 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} carries a sine of {amplitude} at {frequency}, phase {phase}",
     excited_by="a record without any step, longer than several periods",
+    example=FrozenMap({"amplitude": 0.01, "frequency": 30.0, "phase": 0.3}),
     restless=True,
 )

@@ -38,6 +38,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} droops by {k} per unit of {from}",
     excited_by="several levels of the other signal, with the slot's own set-point at rest",
+    example=FrozenMap({"k": 0.2, "deadband": 0.0001}),
     states="the other signal's start value, one a slot",
     confusable=FrozenMap(
         {

@@ -27,6 +27,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} has an inductance of {L} in its path",
     excited_by="a fast change of the voltage across the path, recorded at several samples per L/R",
+    example=FrozenMap({"L": 0.002, "R": 0.7}),
     states="the current, one a slot",
     confusable=FrozenMap({"lag": "nothing from outside: the same with T = L/R"}),
     resistance="R",

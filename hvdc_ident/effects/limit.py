@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} cannot exceed {level} in magnitude",
     excited_by="a step large enough that the signal reaches the limit, held, then released",
+    example=FrozenMap({"level": 0.45}),
     confusable=FrozenMap(
         {
             "saturation": "steps to several levels: the soft one bends long before the hard one cuts",

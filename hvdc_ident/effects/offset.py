@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} is off by {c}",
     excited_by="a level held long enough, with a record that the loop does not regulate",
+    example=FrozenMap({"c": 0.01}),
     confusable=FrozenMap(
         {
             "gain": "several levels: the offset is the same at each",

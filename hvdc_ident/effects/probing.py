@@ -174,7 +174,11 @@ def probes(
     other = source or signal
     settled = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
     if closer:
-        settled |= {n: replace(q, probes=q.scan, measure=q.scanned_in or q.measure) for n, q in effect.parameters.items() if q.scan}
+        settled |= {
+            n: replace(q, probes=q.scan, measure=q.scanned_in or q.measure)
+            for n, q in effect.parameters.items()
+            if q.scan
+        }
     effect = replace(effect, parameters=effect.parameters | settled)
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}
     absent = {n: 0.0 for n, q in effect.parameters.items() if q.optional}

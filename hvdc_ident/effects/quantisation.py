@@ -75,6 +75,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} is rounded to multiples of {step}",
     excited_by="slow ramps both ways over several levels",
+    example=FrozenMap({"step": 0.03}),
     confusable=FrozenMap(
         {
             "deadband": "slow ramps both ways: one flat piece at 0 against many",

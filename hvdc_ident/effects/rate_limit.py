@@ -34,6 +34,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} cannot change faster than {rate}",
     excited_by="steps of two sizes through the slot, so that two slopes would be asked for",
+    example=FrozenMap({"rate": 1.0}),
     states="y, one a slot",
     confusable=FrozenMap(
         {

@@ -19,9 +19,15 @@ EFFECT = Effect(
     parameters=FrozenMap(
         {
             "Ts": EffectParameter(
-                1e-4, neutral=0.0, unit="s", description="sampling period", measure="time", probes=(0.1, 0.4, 0.7),
+                1e-4,
+                neutral=0.0,
+                unit="s",
+                description="sampling period",
+                measure="time",
+                probes=(0.1, 0.4, 0.7),
                 # Samples of a record: as many are told from a third more of one, until a sample is but a few rows.
-                scan=(*(4.0 + 0.3 * k for k in range(220)), *(70.0 * 1.05**k for k in range(45))), scanned_in="record/n",
+                scan=(*(4.0 + 0.3 * k for k in range(220)), *(70.0 * 1.05**k for k in range(45))),
+                scanned_in="record/n",
             ),
             # At most one period: a bound that moves with Ts, so a refit leaves it.
             "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period", held=True),
@@ -30,6 +36,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} is sampled every {Ts} and published {compute} later",
     excited_by="a step or ramp through the slot, recorded several times per sampling period",
+    example=FrozenMap({"Ts": 0.0013, "compute": 0.0003}),
     states="one held value a slot",
     confusable=FrozenMap(
         {

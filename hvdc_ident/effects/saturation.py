@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} saturates softly towards {level}",
     excited_by="steps to several levels of both signs",
+    example=FrozenMap({"level": 0.8}),
     confusable=FrozenMap(
         {
             "limit": "steps to several levels: the soft one bends long before the hard one cuts",

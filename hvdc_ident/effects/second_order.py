@@ -36,6 +36,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}",
     excited_by="a step through the slot, recorded at several samples per 1/wn",
+    example=FrozenMap({"wn": 400.0, "zeta": 0.5}),
     states="y and its rate v = y'/wn, one pair a slot",
     confusable=FrozenMap(
         {

@@ -20,5 +20,6 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} has the further term {expression}",
     excited_by="an experiment over the whole range of the signals in the term",
+    example=FrozenMap({"k": 0.1}),
     needs_expression=True,
 )

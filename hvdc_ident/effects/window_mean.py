@@ -27,6 +27,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     sentence="{at} is the mean over the last {T}",
     excited_by="a step through the slot, recorded at several samples per window",
+    example=FrozenMap({"T": 0.01}),
     states="y, one a slot, and the signal's history over T",
     confusable=FrozenMap(
         {

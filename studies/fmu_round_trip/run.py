@@ -24,7 +24,6 @@ from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.files import json_text, write_text
 from hvdc_ident.fmu.export import export_fmu
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import linearize
 from hvdc_ident.model import Model
 from hvdc_ident.model.card import save_card
@@ -38,29 +37,6 @@ from hvdc_ident.study.tables import csv_text
 HERE = Path(__file__).resolve().parent
 KINDS = {"ME": "model-exchange", "CS": "co-simulation"}
 SLOT, SOURCE = "P2_m", "Vdc2"
-SIZES: dict[str, dict[str, float]] = {  # one that shows in the link's P loop
-    "backlash": {"width": 0.02},
-    "conductance": {"g": 0.02},
-    "coupling": {"k": 0.2},
-    "deadband": {"width": 0.02},
-    "delay": {"T": 0.002},
-    "disturbance": {"amplitude": 0.01, "frequency": 30.0, "phase": 0.3},
-    "droop": {"k": 0.2, "deadband": 1e-4},
-    "gain": {"k": 0.9},
-    "inductance": {"L": 0.002, "R": 0.7},
-    "lag": {"T": 0.002},
-    "lead-lag": {"T1": 0.003, "T2": 0.001},
-    "limit": {"level": 0.45},
-    "loss": {"a": 0.002, "b": 0.03, "c": 0.02},
-    "offset": {"c": 0.01},
-    "quantisation": {"step": 0.03},
-    "rate-limit": {"rate": 1.0},
-    "sample-hold": {"Ts": 1.3e-3, "compute": 3e-4},
-    "saturation": {"level": 0.8},
-    "second-order": {"wn": 400.0, "zeta": 0.5},
-    "term": {"k": 0.1},
-    "window-mean": {"T": 0.01},
-}
 QUICK = ("vsc-hvdc-link", "lag", "limit", "delay")
 RTOL = 1e-9
 PARTS = ("agreement", "studies")
@@ -79,7 +55,7 @@ def models(quick: bool) -> Iterator[tuple[str, Model]]:
         use = EffectUse(
             name,
             (SLOT,),
-            FrozenMap(SIZES[name]),
+            effect.example,
             source=SOURCE if effect.needs_source else "",
             expression=f"k*{SOURCE}**2" if effect.needs_expression else "",
         )

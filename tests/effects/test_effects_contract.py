@@ -76,22 +76,42 @@ SMALL = {
 }
 
 
-def test_the_catalogue_is_the_one_of_the_interface():
-    assert tuple(sorted(NEUTRAL)) == NAMES
+def declared(name, near=False):
+    """The values that switch an effect off, as it declares them; or values close to these."""
+    found = {n: q.neutral for n, q in effects()[name].parameters.items() if q.neutral is not None}
+    values = {n: effects()[name].example.get(v, v) if isinstance(v, str) else v for n, v in found.items()}
+    return {n: min(v, 1e7) * (1 + 1e-9) or 1e-9 for n, v in values.items()} if near else values
+
+
+def test_the_catalogue_holds_the_one_of_the_interface():
+    assert set(NEUTRAL) <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_example_acts_and_its_values_are_the_effects_own(name):
+    effect = effects()[name]
+    if effect.needs_expression:
+        assert not effect.parameters, "coefficients have the user's names"
+        return
+    assert set(effect.example) <= set(effect.parameters)
+    values = {n: q.value for n, q in effect.parameters.items()} | dict(effect.example)
+    assert not effect.is_neutral(values)
+    assert effect.is_neutral(values | declared(name))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_neutral_gives_the_base_model_back(name):
-    for values in NEUTRAL[name]:
+    for values in NEUTRAL.get(name, (declared(name),)):
         assert LINK.with_effects([use(name, "P2_m", values)]) is LINK
     if not effects()[name].needs_expression:
-        without_source = replace(use(name, "P2_m", NEUTRAL[name][0]), source="")
+        without_source = replace(use(name, "P2_m", declared(name)), source="")
         assert LINK.with_effects([without_source]) is LINK
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_near_neutral_it_is_near_the_base_model(name):
-    model = LINK.with_effects([use(name, "P2_m", NEARLY.get(name, dict.fromkeys(SIZES[name], 1e-9)))])
+    small = {"k": 1e-9} if effects()[name].needs_expression else declared(name, near=True)
+    model = LINK.with_effects([use(name, "P2_m", NEARLY.get(name, small))])
     assert model != LINK
     plain, with_it = (simulate(m, CASE, outputs=("P2",), rtol=1e-9)["P2"] for m in (LINK, model))
     np.testing.assert_allclose(with_it, plain, atol=SMALL.get(name, 3e-6))
