@@ -13,7 +13,10 @@ import pytest
 from hvdc_ident import simulate as package
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fit import Free, Problem
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.trajectory import Trajectory
 from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))
@@ -23,7 +26,7 @@ from hidden.diagnosing import diagnosed, experiments_of, free_of, model_of
 from hidden.operators import CATALOGUE
 from hidden.plants import DRIVE, STATION
 from hidden.reporting import report
-from hidden.simulator import Hidden, Run, Signal, simulate
+from hidden.simulator import STEP, Hidden, Run, Signal, simulate
 
 STUDY = load("hidden_effects")
 ROWS = 125
@@ -83,6 +86,23 @@ def test_both_simulators_agree(name):
     assert (np.abs(mine - theirs).max(axis=0) < share * effect + 2e-7).all()
 
 
+def test_a_row_on_a_sampling_instant_is_read_before_it_by_both():
+    moves = {"wref": ((0.0402, 1.0), (0.0402, 1.3))}
+    values = {"Ts": 9 * STEP * (1 + sizes.LATE), "compute": 0.0}  # every ninth row meets every twentieth sample
+    mine = simulate(
+        DRIVE, [Run({n: Signal(p) for n, p in moves.items()})], [Hidden("sample-hold", "wm", values)], rows=ROWS
+    )
+    model = model_of("drive").with_effects([EffectUse("sample-hold", ("wm",), FrozenMap(values))])
+    inputs = {n: InputSignal.corners(p) for n, p in moves.items()}
+    theirs = package(model, experiment("e", TIME, inputs), outputs=DRIVE.outputs).trajectory.values
+    after = {"Ts": 9 * STEP * (1 - sizes.LATE), "compute": 0.0}
+    model = model_of("drive").with_effects([EffectUse("sample-hold", ("wm",), FrozenMap(after))])
+    other = package(model, experiment("e", TIME, inputs), outputs=DRIVE.outputs).trajectory.values
+    np.testing.assert_allclose(mine[:, 0], theirs, atol=2e-6)
+    met = np.flatnonzero(np.abs(other - theirs).max(axis=1) > 1e-4)
+    assert met.size > 3 and (met % 9 == 0).all(), "which comes first is seen, at those rows alone"
+
+
 @pytest.mark.parametrize("plant", [STATION, DRIVE])
 def test_both_simulators_agree_on_the_plants(plant):
     moved = {n: ((0.0402, v), (0.0402, v + plant.kicks[n]), (0.3, v), (0.4, v)) for n, v in plant.inputs.items()}
@@ -104,6 +124,29 @@ def test_a_quantiser_in_a_loop_comes_to_the_same_sliding_rest():
     theirs = package(model, experiment("e", TIME[:50]), outputs=("P", "Vdc")).trajectory.values.mean(axis=0)
     np.testing.assert_allclose(mine[:2], theirs, atol=1e-3)
     assert theirs[0] == pytest.approx(0.495, abs=1e-3), "0.5 lies between two levels; P slides at the edge below"
+
+
+@pytest.mark.parametrize("lead", [0.0, 1.0])
+@pytest.mark.parametrize("plant", [STATION, DRIVE])
+def test_a_disturbance_is_seen_the_same_however_the_record_begins(plant, lead):
+    """It begins with the record, at rest; or it has been there for a second, and the plant repeats itself."""
+    at, kick = ("E", "Pref") if plant is STATION else ("load", "wref")
+    values = {"amplitude": 0.03, "frequency": 7.0, "phase": 2.0}
+    moves = {kick: ((0.0402, plant.inputs[kick]), (0.0402, 1.1 * plant.inputs[kick]))}
+    runs = [Run({n: Signal(p) for n, p in moves.items()})]
+    quiet = simulate(plant, runs, rows=ROWS)[:, 0]
+    record = simulate(plant, runs, [Hidden("disturbance", at, values)], rows=ROWS, lead=lead)[:, 0]
+    sigma = 0.02 * np.ptp(quiet, axis=0)
+    model = model_of(plant.name).with_effects([EffectUse("disturbance", (at,), FrozenMap(values))])
+    measured = Trajectory(TIME, record, plant.outputs)
+    noise = dict(zip(plant.outputs, sigma.tolist(), strict=True))
+    inputs = {n: InputSignal.corners(p) for n, p in moves.items()}
+    case = experiment("e", TIME, inputs, measured=measured, noise=noise)
+    gain = plant.fitted[0]
+    problem = Problem(ModelSimulator(model), (case,), (Free(gain, plant.parameters[gain], 0.1, 10.0),))
+    settled, loose = (replace(problem, unsettled=u).cost(problem.start) for u in (False, True))
+    assert loose < 0.05, "no noise: nothing is left but what is not linear in the start"
+    assert settled > 100 * loose
 
 
 def test_designs_are_seeded_and_balanced():

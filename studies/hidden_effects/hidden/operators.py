@@ -20,6 +20,7 @@ class Operator:
 
     states = 0
     waits_for_rest = False  # whether a steady start cannot be computed: it has to be waited for
+    ticks = False  # whether it jumps at instants of its own: a row at such an instant is read before the jump
 
     def __init__(self, p: Values, h: float, steps: int) -> None:
         self.p, self.h, self.steps = p, h, steps
@@ -250,6 +251,8 @@ class Backlash(Operator):
 
 class SampleHold(Operator):
     """Samples at whole multiples of the period, counted in steps from the start."""
+
+    ticks = True
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.every = np.maximum(np.round(self.p["Ts"] / self.h), 1.0)

@@ -62,9 +62,13 @@ def simulate(
     interval: float = 4e-3,
     watch: Sequence[str] = (),
     step: float = STEP,
+    lead: float = LEAD,
 ) -> Array:
-    """(rows, runs, outputs) at k * interval s; or of the slots in `watch` (as their readers see them)."""
-    return _Batch(plant, runs, hidden, rows, interval, watch, step).result()
+    """(rows, runs, outputs) at k * interval s; or of the slots in `watch` (as their readers see them).
+
+    lead: how long a run without a steady start waits for rest, or for what it repeats, before its first row, s.
+    """
+    return _Batch(plant, runs, hidden, rows, interval, watch, step, lead).result()
 
 
 class _Batch:
@@ -77,6 +81,7 @@ class _Batch:
         interval: float,
         watch: Sequence[str],
         step: float,
+        lead: float,
     ) -> None:
         self.plant, self.n, self.h = plant, len(runs), step
         self.rows, self.every = rows, round(interval / step)
@@ -84,7 +89,8 @@ class _Batch:
         self.watch = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
         kinds = CATALOGUE | OUTSIDE
         waits = any(kinds[h.effect].waits_for_rest for h in hidden)
-        self.lead = round(LEAD / step) if waits else 0
+        self.lead = round(lead / step) if waits else 0
+        self.ticks = any(kinds[h.effect].ticks for h in hidden)
         self.steps = self.lead + (rows - 1) * self.every + 1
         self.p = {n: np.array([float(r.values.get(n, v)) for r in runs]) for n, v in plant.parameters.items()}
         self.chains: dict[str, list[tuple[Operator, int, str]]] = {}
@@ -179,14 +185,19 @@ class _Batch:
         for step in range(self.steps):
             t = (step - self.lead) * h
             total, rate = np.zeros_like(x), x
+            row = step >= self.lead and (step - self.lead) % self.every == 0
+            if row and self.ticks and step:
+                # The end of the last step: as things stand before what ticks now. A row on a tick is thus read before it.
+                self._flow("run", list(x), {n: v[step, 0] for n, v in self.inputs.items()}, t, 1.0)
+                out[(step - self.lead) // self.every] = np.array([self.seen[n] for n in self.watch]).T
+                row = False
             for stage in range(4):
                 share, place = STAGES[stage], places[stage]
                 at = x + (share * h) * rate if stage else x
                 inputs = {n: v[step, place] for n, v in self.inputs.items()}
                 rate = np.array(self._flow("run", list(at), inputs, t + share * h, share))
-                if stage == 0 and step >= self.lead and (step - self.lead) % self.every == 0:
-                    for k, name in enumerate(self.watch):
-                        out[(step - self.lead) // self.every, :, k] = self.seen[name]
+                if stage == 0 and row:
+                    out[(step - self.lead) // self.every] = np.array([self.seen[n] for n in self.watch]).T
                 total += WEIGHTS[stage] * rate
             x = x + h * total
         return out

@@ -20,6 +20,9 @@ UNIT = 4.15
 """One unit: the post-refit signature |M s|, in whitened noise, at which its score s'Mr/|Ms| has a mean equal to the
 threshold of a two-sided test at 1 % over three hundred candidates."""
 GRID = 14
+LATE = 1e-7
+"""By how much a sampler's period is longer than its steps. Rows and samples both begin with the record: without it they
+would meet exactly, and which of the two comes first would be a matter of rounding."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,9 @@ def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, re
         case "lag" | "delay" | "window-mean":
             return {"T": x}
         case "sample-hold":
-            # An odd number of steps: the samples meet the rows as rarely as they can.
-            return {"Ts": STEP * (2 * np.round((x / STEP - 1) / 2) + 1), "compute": 0 * one}
+            # An odd number of steps: the samples meet the rows as rarely as they can. The plant's clock is slow by LATE:
+            # a row that meets a sample comes before it, which is how the simulator reads it.
+            return {"Ts": (1 + LATE) * STEP * (2 * np.round((x / STEP - 1) / 2) + 1), "compute": 0 * one}
         case "second-order":
             return {"wn": 1 / x, "zeta": rng.uniform(0.2, 0.9) * one}
         case "lead-lag":
