@@ -180,7 +180,8 @@ def run(job: Job) -> Refit:
     for begin in job.begins:
         try:
             end = METHOD.run(job.problem, begin)
-            if end.status == "failed" or end.cost is None:
+            # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
+            if end.cost is None:
                 why = end.message
                 continue
             if best is None or 2.0 * end.cost < best.chi2:

@@ -32,6 +32,7 @@ Path = Along | Ends
 """A run with its answers: of equations, or of something closed."""
 SEEN = 1.0
 """s's below which a size leaves no trace: no experiment excites it."""
+_BY_COLUMN = ("raw", "size", "left", "noise", "sound", "two_sided")
 LEFT = 1e-3
 """Share of a signature that has to be left beside the parameters."""
 
@@ -39,7 +40,8 @@ LEFT = 1e-3
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Scores of C columns. raw: (C,) s'Mr. size: (C,) s's. left: (C,) s'Ms. noise: (C, B) s'M of noise. sound: (C,)
-    whether the loop closed. two_sided: (C,) whether the effect may be reversed."""
+    whether the loop closed. two_sided: (C,) whether the effect may be reversed. beside: (B,) the largest score in each
+    record of noise of columns that were looked at too and are not here."""
 
     columns: tuple[Column, ...]
     raw: Array
@@ -48,6 +50,7 @@ class Scores:
     noise: Array
     sound: NDArray[np.bool_]
     two_sided: NDArray[np.bool_]
+    beside: Array | None = None
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
@@ -62,12 +65,20 @@ class Scores:
     @cached_property
     def largest(self) -> Array:
         """(B,) the largest score of all candidates in each record of noise."""
-        return np.asarray(self._t(self.noise).max(axis=0, initial=0.0))
+        own = np.asarray(self._t(self.noise).max(axis=0, initial=0.0))
+        return own if self.beside is None or not own.size else np.maximum(own, self.beside)
 
     def _t(self, raw: Array) -> Array:
         left = np.where(self.left > 0, self.left, 1.0)[:, None]
         allowed = self.usable[:, None] & (self.two_sided[:, None] | (raw > 0))
         return np.where(allowed, raw**2 / left, 0.0)
+
+    def joined(self, more: Scores) -> Scores:
+        """These columns and others, against the same noise."""
+        pairs = {n: np.concatenate([getattr(self, n), getattr(more, n)]) for n in _BY_COLUMN}
+        others = [s.beside for s in (self, more) if s.beside is not None]
+        beside = np.max(others, axis=0) if others else None
+        return replace(self, columns=(*self.columns, *more.columns), beside=beside, **pairs)
 
     @property
     def expected(self) -> Array:
