@@ -18,6 +18,8 @@ from hvdc_ident.trajectory import Array
 
 NEAR = 1e-4
 """Misfits below this share of the noise, where the difference of two logarithms has no digits left, take the tangent at 0."""
+FAR = 1e3
+"""Standard deviations beyond half a step from which the tail's expansion stands for logarithms that differ by less than their own error."""
 REACH = 10.0
 """Standard deviations beyond half a step to which the mean of g^2 is integrated."""
 POINTS = 4001
@@ -59,7 +61,8 @@ def _log_chance(z: Array, step: float) -> Array:
 
 def _residual(z: Array, step: float, noise: float) -> tuple[Array, Array]:
     """g and dg/dz from misfit and step in units of the noise."""
-    size = np.abs(z)
+    whole = np.abs(z)
+    size = np.minimum(whole, FAR + 0.5 * step)
     log_p = _log_chance(size, step)
     none = float(_log_chance(np.zeros(1), step)[0])
     tangent = float(np.sqrt(np.exp(_log_density(0.5 * step) - none) * step))
@@ -67,6 +70,11 @@ def _residual(z: Array, step: float, noise: float) -> tuple[Array, Array]:
     falls = np.exp(_log_density(size - 0.5 * step) - log_p) * -np.expm1(-size * step)
     near = (size < NEAR) | (g == 0.0)
     slope = np.where(near, tangent, falls / np.where(near, 1.0, g))
+    # Phi(-x) = phi(x)/x (1 - 1/x^2 ...), so that dlog Phi(-x)/dx = -(x + 1/x ...)
+    x = np.maximum(whole - 0.5 * step, FAR)
+    more = np.sqrt(1.0 + (2.0 * (none + np.log(x)) + np.log(2.0 * np.pi)) / x / x)
+    far = whole - 0.5 * step > FAR
+    g, slope = np.where(far, x * more, g), np.where(far, (1.0 + 1.0 / x / x) / more, slope)
     return np.where(near, tangent * z, np.sign(z) * g), slope / noise
 
 

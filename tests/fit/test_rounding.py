@@ -66,3 +66,15 @@ def test_squares_of_rounded_noise_have_the_mean_that_is_told(noise: float) -> No
     # whatever the level: the likelihood's derivative has mean 0, though the residual's own mean has not
     score = (g * slope).mean(axis=1) * 0.7
     assert np.abs(score).max() < 5.0 * (g * slope * 0.7).std(axis=1).max() / np.sqrt(2000)
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.25, 1.0])
+def test_far_off_it_goes_on_as_a_line_to_any_size(noise: float) -> None:
+    r = Rounding(1.0, noise)
+    edge = 0.5 + 1e3 * noise
+    near = r.residual(edge * np.array([1.0 - 1e-6, 1.0 + 1e-6]))
+    np.testing.assert_allclose(near[0][1] - near[0][0], 2e-6 * edge / noise, rtol=1e-3)
+    np.testing.assert_allclose(near[1], 1.0 / noise, rtol=1e-4)
+    g, slope = r.residual(np.array([-1e9, 1e155, -1e300]) * noise)
+    np.testing.assert_allclose(g, [-1e9, 1e155, -1e300], rtol=1e-8 / noise)
+    np.testing.assert_allclose(slope, 1.0 / noise, rtol=1e-8)
