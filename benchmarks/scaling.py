@@ -71,30 +71,37 @@ def of_states(terminals: int) -> dict[str, float]:
     return row | {"states": len(model.states), "memory": peak() - base}
 
 
+def write_sweep(folder: Path, points: int) -> tuple[Path, int]:
+    """A study of the phasor link over a grid of KPVDC and KIVDC, and how many points it has, `points` or a few more."""
+    from hvdc_ident.study.tables import csv_text
+
+    side = max(1, round(points**0.5))
+    other = -(-points // side)
+    t = np.round(np.arange(751) * 2e-3, 9)
+    step = np.where(t >= 0.1, 1.019, 1.0)
+    rows = np.column_stack([t, step, -0.4 + 0.45 * (t >= 0.1) * np.exp(-30 * np.clip(t - 0.1, 0, None))])
+    (folder / "v.csv").write_text(csv_text(["time", "Vdcref1", "Irorder1"], rows.tolist()))
+    axes = "".join(
+        f'[[sweep]]\nparameter = "{n}"\nmin = {low}\nmax = {high}\npoints = {count}\n'
+        for n, low, high, count in (("KPVDC", 10, 40, side), ("KIVDC", 250, 1500, other))
+    )
+    (folder / "s.toml").write_text(
+        'schema = 1\nname = "s"\n[model]\nsource = "vsc-hvdc-link"\n[[experiment]]\nname = "v"\ndata = "v.csv"\n'
+        f'inputs = ["Vdcref1"]\noutputs = ["Irorder1"]\nevent = 0.1\n{axes}'
+    )
+    return folder / "s.toml", side * other
+
+
 def of_sweep(points: int, workers: int) -> dict[str, float]:
     """What a sweep of so many points costs: s and MiB, the bytes it leaves in its store, and of its tables."""
     from hvdc_ident.study.pipeline import run_stage
     from hvdc_ident.study.stage import Options
     from hvdc_ident.study.study import load_study
-    from hvdc_ident.study.tables import csv_text
 
-    side = max(1, round(points**0.5))
-    other = -(-points // side)
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
-        t = np.round(np.arange(751) * 2e-3, 9)
-        step = np.where(t >= 0.1, 1.019, 1.0)
-        rows = np.column_stack([t, step, -0.4 + 0.45 * (t >= 0.1) * np.exp(-30 * np.clip(t - 0.1, 0, None))])
-        (folder / "v.csv").write_text(csv_text(["time", "Vdcref1", "Irorder1"], rows.tolist()))
-        axes = "".join(
-            f'[[sweep]]\nparameter = "{n}"\nmin = {low}\nmax = {high}\npoints = {count}\n'
-            for n, low, high, count in (("KPVDC", 10, 40, side), ("KIVDC", 250, 1500, other))
-        )
-        (folder / "s.toml").write_text(
-            'schema = 1\nname = "s"\n[model]\nsource = "vsc-hvdc-link"\n[[experiment]]\nname = "v"\ndata = "v.csv"\n'
-            f'inputs = ["Vdcref1"]\noutputs = ["Irorder1"]\nevent = 0.1\n{axes}'
-        )
-        study = load_study(str(folder / "s.toml"))
+        path, count = write_sweep(folder, points)
+        study = load_study(str(path))
         run_stage(study, "simulate", folder / "warm", Options())  # compiled here
         base = peak()
         cpu, wall, done = spent(lambda: run_stage(study, "sweep", folder / "out", Options(workers=workers)))
@@ -104,7 +111,7 @@ def of_sweep(points: int, workers: int) -> dict[str, float]:
         tables = sum((folder / "out" / n).stat().st_size for n in ("sweep.json", "sweep.csv"))
         workers_cpu = resource.getrusage(resource.RUSAGE_CHILDREN)
         return {
-            "points": side * other,
+            "points": count,
             "cpu": cpu + (workers_cpu.ru_utime + workers_cpu.ru_stime if workers > 1 else 0.0),
             "wall": wall,
             "again": again,
