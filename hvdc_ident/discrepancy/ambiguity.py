@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -70,13 +70,13 @@ def _is_nothing(trial: Trial) -> bool:
     return at_edge(trial.refit, last) or not clear(trial.refit, last)
 
 
-def separating(groups: Sequence[Sequence[Rival]]) -> Mapping[str, Any]:
+def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:
     """For each set with more than one member what would tell them apart, in words; empty where there is none."""
     texts = []
     for group in groups:
         if len(group) > 1:
             first = group[0]
-            told = advice(first.effect, [(r.effect, r.at) for r in group[1:]], first.at)
+            told = advice(first.effect, [(r.effect, r.at) for r in group[1:]], first.at, recorded)
             if told:
                 texts.append(told)
     return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}

@@ -145,7 +145,7 @@ def _assembled(
         text=judgement.text if other is None else f"{judgement.text} {other.text}",
         effects=effects,
         ambiguity=sets,
-        separating_experiment=separating(sets) or judgement.experiment,
+        separating_experiment=separating(sets, {o for e in last.problem.experiments for o in e.outputs}) or judgement.experiment,
         candidates=lines(outcome),
         location=localise(model if isinstance(model, Model) else None, first.nominal()),
         detectable=detectable(outcome, search.options),

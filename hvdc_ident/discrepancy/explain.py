@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from hvdc_ident.discrepancy.refit import Placed, Refit
 from hvdc_ident.discrepancy.result import Found, Size
 from hvdc_ident.effects import effects
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.words import listed, quantity
 
 
 def found_of(refit: Refit, placed: Placed, chosen_from: int) -> Found:
@@ -34,20 +35,19 @@ def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
     """The effect's sentence from the catalogue, filled in."""
     entry = effects()[placed.candidate.effect]
     units = {n: q.unit for n, q in entry.parameters.items()}
-    words = {n: f"{v:.4g} {units.get(n, '')}".rstrip() for n, v in sizes.items()}
-    words |= {"at": " and ".join(_listed(placed.candidate.at)), "from": placed.candidate.source}
+    words = {n: quantity(v, units.get(n, "")) for n, v in sizes.items()}
+    at = placed.candidate.at
+    words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": placed.candidate.source}
     text = entry.sentence
     for name, value in words.items():
         text = text.replace("{" + name + "}", value)
-    return text[:1].upper() + text[1:] if text and not text.startswith(placed.candidate.at[0]) else text
+    return text[:1].upper() + text[1:] if text and not text.startswith(at[0]) else text
 
 
-def _listed(names: tuple[str, ...]) -> tuple[str, ...]:
-    return names if len(names) < 3 else (", ".join(names[:-1]), names[-1])
-
-
-def advice(first: str, others: list[tuple[str, tuple[str, ...]]], at: tuple[str, ...]) -> str:
-    """What experiment or record would tell the members of an ambiguity set apart."""
+def advice(
+    first: str, others: list[tuple[str, tuple[str, ...]]], at: tuple[str, ...], recorded: Collection[str] = ()
+) -> str:
+    """What experiment or record would tell the members of an ambiguity set apart; what is recorded already is not asked for."""
     entry = effects()[first]
     parts = []
     for name in dict.fromkeys(n for n, _ in others if n != first):
@@ -55,8 +55,8 @@ def advice(first: str, others: list[tuple[str, tuple[str, ...]]], at: tuple[str,
         parts.append(f"{first} or {name}: {told or f'{entry.excited_by}; {effects()[name].excited_by}'}")
     elsewhere = dict.fromkeys(p for n, a in others if n == first and a != at for p in a if p not in at)
     if elsewhere:
-        parts.append(
-            f"which place: record {', '.join(dict.fromkeys([*at, *list(elsewhere)[:6]]))} beside the present outputs, "
-            f"and move the inputs on either side of them"
-        )
+        wanted = dict.fromkeys(p.removeprefix("outputs.") for p in (*at, *list(elsewhere)[:6]))
+        missing = [p for p in wanted if p not in recorded]
+        record = f"record {listed(missing)} as well, and " if missing else ""
+        parts.append(f"{record}move the inputs on either side of {listed(wanted)}")
     return "; ".join(parts)

@@ -14,6 +14,7 @@ from hvdc_ident.errors import ComputationError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.model.definition import Model
 from hvdc_ident.simulate import simulate
+from hvdc_ident.words import quantity
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 """Of the way from the neutral size to the one that was found; 0 is the model without the effect, gains as found with it."""
@@ -46,7 +47,7 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
             continue
         shown["sizes"].append(value)
         shown["shares"].append(share)
-        shown["labels"].append("without it" if value is None else f"{name} = {value:.4g} {size.unit}".rstrip())
+        shown["labels"].append("without it" if value is None else f"{name} = {quantity(value, size.unit)}")
         shown["curves"].append(run[place[0]][rows].tolist())
     assert chosen.measured is not None
     return {

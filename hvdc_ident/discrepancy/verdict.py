@@ -78,9 +78,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
     if any(len(g) > 1 for g in sets):
         others = max(len(g) for g in sets) - 1
-        return Judgement(
-            "ambiguous", f"Missing: {labels}, or one of {others} others that these data cannot tell from it.", tests
-        )
+        rest = f"one of {others} others" if others > 1 else "another one"
+        return Judgement("ambiguous", f"Missing: {labels}, or {rest} that these data cannot tell from it.", tests)
     return Judgement("named", f"Missing: {labels}.", tests)
 
 

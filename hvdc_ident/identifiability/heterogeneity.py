@@ -111,7 +111,7 @@ def misspecification(optimum: Optimum, found: FrozenMap[Heterogeneity], units: d
             unit = f" {units[name]}" if units.get(name) else ""
             signs.append(
                 f"the experiments disagree on {name}: alone they would put it at {low:.4g} to {high:.4g}{unit} "
-                f"(Q {h.q:.3g} for {h.dof} degrees of freedom, I2 {100 * h.i2:.0f} %)"
+                f"(Q {h.q:.0f} for {h.dof} degree{'' if h.dof == 1 else 's'} of freedom, I2 {100 * h.i2:.0f} %)"
             )
     if optimum.excess > 1.0:
         signs.append(f"the residuals are {np.sqrt(optimum.excess):.2g} times the noise")

@@ -1,0 +1,29 @@
+"""Values and lists as sentences say them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+_SMALLER = ((1e-4, 1e6, "µs"), (0.1, 1e3, "ms"))
+
+
+def quantity(value: float, unit: str = "", digits: int = 4) -> str:
+    """A value with its unit, so many significant digits; short times in ms or µs."""
+    for below, factor, smaller in _SMALLER:
+        if unit == "s" and 0.0 < abs(value) < below:
+            return f"{factor * value:.{digits}g} {smaller}"
+    return f"{value:.{digits}g} {unit}".rstrip()
+
+
+def span(low: float, high: float, unit: str = "", digits: int = 4) -> str:
+    """Two ends with one unit, that of the upper one."""
+    for below, factor, smaller in _SMALLER:
+        if unit == "s" and 0.0 < abs(high) < below:
+            return f"{factor * low:.{digits}g} and {factor * high:.{digits}g} {smaller}"
+    return f"{low:.{digits}g} and {high:.{digits}g} {unit}".rstrip()
+
+
+def listed(names: Iterable[str]) -> str:
+    """The names as a sentence has them: A, B and C."""
+    *most, last = [*names] or [""]
+    return f"{', '.join(most)} and {last}" if most else last
