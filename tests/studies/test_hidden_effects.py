@@ -191,11 +191,21 @@ def test_a_case_is_as_large_as_it_should_be_and_made_anew_the_same(large):
 def test_a_unit_is_what_a_refit_leaves():
     base = sizes.nominal("drive", "small", 1)
     sigma = 0.01 * np.ptp(base.outputs[:, :2], axis=(0, 1))
-    shift = base.outputs[:, :2] + 0.3 * base.slopes[:, :, 0]
     everything = (0, 1, 2)
-    assert sizes.units(base, shift[:, :, None], sigma, "white", everything)[0] < 1e-9, (
+    small = base.outputs[:, :2] + 0.01 * base.slopes[:, :, 0]
+    assert sizes.units(base, small[:, :, None], sigma, "white", everything)[0] < 1e-9, (
         "a gain's own answer is no effect"
     )
+    # Nor is it where the gains move far: a refit makes it good, a straight line from the true gains does not.
+    values = {"KP": 1.7 * DRIVE.parameters["KP"], "J": 0.6 * DRIVE.parameters["J"]}
+    moved = simulate(DRIVE, [Run(r.inputs, values) for r in base.runs[:2]])
+    q = np.linalg.qr(base.slopes.transpose(0, 1, 3, 2).reshape(-1, 3) / np.tile(sigma, 600)[:, None])[0]
+    r = ((moved - base.outputs[:, :2]) / sigma).ravel()
+    assert np.linalg.norm(r - q @ (q.T @ r)) > 5 * sizes.UNIT
+    assert sizes.units(base, moved[:, :, None], sigma, "white", everything)[0] < 0.05
+    # Beyond the bounds a fit stops there: what it leaves is what the edge leaves.
+    outside = simulate(DRIVE, [Run(r.inputs, {"KP": 8 * DRIVE.parameters["KP"]}) for r in base.runs[:2]])
+    assert sizes.units(base, outside[:, :, None], sigma, "white", everything)[0] > 1.0
     odd = base.outputs[:, :2].copy()
     odd[40, 0, 0] += 5 * sigma[0]  # one row before the event: no gain can follow
     assert sizes.units(base, odd[:, :, None], sigma, "white", everything)[0] == pytest.approx(5 / sizes.UNIT, rel=1e-3)

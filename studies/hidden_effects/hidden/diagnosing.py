@@ -12,6 +12,7 @@ import numpy as np
 from hidden.campaigns import summary
 from hidden.cases import Case
 from hidden.plants import PLANTS
+from hidden.sizes import WIDTH
 from hvdc_ident import simulate
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse, effects
@@ -26,8 +27,6 @@ from hvdc_ident.trajectory import Trajectory
 
 CARDS = Path(__file__).resolve().parents[1] / "cards"
 NAMES = ("fit-1", "fit-2", "holdout")
-WIDTH = 5.0
-"""The bounds of a fitted parameter: its true value divided and multiplied by this."""
 
 
 def model_of(plant: str) -> Model:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,6 +20,14 @@ UNIT = 4.15
 """One unit: the post-refit signature |M s|, in whitened noise, at which its score s'Mr/|Ms| has a mean equal to the
 threshold of a two-sided test at 1 % over three hundred candidates."""
 GRID = 14
+NEAR = 0.03
+"""A change of a parameter, as a logarithm, up to which its answer counts as linear."""
+ROUNDS, SETTLED = 8, 1e-2
+"""Of a refit: runs at most, and the relative fall of the sum of squares at which it has ended."""
+COARSE = 2e-3
+"""s: the step of the plant without effects in such a refit. All inputs' corners lie on it."""
+WIDTH = 5.0
+"""The bounds of a fitted parameter: its true value divided and multiplied by this."""
 LATE = 1e-7
 """By how much a sampler's period is longer than its steps. Rows and samples both begin with the record: without it they
 would meet exactly, and which of the two comes first would be a matter of rounding."""
@@ -139,6 +147,7 @@ class Nominal:
     runs: tuple[Run, Run, Run]
     outputs: Array
     slopes: Array  # (rows, 2, parameters, outputs), of the fitted experiments
+    coarse: Array  # (rows, 2, outputs), what those of a run at COARSE lack
     slots: Mapping[str, Array]  # (rows, 2)
 
 
@@ -160,7 +169,8 @@ def nominal(plant_name: str, excitation: str, variant: int) -> Nominal:
     slopes = (moved[:, :, 1] - moved[:, :, 0]).transpose(0, 2, 1, 3) / size[:, None]
     slots = {s: found[:, :2, n + k] for k, s in enumerate(plant.slots)}
     slots |= {f"outputs.{o}": found[:, :2, k] for k, o in enumerate(plant.outputs)}
-    return Nominal(plant, runs, found[:, :3, :n], slopes, slots)
+    coarse = found[:, :2, :n] - simulate(plant, runs[:2], step=COARSE)
+    return Nominal(plant, runs, found[:, :3, :n], slopes, coarse, slots)
 
 
 def about(base: Nominal, at: str, source: str) -> About:
@@ -173,16 +183,95 @@ def about(base: Nominal, at: str, source: str) -> About:
 
 
 def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Sequence[int]) -> Array:
-    """(n,) the post-refit size of each answer, in units. answer: (rows, 2, n, outputs) of the fitted experiments."""
+    """(n,) the post-refit size of each answer, in units. answer: (rows, 2, n, outputs) of the fitted experiments.
+
+    What the plant without effects, refitted, leaves of the answer. Where a linear step moves no parameter far it is
+    taken for the refit; else the refit is run, within the bounds a fit has.
+    """
     pick = list(channels)
-    s = whitened(answer - base.outputs[:, :2, None], sigma, kind)[..., pick]
-    slopes = whitened(base.slopes, sigma, kind)[..., pick]
-    s = s.transpose(0, 1, 3, 2).reshape(-1, answer.shape[2])
-    slopes = slopes.transpose(0, 1, 3, 2).reshape(-1, len(base.plant.fitted))
-    slopes = slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-12)
-    left, values, _ = np.linalg.svd(slopes, full_matrices=False)
-    left = left[:, values > 1e-9 * values.max()]
-    return np.asarray(np.linalg.norm(s - left @ (left.T @ s), axis=0) / UNIT)
+
+    def residual(y: Array) -> Array:
+        """(N, n) of outputs (rows, 2, n, outputs)."""
+        d = whitened(y, sigma, kind)[..., pick]
+        return np.asarray(d.transpose(0, 1, 3, 2).reshape(-1, y.shape[2]))
+
+    logs = np.array([base.plant.parameters[p] for p in base.plant.fitted])[:, None]
+    slopes = residual(base.slopes * logs)
+    r = residual(answer - base.outputs[:, :2, None])
+    steps = np.array([_step(slopes, d, 0.0) for d in r.T])
+    found = np.linalg.norm(r - slopes @ steps.T, axis=0)
+    far = np.flatnonzero(np.abs(steps).max(axis=1) > NEAR)
+    if far.size:
+        found[far] = _refitted(base, residual, answer[:, :, far], r[:, far], slopes)
+    return found / UNIT
+
+
+def _step(slopes: Array, r: Array, damping: float) -> Array:
+    """The Levenberg-Marquardt step of log-parameters towards r."""
+    norms = np.maximum(np.linalg.norm(slopes, axis=0), 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300))
+    unit = slopes / norms
+    left, values, right = np.linalg.svd(unit, full_matrices=False)
+    kept = values > 1e-9 * values.max()
+    left, values, right = left[:, kept], values[kept], right[kept]
+    return np.asarray((right.T @ (values / (values**2 + damping) * (left.T @ r))) / norms)
+
+
+def _refitted(base: Nominal, residual: Callable[[Array], Array], answer: Array, r: Array, slopes: Array) -> Array:
+    """(n,) the norm of what is left of each answer at the best parameters found, all answers at once."""
+    n = answer.shape[2]
+    here, cost, jacobians = np.zeros((n, len(base.plant.fitted))), np.sum(r**2, axis=0), [slopes] * n
+    r, damping, open_ = r.copy(), np.full(n, 1e-3), np.ones(n, dtype=bool)
+    for _ in range(ROUNDS):
+        which = np.flatnonzero(open_)
+        if not which.size:
+            break
+        there = np.array([_bounded(here[k], jacobians[k], r[:, k], damping[k]) for k in which])
+        y, moved = _plant(base, there)
+        new = residual(answer[:, :, which] - y)
+        for j, k in enumerate(which):
+            power = float(np.sum(new[:, j] ** 2))
+            if not power < cost[k]:
+                damping[k] *= 10.0
+                open_[k] = damping[k] < 1e6
+                continue
+            open_[k] = cost[k] - power > SETTLED * cost[k]
+            here[k], cost[k], r[:, k] = there[j], power, new[:, j]
+            jacobians[k], damping[k] = residual(moved[:, :, j]), 0.1 * damping[k]
+    return np.asarray(np.sqrt(cost))
+
+
+def _bounded(at: Array, slopes: Array, r: Array, damping: float) -> Array:
+    """Where a step leads, within the bounds; parameters that a step would take across one stand there."""
+    edge, free = np.log(WIDTH), np.ones(at.size, dtype=bool)
+    there = at.copy()
+    for _ in range(at.size):
+        there[free] = at[free] + _step(slopes[:, free], r - slopes[:, ~free] @ (there - at)[~free], damping)
+        out = free & (np.abs(there) > edge)
+        if not out.any():
+            break
+        there[out], free = np.sign(there[out]) * edge, free & ~out
+        if not free.any():
+            break
+    return np.clip(there, -edge, edge)
+
+
+def _plant(base: Nominal, logs: Array) -> tuple[Array, Array]:
+    """Outputs, (rows, 2, n, outputs), of the plant without effects at log-parameters (n, p), and slopes by those.
+
+    slopes: (rows, 2, n, parameters, outputs).
+    """
+    plant, n, p = base.plant, *logs.shape
+    batch = []
+    for run in base.runs[:2]:
+        for k in range(n):
+            for j in range(p + 1):
+                shift = logs[k] + 1e-3 * (np.arange(p) == j - 1)
+                values = {q: plant.parameters[q] * float(np.exp(v)) for q, v in zip(plant.fitted, shift, strict=True)}
+                batch.append(Run(run.inputs, values))
+    found = simulate(plant, batch, step=COARSE)
+    found = found.reshape(found.shape[0], 2, n, p + 1, -1)
+    slopes = (found[:, :, :, 1:] - found[:, :, :, :1]) / 1e-3
+    return found[:, :, :, 0] + base.coarse[:, :, None], slopes
 
 
 def sized(
