@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal
@@ -75,9 +75,9 @@ class Engine:
         p = np.ascontiguousarray(p, dtype=float)
         n, extra = s.nx + s.nz, s.nd + s.nq
         m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
-        for guess in self._guesses:
+        for begin in self._begins(p, u, time):
             y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width))
-            y[:n], w[0], w[1 : 1 + s.nu] = guess, time, u
+            y[:n], w[0], w[1 : 1 + s.nu], w[1 + s.nu : 1 + s.nu + extra] = begin[:n], time, u, begin[n:]
             jac = np.zeros((n + extra, n + extra))
             given = (self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst)
             if _status(self._integrators.rest(*given)) == 0:
@@ -85,6 +85,26 @@ class Engine:
         from hvdc_ident.simulate.steady import fallback
 
         return fallback(self.structure, self._address, p, u, self._guesses[0], time)
+
+    def _begins(self, p: Array, u: Array, time: float) -> Iterator[Array]:
+        """Where the search begins: each guess with its delayed and sampled values at 0, then with those as their sources are there."""
+        extra = self.structure.sizes.nd + self.structure.sizes.nq
+        for guess in self._guesses:
+            yield np.concatenate([guess, np.zeros(extra)])
+            if extra:
+                held = self._held(guess, p, u, time)
+                if held.any() and np.isfinite(held).all():
+                    yield np.concatenate([guess, held])
+
+    def _held(self, guess: Array, p: Array, u: Array, time: float) -> Array:
+        """Delayed and sampled values, as their sources are at a guess."""
+        s = self.structure.sizes
+        held, m = np.zeros(s.nd + s.nq), np.zeros(max(s.ns, 1))
+        for _ in held:  # a source may read another's value
+            w = np.concatenate([[time], u, held])
+            evaluate(self._address[NAMES.index("modes")], guess, w, p, m, m)
+            evaluate(self._address[NAMES.index("src")], guess, w, p, m, held)
+        return held
 
     @cached_property
     def _guesses(self) -> list[Array]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from hvdc_ident.effects import EffectUse
 from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model import Algebraic, Model, State
@@ -115,3 +116,16 @@ def test_a_rest_far_from_a_guess_of_zero_is_found_where_a_state_does_not_matter(
     start = simulate(model, experiment("start", np.array([0.0, 1.0])))
     np.testing.assert_allclose(start["x"], size, rtol=1e-12)
     np.testing.assert_allclose(start["y"], 2.0)
+
+
+@pytest.mark.parametrize("slot", ["Vdc1", "Vac1", "Vac2", "Vdc1_m"])
+@pytest.mark.parametrize("effect", ["delay", "sample-hold"])
+def test_what_is_delayed_is_at_rest_where_the_signal_is(slot, effect):
+    """A delayed voltage that is taken for 0 at first is divided by: the search begins where its source stands."""
+    late = LINK.with_effects([EffectUse(effect, (slot,), {"T" if effect == "delay" else "Ts": 1e-3})])
+    still = experiment("rest", np.array([0.0, 1e-4]), {"Pref2": InputSignal.constant(0.3)})
+    expected = simulate(LINK, still, sensitivities=("Rdc",))
+    found = simulate(late, still, sensitivities=("Rdc",))
+    for output in LINK.outputs:
+        assert found[output][0] == pytest.approx(expected[output][0], abs=1e-9)
+        assert found.gradient(output)[0] == pytest.approx(expected.gradient(output)[0], abs=1e-9)
