@@ -20,7 +20,7 @@ ACROSS = 3
 
 def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
     """The pooled residual of given gains, refitted and augmented model, on fitted and on held-out data."""
-    fig = figure(5.5, 3.0)
+    fig = figure(7.4, 2.8)
     axes = fig.subplots()
     names = [n for n in ("nominal", "refitted", "augmented") if n in pooled]
     for k, (part, label, colour) in enumerate((("fit", "fitted", AFTER), ("holdout", "held out", BEFORE))):
@@ -78,3 +78,4 @@ def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
     below.set_xlabel("frequency, Hz")
     for axes in (above, below):
         axes.grid(True, color=MARK, alpha=0.3)
+        axes.tick_params(labelsize=7)

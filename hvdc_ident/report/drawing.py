@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -20,11 +21,18 @@ POINTS = 700
 MEASURED, BEFORE, AFTER, MARK = "#222222", "#d08020", "#1f5fa8", "#999999"
 
 
-def figure(width: float, height: float) -> Figure:
-    """An empty figure, sizes in inches; no window, no state shared with other figures."""
+def figure(width: float, height: float, margins: Mapping[str, float] | None = None) -> Figure:
+    """An empty figure, sizes in inches; no window, no state shared with other figures.
+
+    margins: as `subplots_adjust` takes them; without, they are found by drawing it twice.
+    """
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    if margins is None:
+        return Figure(figsize=(width, height), layout="constrained")
+    fig = Figure(figsize=(width, height))
+    fig.subplots_adjust(**margins)
+    return fig
 
 
 def svg(fig: Figure, label: str) -> str:

@@ -32,7 +32,14 @@ def share(after: Any, before: Any) -> str:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> str:
-    """A table. header and cells are HTML already; `words` are the columns of text, the others are numbers."""
+    """A table. header and cells are HTML already; `words` are the columns of text, the others are numbers.
+
+    A column without anything in it is left out.
+    """
+    rows = [list(row) for row in rows]
+    keep = [i for i in range(len(header)) if not rows or any(row[i] for row in rows)]
+    header, rows = [header[i] for i in keep], [[row[i] for i in keep] for row in rows]
+    words = [new for new, old in enumerate(keep) if old in words]
     head = "".join(f"<th{_kind(i, words)}>{h}</th>" for i, h in enumerate(header))
     body = "\n".join(
         "<tr>" + "".join(f"<td{_kind(i, words)}>{c}</td>" for i, c in enumerate(row)) + "</tr>" for row in rows

@@ -18,6 +18,7 @@ from hvdc_ident.files import write_text
 from hvdc_ident.report.drawing import AFTER, MEASURED, figure, svg, visible_rows
 from hvdc_ident.report.html import text
 from hvdc_ident.report.results import Results
+from hvdc_ident.words import listed, span
 
 FILE = "letter.html"
 STAGE = "discrepancy"
@@ -84,7 +85,7 @@ def _missed(results: Results, found: dict[str, Any]) -> str:
     unit = units.get(output, "")
     return (
         f"With the gains it came with, your model misses {output} in experiment '{experiment}' by "
-        f"{100 * share:.2g} % of what that signal does (RMSE {rmse:.3g} {unit}), the most of all recorded signals."
+        f"{100 * share:.2g} % of all that it does there (RMSE {rmse:.3g} {unit}), more than any other recorded signal."
     ).replace(" )", ")")
 
 
@@ -105,11 +106,11 @@ def _consistent(found: dict[str, Any]) -> str:
     if not effects:
         return str(found.get("text", ""))
     told = [" ".join([e["text"].rstrip("."), _interval(e)]).strip() for e in effects]
-    first = f"The difference is what this would make: {'; and '.join(told)}."
+    first = f"It is consistent with this: {'; and '.join(told)}."
     rivals = [r for group in found.get("ambiguity") or [] for r in group[1:]]
     if not rivals:
         return first + " No other effect of the catalogue, and no other place, explains the recordings as well."
-    names = list(dict.fromkeys(f"{r['effect']} at {' and '.join(r['at'])}" for r in rivals))
+    names = list(dict.fromkeys(f"{r['effect']} at {listed(r['at'])}" for r in rivals))
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     return f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}."
 
@@ -119,7 +120,7 @@ def _interval(effect: dict[str, Any]) -> str:
     for name, size in effect["parameters"].items():
         low, high = size.get("ci95") or (None, None)
         if low is not None and high is not None:
-            parts.append(f"{name} between {low:.4g} and {high:.4g} {size.get('unit', '')}".rstrip())
+            parts.append(f"{name} between {span(low, high, size.get('unit') or '')}")
     return f"({', '.join(parts)}, 95 %)" if parts else ""
 
 
@@ -139,11 +140,11 @@ def _gains(found: dict[str, Any]) -> str:
         return f"Your gains are to blame: fitted, {name} moves by {_percent(alone)}, and that closes the gap as far as it closes."
     if abs(with_it) < 0.5 * abs(alone):
         return (
-            f"Your gains are not to blame: fitted without the effect {name} would be bent by {_percent(alone)}, "
-            f"with it the same fit leaves {_percent(with_it)}."
+            f"Your gains are not to blame: a fit without the effect moves {name} by {_percent(alone)} to make up for it; "
+            f"with the effect the same fit moves it by {_percent(with_it)}."
         )
     return (
-        f"Your gains move too: {name} by {_percent(alone)} when fitted without the effect and by "
+        f"Your gains are to blame too: a fit moves {name} by {_percent(alone)} without the effect and by "
         f"{_percent(with_it)} with it."
     )
 
@@ -191,7 +192,7 @@ def _slider(sizes: dict[str, Any] | None) -> str:
     chosen = sizes.get("chosen") or 0
     drawn = _at_sizes(sizes, chosen)
     data = json.dumps({"labels": sizes["labels"]}).replace("<", "\\u003c")
-    label = f"size of the effect, {sizes['effect']} at {' and '.join(sizes['at'])}"
+    label = f"size of the effect, {sizes['effect']} at {listed(sizes['at'])}"
     return (
         f'<div data-sizes="1"><figure>{drawn}</figure><p class="small"><label>{text(label)}: '
         f'<input type="range" hidden min="0" max="{len(sizes["curves"]) - 1}" value="{chosen}" aria-label="{text(label)}">'

@@ -15,7 +15,7 @@ from hvdc_ident.report.section import Section
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """
-:root { --ink: #1c1c1c; --soft: #666; --line: #ddd; --accent: #1f5fa8; }
+:root { --ink: #1c1c1c; --soft: #5b5b5b; --line: #ddd; --accent: #1f5fa8; }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 62rem; padding: 2rem 1.5rem 4rem; color: var(--ink); background: #fff;
   font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
@@ -34,11 +34,15 @@ code { color: var(--soft); overflow-wrap: anywhere; }
 button, input[type=range] { font: inherit; } figure { position: relative; }
 figure > button { position: absolute; right: 0; bottom: 0; font-size: .8rem; padding: .1rem .5rem; color: var(--accent);
   background: #fff; border: 1px solid var(--accent); border-radius: .3rem; cursor: pointer; }
-button:focus-visible, input:focus-visible, a:focus-visible, [tabindex]:focus-visible { outline: 3px solid #e69f00; }
+button:focus-visible, input:focus-visible, a:focus-visible, summary:focus-visible, [tabindex]:focus-visible {
+  outline: 3px solid #b35900; outline-offset: 2px; } a { color: var(--accent); } summary { cursor: pointer; }
 .letter { border: 1px solid var(--line); padding: 1rem 1.4rem; border-radius: .4rem; } .letter p { margin: .5rem 0; }
 figure { margin: .4rem 0 1rem; break-inside: avoid; } figure svg { width: 100%; height: auto; display: block; }
+.keys { color: var(--soft); font-size: .8rem; }
+@media (max-width: 40rem) { body { padding: 1rem .8rem 3rem; } .letter { padding: .6rem .8rem; }
+  figure { overflow-x: auto; } figure > svg { min-width: 34rem; } figure > button { position: sticky; left: 0; } }
 @media print {
-  figure > button, input[type=range] { display: none; }
+  figure > button, input[type=range], .saved, .keys { display: none; } details::details-content { content-visibility: visible; }
   body { max-width: none; padding: 0; font-size: 10pt; }
   h2, h3 { break-after: avoid; } tr { break-inside: avoid; }
 }

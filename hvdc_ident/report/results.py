@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import InputError
+from hvdc_ident.files import csv_name
 from hvdc_ident.trajectory import Trajectory
 
 
@@ -58,7 +59,7 @@ class Results:
         if path.parent.resolve() != self.folder.resolve() or not path.is_file():
             return None
         with path.open(encoding="utf-8", newline="") as file:
-            header = next(csv.reader(file), [])
+            header = [csv_name(name) for name in next(csv.reader(file), [])]
             try:
                 rows = np.loadtxt(file, delimiter=",", ndmin=2)
             except ValueError:

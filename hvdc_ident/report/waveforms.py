@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+MARGINS = {"left": 0.11, "right": 0.99, "bottom": 0.12, "top": 0.91, "hspace": 0.1}
+
+
 def waveforms(
     output: str,
     unit: str,
@@ -27,7 +30,7 @@ def waveforms(
     before, after: tables with the columns OUTPUT and OUTPUT.measured, at the start values and at the estimates; with
     OUTPUT.low and OUTPUT.high the band between them is shaded.
     """
-    fig = figure(7.4, 3.5)
+    fig = figure(7.4, 3.5, MARGINS)
     top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[3, 1])
     shown = after if after is not None else before
     if shown is not None:
@@ -46,6 +49,8 @@ def waveforms(
     top.set_ylabel(f"{output}{unit_text}")
     strip.set_ylabel("residual")
     strip.set_xlabel("time, s")
+    for axes in (top, strip):
+        axes.yaxis.set_label_coords(-0.1, 0.5)  # one below the other, however wide the numbers are
     strip.axhline(0.0, color=MARK, linewidth=0.6)
     for axes in (top, strip):
         axes.grid(True, color="#e4e4e4", linewidth=0.6)
@@ -55,7 +60,7 @@ def waveforms(
             axes.axvline(event, color=MARK, linewidth=0.8, linestyle=":")
         if window is not None:
             axes.axvspan(*window, color="#1f5fa8", alpha=0.05, linewidth=0)
-    fig.legend(*top.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside upper right", ncols=3)
+    fig.legend(*top.get_legend_handles_labels(), fontsize=8, frameon=False, loc="upper right", ncols=4)
     if shown is not None:
         top.set_ylim(*_limits([t for t in (before, after) if t is not None], output))
     return fig

@@ -21,7 +21,7 @@ def diagnosis(**changes: Any) -> dict[str, Any]:
         "effect": "lag",
         "at": ["P2_m"],
         "parameters": {"T": {"value": 0.0016, "ci95": [0.0014, 0.0018], "unit": "s"}},
-        "text": "P2_m follows with a lag of 0.0016 s",
+        "text": "P2_m follows with a lag of 1.6 ms",
         "chosen_from": 5,
     }
     gap = {
@@ -45,7 +45,7 @@ def diagnosis(**changes: Any) -> dict[str, Any]:
         "measured": [0.0, 0.5, 1.0],
         "sizes": [None, 0.0016],
         "shares": [0.0, 1.0],
-        "labels": ["without it", "T = 0.0016 s"],
+        "labels": ["without it", "T = 1.6 ms"],
         "curves": [[0.0, 0.6, 1.0], [0.0, 0.5, 1.0]],
         "chosen": 1,
     }
@@ -85,7 +85,7 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
     letter = letter_of(Results(folder_with(tmp_path, diagnosis())))
     missed, consistent, gains, gained, following = letter.sentences
     assert "misses P2 in experiment 'step' by 20 %" in missed
-    assert "lag of 0.0016 s" in consistent and "0.0014 and 0.0018 s" in consistent and "delay at P2_m" in consistent
+    assert "lag of 1.6 ms" in consistent and "1.4 and 1.8 ms" in consistent and "delay at P2_m" in consistent
     assert "not to blame" in gains and "+5.0 %" in gains and "+0.3 %" in gains
     assert "75 %" in gained and "1.05 times the noise" in gained
     assert following == "To tell them apart: Record P2 at 1 kHz."

@@ -107,7 +107,7 @@ def test_the_page_is_whole_and_needs_no_network(tmp_path: Path) -> None:
     found = parsed(text)
     assert found.seen.count("svg") == 1
     assert sorted(found.scripts, key=str) == [None, "application/gzip", "application/json"]
-    assert all(a.startswith("#") for a in found.addresses)
+    assert all(a.startswith(("#", "data:application/zip;")) for a in found.addresses)
     for words in (
         "Gains",
         "Error before and after",

@@ -28,6 +28,15 @@
     }));
   };
 
+  // What a mouse does by dragging: every key gives the range of the time axis that is shown next.
+  const KEYS = "+ and − zoom, arrow keys move, 0 shows all";
+  const zoom = (factor) => (a, b) => [(a + b) / 2 - factor * (b - a) / 2, (a + b) / 2 + factor * (b - a) / 2];
+  const shift = (share) => (a, b) => [a + share * (b - a), b + share * (b - a)];
+  const MOVES = {
+    "+": zoom(0.5), "=": zoom(0.5), "-": zoom(2), "ArrowLeft": shift(-0.2), "ArrowRight": shift(0.2),
+    "0": (a, b, all) => [...all],
+  };
+
   const enlarge = async (figure, button) => {
     const data = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
     const [x, upper, lower] = data.titles;
@@ -44,6 +53,19 @@
       legend: { orientation: "h", y: 1.12 }, hovermode: "x unified",
     }, { responsive: true, displaylogo: false });
     place.tabIndex = 0;
+    place.setAttribute("role", "group");
+    place.setAttribute("aria-label", figure.dataset.zoom + ". Keys: " + KEYS);
+    const keys = document.createElement("p");
+    keys.className = "keys";
+    keys.textContent = KEYS;
+    figure.append(keys);
+    const all = [...place.layout.xaxis.range];
+    place.addEventListener("keydown", (event) => {
+      const move = MOVES[event.key];
+      if (!move || event.ctrlKey || event.altKey || event.metaKey) return;
+      event.preventDefault();
+      Plotly.relayout(place, { "xaxis.range": move(...place.layout.xaxis.range, all) });
+    });
     place.focus();
   };
 

@@ -9,21 +9,34 @@ from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import number, share, table, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
+from hvdc_ident.words import span
 
 MOST = 12
+SHOWN = 5e-3
+"""A smaller share of the gap is none."""
 
 
 def _render(results: Results) -> str:
     found = results.get("discrepancy")
     if not found.get("verdict"):
         return ""
-    parts = [_lead(found), _effects(found), _sets(found), _gap(found), _gains(found), _where(found), _candidates(found)]
+    units = {**(results.get("simulation").get("units") or {}), **(results.get("fit").get("units") or {})}
+    parts = [
+        _lead(found),
+        _effects(found),
+        _sets(found),
+        _gap(found, units),
+        _gains(found),
+        _where(found),
+        _candidates(found),
+    ]
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
     return "".join(parts) + notes
 
 
 def _lead(found: dict[str, Any]) -> str:
-    return f"<p><strong>{text(found['verdict'])}</strong>. {text(found.get('text', ''))}</p>"
+    verdict = str(found["verdict"])
+    return f"<p><strong>{text(verdict[:1].upper() + verdict[1:])}.</strong> {text(found.get('text', ''))}</p>"
 
 
 def _effects(found: dict[str, Any]) -> str:
@@ -33,10 +46,10 @@ def _effects(found: dict[str, Any]) -> str:
         for name, p in (e.get("parameters") or {}).items():
             low, high = p.get("ci95") or (None, None)
             interval = f" (95 %: {number(low)} … {number(high)})" if p.get("ci95") else ""
-            sizes.append(f"{text(name)} = {number(p.get('value'))} {text(p.get('unit') or '')}{interval}")
-        lines.append(
-            f"<li>{text(e.get('text', ''))}: {'; '.join(sizes)}; chosen from {text(e.get('chosen_from'))}.</li>"
-        )
+            size = f"{text(name)} = {number(p.get('value'))}{interval} {text(p.get('unit') or '')}"
+            sizes.append(size.rstrip())
+        among = f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
+        lines.append(f"<li>{text(str(e.get('text', '')).rstrip('.'))}: {'; '.join(sizes)}. {among}</li>")
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
 
 
@@ -50,14 +63,15 @@ def _sets(found: dict[str, Any]) -> str:
         more = f"<p class='small'>and {len(group) - MOST} more</p>" if len(group) > MOST else ""
         parts.append(
             "<h3>As good as what was put in</h3>"
-            + table(["effect", "at", "from", "ΔBIC"], rows, words=(0, 1, 2))
+            + table(["effect", "at", "from", "behind the best, BIC"], rows, words=(0, 1, 2))
             + more
         )
     advice = (found.get("separating_experiment") or {}).get("text")
-    return "".join(parts) + (f"<p><strong>What to measure.</strong> {text(advice)}</p>" if advice else "")
+    told = f"<p><strong>What to measure.</strong> {text(advice.rstrip('.'))}.</p>" if advice else ""
+    return "".join(parts) + told
 
 
-def _gap(found: dict[str, Any]) -> str:
+def _gap(found: dict[str, Any], units: dict[str, Any]) -> str:
     gap = found.get("gap") or {}
     if not gap.get("pooled"):
         return ""
@@ -71,8 +85,10 @@ def _gap(found: dict[str, Any]) -> str:
                     for m in ("nominal", "refitted", "augmented")
                 ]
                 floor = (gap.get("noise_floor") or {}).get(output)
-                rows.append([text(output), text(experiment), text(part), *(number(v, 3) for v in (*values, floor))])
-    header = ["output", "experiment", "role", "given gains", "refitted", "with effect", "noise"]
+                errors = [number(v, 3) for v in (*values, floor)]
+                role = "held out" if part == "holdout" else part
+                rows.append([text(output), text(experiment), role, *errors, text(units.get(output, ""))])
+    header = ["output", "experiment", "role", "given gains", "refitted", "with effect", "noise", "unit"]
     shrink = gap.get("shrink_holdout")
     line = (
         f"<p>Held out, the gap shrinks by {100 * shrink:.1f} %.</p>"
@@ -81,8 +97,10 @@ def _gap(found: dict[str, Any]) -> str:
     )
     frequency = [c for c in found.get("bode") or [] if c.get("omega")]
     second = svg(bode(frequency), "frequency responses of model and record") if frequency else ""
-    errors = table(header, rows, words=(0, 1, 2))
-    return f"<h3>Before and after (RMSE)</h3><figure>{picture}</figure>{line}{errors}<figure>{second}</figure>"
+    listed = table(header, rows, words=(0, 1, 2, 7))
+    note = "<p class='small'>Rows on a jump of an input are left out here: no recorder tells which side they show.</p>"
+    told = f"<h3>Before and after (RMSE)</h3><figure>{picture}</figure>{line}{listed}{note}"
+    return f"{told}<figure>{second}</figure>" if second else told
 
 
 def _gains(found: dict[str, Any]) -> str:
@@ -104,25 +122,28 @@ def _gains(found: dict[str, Any]) -> str:
 
 def _where(found: dict[str, Any]) -> str:
     place, left = found.get("location") or {}, found.get("remaining") or {}
-    outputs = ", ".join(f"{text(n)} {100 * v:.0f} %" for n, v in list((place.get("outputs") or {}).items())[:5])
-    experiments = ", ".join(f"{text(n)} {100 * v:.0f} %" for n, v in list((place.get("experiments") or {}).items())[:5])
+    outputs, experiments = _shares(place.get("outputs")), _shares(place.get("experiments"))
     window, band, region = place.get("time_window"), place.get("band_hz"), place.get("region")
-    parts = [f"Share of the gap by output: {outputs}; by experiment: {experiments}."]
+    parts = [f"Share of the gap by output: {outputs}; by experiment: {experiments}."] if outputs else []
     if window:
-        parts.append(f"Most of it lies between {number(window['from'])} and {number(window['to'])} s from the event.")
+        parts.append(f"Most of it lies between {span(window['from'], window['to'], 's', 3)} after the event.")
     if band:
-        parts.append(f"Band shared with the inputs: {number(band[0], 3)} to {number(band[1], 3)} Hz.")
+        parts.append(f"It shares frequencies with the inputs from {number(band[0], 3)} to {number(band[1], 3)} Hz.")
     if region:
-        parts.append(
-            f"Densest where {text(region['signal'])} is in {number(region['from'], 3)} … {number(region['to'], 3)}."
-        )
-    rest = "noise" if left.get("adequate") else "not all noise"
-    explained = left.get("explained_share")
-    parts.append(
-        f"What is left is {rest}"
-        + (f"; {100 * explained:.1f} % of the gap is explained." if explained is not None else ".")
-    )
+        ends = f"{number(region['from'], 3)} and {number(region['to'], 3)}"
+        parts.append(f"It is densest where {text(region['signal'])} lies between {ends}.")
+    explained, rest = left.get("explained_share"), "noise" if left.get("adequate") else "not all noise"
+    if explained is not None:
+        parts.append(f"{100 * explained:.1f} % of the gap is explained; what is left is {rest}.")
+    elif left:
+        parts.append(f"What is left is {rest}.")
+    if not parts:
+        return ""
     return "<h3>Where model and data differ</h3><p>" + " ".join(parts) + "</p>"
+
+
+def _shares(found: dict[str, float] | None) -> str:
+    return ", ".join(f"{text(n)} {100 * v:.0f} %" for n, v in list((found or {}).items())[:5] if v >= SHOWN)
 
 
 def _candidates(found: dict[str, Any]) -> str:
@@ -141,8 +162,12 @@ def _candidates(found: dict[str, Any]) -> str:
         ]
         for c in lines
     ]
-    header = ["effect", "at", "from", "score", "p", "gain in BIC", "held out"]
-    return "<h3>Candidates that were refitted</h3>" + table(header, rows, words=(0, 1, 2))
+    header = ["effect", "at", "from", "score", "p", "gain in BIC", "held out, noise units"]
+    note = (
+        "<p class='small'>Score: how much of the residuals the effect's signature takes at its best size, in noise units "
+        "squared; p: the chance of such a score anywhere from noise alone.</p>"
+    )
+    return "<h3>Candidates that were refitted</h3>" + table(header, rows, words=(0, 1, 2)) + note
 
 
 SECTION = Section(order=25, title="What the model lacks", render=_render)

@@ -9,6 +9,7 @@ from hvdc_ident.report.html import number, table, text
 from hvdc_ident.report.profiles import intervals, pair_map, profiles
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
+from hvdc_ident.words import listed
 
 SHOWN = 5e-4
 """A smaller share of the information is none."""
@@ -31,9 +32,19 @@ def _lead(found: dict[str, Any]) -> str:
     )
     rest = f"; held: {text(', '.join(held))}" if held else ""
     structural = found.get("structural") or {}
-    method = f" Structure: {text(structural.get('status', ''))} ({text(structural.get('method', ''))})."
+    method = f" {_structure(structural)} ({text(structural.get('method', ''))})." if structural.get("status") else ""
     combos = "".join(f"<p>{text(_capital(c['words']))}.</p>" for c in found.get("combinations") or [])
     return f"<p><strong>{told}</strong>{rest}.{method}</p>{combos}"
+
+
+def _structure(structural: dict[str, Any]) -> str:
+    """What perfect data could tell."""
+    lost = structural.get("unidentifiable") or []
+    if lost:
+        return f"Not even perfect data would tell {text(listed(map(str, lost)))}"
+    if structural["status"] == "decided":
+        return "From perfect data of these signals every candidate could be told"
+    return f"What perfect data could tell: {text(structural['status'])}"
 
 
 def _verdicts(parameters: dict[str, Any]) -> str:

@@ -93,7 +93,7 @@ def _bode(data: dict[str, Any]) -> str:
     gain.legend(fontsize="small")
     for axes in (gain, phase):
         axes.grid(True, color="#dddddd", linewidth=0.5)
-    return svg(fig, "Bode diagram of the linear model")
+    return f"<figure>{svg(fig, 'Bode diagram of the linear model')}</figure>"
 
 
 SECTION = Section(order=25, title="Linear model", render=_render)

@@ -1,48 +1,103 @@
-"""The first lines of the page: what was asked and what came out, in sentences."""
+"""The first lines of the page: what was asked and what came out, in five sentences."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import number, text
+from hvdc_ident.report.html import number, share, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
+from hvdc_ident.words import listed
 
 
 def _render(results: Results) -> str:
-    heading, fit, simulation = results.heading, results.get("fit"), results.get("simulation")
-    experiments = {**(simulation.get("experiments") or {}), **(fit.get("experiments") or {})}
+    fit = results.get("fit")
+    lines = [_asked(results, fit), _estimated(results, fit), _closer(fit), _adequate(fit), _missing(results)]
+    return "".join(f"<p>{line}</p>" for line in [*lines, *_warnings(results)] if line)
+
+
+def _asked(results: Results, fit: dict[str, Any]) -> str:
+    experiments = {**(results.get("simulation").get("experiments") or {}), **(fit.get("experiments") or {})}
     held_out = sum(1 for e in experiments.values() if e.get("role") == "holdout")
-    lines = [f"Model <strong>{text(heading.get('model', ''))}</strong>"]
-    if experiments:
-        kept = f", {held_out} of them held out" if held_out else ""
-        lines[0] += f" against {_count(len(experiments), 'experiment')}{kept}"
-    lines[0] += "."
-    fitted = fit.get("fitted") or []
-    if fitted and fit.get("status") != "failed":
-        lines.append(f"{_count(len(fitted), 'parameter')} estimated: {text(', '.join(map(str, fitted)))}.")
-        ratios = _ratios(fit)
-        if ratios:
-            low, high = min(ratios), max(ratios)
-            lines.append(
-                f"After the fit the RMSE is {number(100 * low, 3)} to {number(100 * high, 3)} % of what it was before."
-            )
-    if fit.get("chi2_per_dof") is not None and not any(
-        "misfit" in str(s) for s in (fit.get("noise_source") or {}).values()
-    ):
-        chi = fit["chi2_per_dof"]
-        verdict = (
-            "the model explains the recordings down to their noise"
-            if chi < 1.5
-            else "more than noise is left over: the model lacks something"
-        )
-        lines.append(f"χ² per degree of freedom {number(chi, 3)}: {verdict}.")
-    failed = (results.get("run").get("stages")) or {}
-    lines += [f"<strong>{text(n)} failed</strong>: {text(s['failed'])}." for n, s in failed.items() if s.get("failed")]
+    kept = f", {held_out} of them held out" if held_out else ""
+    against = f" against {_count(len(experiments), 'experiment')}{kept}" if experiments else ""
+    return f"Model <strong>{text(results.heading.get('model', ''))}</strong>{against}."
+
+
+def _estimated(results: Results, fit: dict[str, Any]) -> str:
+    """What was estimated and which of it moved most; without a fit, what could be."""
+    told = results.get("identifiability")
+    candidates = list(fit.get("candidates") or told.get("parameters") or {})
+    fitted = [str(n) for n in fit.get("fitted") or ([] if fit else told.get("identifiable") or [])]
+    held = [n for n in candidates if n not in fitted]
+    rest = f"; {text(listed(held))} {'is' if len(held) == 1 else 'are'} held" if held else ""
+    if not fit:
+        return f"These data tell {text(listed(fitted)) if fitted else 'no candidate'}{rest}." if candidates else ""
+    if not fitted or fit.get("status") == "failed":
+        return ""
+    moved = {}
+    for name in fitted:
+        start, value = (fit["candidates"].get(name) or {}).get("start"), (fit.get("values") or {}).get(name)
+        if start and value is not None:
+            moved[name] = (abs(value / start - 1.0), share(value, start), number(value))
+    most = max(moved, key=lambda n: moved[n][0], default=None)
+    how = f"; {text(most)} moves most, by {moved[most][1]} to {moved[most][2]}" if most else ""
+    unit = str((fit["candidates"].get(most) or {}).get("unit", "")) if most else ""
+    return (
+        f"{_count(len(fitted), 'parameter')} estimated: {text(listed(fitted))}{how} {text(unit)}".rstrip() + f"{rest}."
+    )
+
+
+def _closer(fit: dict[str, Any]) -> str:
+    ratios = _ratios(fit) if fit.get("fitted") and fit.get("status") != "failed" else []
+    if not ratios:
+        return ""
+    low, high = number(100 * min(ratios), 3), number(100 * max(ratios), 3)
+    return f"After the fit the RMSE of each signal is {low if low == high else f'{low} to {high}'} % of what it was before."
+
+
+def _adequate(fit: dict[str, Any]) -> str:
+    chi = fit.get("chi2_per_dof")
+    if chi is None or any("misfit" in str(s) for s in (fit.get("noise_source") or {}).values()):
+        return ""
+    left = "the model explains the recordings down to their noise"
+    if chi >= 1.5:
+        left = "more than noise is left over, so the model lacks something"
+    return f"χ² per degree of freedom is {number(chi, 3)}: {left}."
+
+
+def _missing(results: Results) -> str:
+    """The diagnosis: what is missing and where, what else it may be, and what the gap did."""
+    found = results.get("discrepancy")
+    if not found.get("verdict"):
+        return ""
+    effects = found.get("effects") or []
+    if not effects:
+        return f"Diagnosis: {text(str(found.get('text', '')).rstrip('.'))}."
+    what = "; and ".join(text(str(e["text"]).rstrip(".")) for e in effects)
+    rivals = max((len(group) - 1 for group in found.get("ambiguity") or []), default=0)
+    others = f", or one of {rivals} others" if rivals > 1 else ", or another effect" if rivals else ""
+    return f"What the model lacks: {what}{others}{_shrunk(found.get('gap') or {})}."
+
+
+def _shrunk(gap: dict[str, Any]) -> str:
+    """What adding it did to the residual, on held-out data where there are any."""
+    pooled = gap.get("pooled") or {}
+    for part, where in (("holdout", "held-out"), ("fit", "fitted")):
+        was, now = ((pooled.get(m) or {}).get(part) for m in ("refitted", "augmented"))
+        if was and now:
+            return f"; with it the {where} residual goes from {number(was, 3)} to {number(now, 3)} times the noise"
+    return ""
+
+
+def _warnings(results: Results) -> list[str]:
+    """Stages that failed, and results of an earlier state of the study."""
+    failed = {n: s["failed"] for n, s in (results.get("run").get("stages") or {}).items() if s.get("failed")}
+    lines = [f"<strong>{text(n)} failed</strong>: {text(str(why).rstrip('.'))}." for n, why in failed.items()]
     for name, data in results.stages.items():
-        if data.get("sources") != heading.get("sources"):
+        if data.get("sources") != results.heading.get("sources"):
             lines.append(f"{text(name)}.json comes from an earlier state of the study: run it again.")
-    return "".join(f"<p>{line}</p>" for line in lines)
+    return lines
 
 
 def _count(n: int, word: str) -> str:

@@ -1,20 +1,49 @@
-"""Where the page comes from: software, seed, files and their hashes."""
+"""Where the page comes from: software, seed, files and their hashes; and every number of it, to be saved."""
 
 from __future__ import annotations
+
+import base64
+import io
+import zipfile
 
 from hvdc_ident.report.html import table, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
+
+ARCHIVE = "results.zip"
+SUFFIXES = (".json", ".csv", ".toml")
+LARGEST = 20_000_000
+"""Bytes of numbers that a page carries at most, uncompressed; beyond it says where they lie."""
 
 
 def _render(results: Results) -> str:
     heading = results.heading
     rows = [["study", text(heading.get("study", ""))], ["model", text(heading.get("model", ""))]]
     rows += [["software", text(heading.get("software", ""))], ["seed", text(heading.get("seed", ""))]]
-    rows += [["result", text(f"{name}.json")] for name in results.stages]
     sources = heading.get("sources") or {}
     rows += [["source", f"{text(name)}<br><code>sha256 {text(value)}</code>"] for name, value in sources.items()]
-    return table(["what", "which"], rows, words=(0, 1))
+    return table(["what", "which"], rows, words=(0, 1)) + _numbers(results)
+
+
+def _numbers(results: Results) -> str:
+    """A link that saves every number of the page as one archive; it works without scripts and without a network."""
+    paths = [f"{name}.json" for name in results.stages]
+    for stage in results.stages.values():
+        paths += [str(n) for n in stage.get("files") or []]
+    files = [results.folder / n for n in dict.fromkeys(paths)]
+    files = [f for f in files if f.parent == results.folder and f.is_file() and f.suffix in SUFFIXES]
+    names = text(", ".join(f.name for f in files))
+    if sum(f.stat().st_size for f in files) > LARGEST:
+        return f"<p class='small'>Every number of this page lies beside it: {names}.</p>"
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for file in files:
+            archive.writestr(
+                zipfile.ZipInfo(file.name), file.read_bytes(), zipfile.ZIP_DEFLATED, 9
+            )  # the same each time
+    data = base64.b64encode(stream.getvalue()).decode()
+    link = f'<a download="{ARCHIVE}" href="data:application/zip;base64,{data}">Save every number of this page</a>'
+    return f"<p class='saved'>{link} ({ARCHIVE}, {len(stream.getvalue()) / 1e3:.0f} kB)</p><p class='small'>In it: {names}.</p>"
 
 
 SECTION = Section(order=90, title="Provenance", render=_render)

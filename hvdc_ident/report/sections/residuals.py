@@ -18,7 +18,16 @@ def _render(results: Results) -> str:
     if not tests:
         return ""
     rows = [_row(o, e, line, fit) for o, by_name in tests.items() for e, line in by_name.items()]
-    head = ["output", "experiment", "rows", "variance explained", "whiteness p", "runs p", "least p with an input", ""]
+    head = [
+        "output",
+        "experiment",
+        "rows",
+        "variance explained",
+        "whiteness p",
+        "runs p",
+        "least p with an input",
+        "which input",
+    ]
     told = (
         f"<p class='small'>p: the chance of such a value from white noise (Ljung and Box; Wald and Wolfowitz; cross-"
         f"correlation with inputs, each filtered by itself). Below {LOW:g} it is marked: something is left over.</p>"
@@ -47,7 +56,7 @@ def _row(output: str, experiment: str, line: dict[str, Any], fit: dict[str, Any]
         text(output),
         text(experiment),
         number(line.get("n")),
-        f"{number(100.0 * share, 5)} %" if share is not None else "–",
+        f"{number(100.0 * share, 5 if share > 0.9 else 3)} %" if share is not None else "–",
         _p((line.get("ljung_box") or {}).get("p")),
         _p((line.get("runs") or {}).get("p")),
         _p(inputs[least]) if least is not None else "–",
@@ -58,7 +67,7 @@ def _row(output: str, experiment: str, line: dict[str, Any], fit: dict[str, Any]
 def _p(value: float | None) -> str:
     if value is None:
         return "–"
-    shown = number(value, 2)
+    shown = number(value, 2) if value > 0 else "&lt;10<sup>−300</sup>"
     return f"<strong>{shown}</strong>" if value < LOW else shown
 
 
