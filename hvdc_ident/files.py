@@ -15,6 +15,9 @@ from typing import Any
 
 from hvdc_ident.errors import InputError
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""How a text begins that a spreadsheet takes for a formula."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -71,6 +74,17 @@ def make_folder(path: Path) -> Path:
     except OSError as e:
         raise _cannot_write(path, e) from None
     return path
+
+
+def csv_cell(text: str) -> str:
+    """Text for a CSV cell, no line breaks in it, with an apostrophe before what a spreadsheet would calculate."""
+    flat = " ".join(text.splitlines())
+    return f"'{flat}" if text.startswith(FORMULA) else flat
+
+
+def csv_name(cell: str) -> str:
+    """The text of a cell that `csv_cell` wrote."""
+    return cell[1:] if cell.startswith("'") and cell[1:].startswith(FORMULA) else cell
 
 
 def digest(content: bytes) -> str:

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.errors import ComputationError, unknown_name
+from hvdc_ident.files import csv_cell
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.sensitivity.axes import Points, Samples
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray
-
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +147,16 @@ class SweepResult:
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
         header = [*self.parameters, *(f"rmse.{o}.{e}" for o, e in self.series), "status", "reason"]
-        writer.writerow([cell(h) for h in header])
+        writer.writerow([csv_cell(h) for h in header])
         for start in range(0, len(self), 1024):
             block = self.points.rows(start, start + 1024).tolist()
             errors = self.rmse[start : start + 1024].tolist()
             for offset, (values, line) in enumerate(zip(block, errors, strict=True)):
                 bad = self.failed.get(start + offset)
                 numbers = ["" if bad is not None or not math.isfinite(v) else repr(v) for v in line]
-                writer.writerow([*map(repr, values), *numbers, "done" if bad is None else "failed", cell(bad or "")])
+                writer.writerow(
+                    [*map(repr, values), *numbers, "done" if bad is None else "failed", csv_cell(bad or "")]
+                )
         return stream.getvalue()
 
     def to_xarray(self) -> xarray.Dataset:
@@ -219,9 +220,3 @@ class SweepResult:
 
     def _repr_html_(self) -> str:
         return "<pre>" + escape(str(self)) + "</pre>"
-
-
-def cell(text: str) -> str:
-    """Text for a CSV cell, no line breaks in it, with an apostrophe before what a spreadsheet would calculate."""
-    flat = " ".join(text.splitlines())
-    return f"'{flat}" if text.startswith(FORMULA) else flat

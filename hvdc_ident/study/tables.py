@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.files import csv_cell
 from hvdc_ident.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -79,9 +80,15 @@ def ssv(values: Mapping[str, float], name: str) -> str:
 
 
 def csv_text(header: list[str], rows: list[list[Any]]) -> str:
-    """CSV text, every number with all its digits, nothing for None."""
+    """CSV text, every number with all its digits, nothing for None, no text that a spreadsheet takes for a formula."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows([["" if v is None else repr(v) if isinstance(v, float) else v for v in row] for row in rows])
+    writer.writerow([csv_cell(h) for h in header])
+    writer.writerows([[_cell(v) for v in row] for row in rows])
     return stream.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, str):
+        return csv_cell(value)
+    return "" if value is None else repr(value) if isinstance(value, float) else value

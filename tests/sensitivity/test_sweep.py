@@ -12,12 +12,11 @@ import pytest
 
 from hvdc_ident.errors import InputError, StudyError, UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
-from hvdc_ident.files import Rows, json_text
+from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
 from hvdc_ident.model.card import parse_card
 from hvdc_ident.models import load_model
 from hvdc_ident.sensitivity.axes import grid, latin_hypercube, listed
 from hvdc_ident.sensitivity.sweep import sweep
-from hvdc_ident.sensitivity.sweep_result import cell
 from hvdc_ident.study.executors import Ended
 from hvdc_ident.trajectory import trajectory
 
@@ -145,9 +144,10 @@ def test_what_is_kept_is_not_run_again_and_what_differs_is_elsewhere():
 
 
 def test_text_that_a_spreadsheet_would_calculate_is_quoted():
-    assert [cell(t) for t in ("=1+1", "+a", "-a", "@a", "\ta", "plain", "two\nlines")] == [
+    assert [csv_cell(t) for t in ("=1+1", "+a", "-a", "@a", "\ta", "plain", "two\nlines")] == [
         "'=1+1", "'+a", "'-a", "'@a", "'\ta", "plain", "two lines",
     ]  # fmt: skip
+    assert [csv_name(csv_cell(t)) for t in ("=1+1", "'=1", "plain", "'quoted'")] == ["=1+1", "=1", "plain", "'quoted'"]
     odd = RECORDED.with_(name="=cmd()")
     assert "rmse.y.=cmd()" in sweep(MODEL, [odd], listed("k", [1])).to_csv()
     assert sweep(MODEL, [odd], listed("k", [-0.0])).to_csv().splitlines()[1].startswith("-0.0,")
