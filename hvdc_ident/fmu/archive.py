@@ -84,16 +84,23 @@ def unpack(path: Path, folder: Path) -> None:
     with _opened(path) as archive:
         for entry in archive.infolist():
             target = folder.joinpath(*PurePosixPath(_plain(entry.filename)).parts)
-            if entry.is_dir():
-                target.mkdir(parents=True, exist_ok=True)
-                continue
-            target.parent.mkdir(parents=True, exist_ok=True)
             try:
+                if entry.is_dir():
+                    target.mkdir(parents=True, exist_ok=True)
+                    continue
+                target.parent.mkdir(parents=True, exist_ok=True)
                 with archive.open(entry) as source, target.open("wb") as sink:
                     while block := source.read(1 << 20):
                         sink.write(block)
             except DAMAGE as e:
-                raise ModelError(f"'{entry.filename}' in the FMU cannot be unpacked: {e}", where=str(path)) from None
+                raise ModelError(
+                    f"'{entry.filename[:80]}' in the FMU cannot be unpacked: {_said(e)}", where=str(path)
+                ) from None
+
+
+def _said(error: Exception) -> str:
+    """The reason, without the folder it was unpacked to."""
+    return (error.strerror or type(error).__name__) if isinstance(error, OSError) else str(error)
 
 
 def _opened(path: Path) -> zipfile.ZipFile:

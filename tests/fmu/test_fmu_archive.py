@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import stat
 import zipfile
+from itertools import pairwise
 
 import pytest
 from c_fmu import CModel, Var, description
@@ -57,6 +58,12 @@ def pipe():
     return entry
 
 
+def device():
+    entry = zipfile.ZipInfo("resources/device")
+    entry.external_attr = (stat.S_IFCHR | 0o600) << 16
+    return entry
+
+
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
@@ -67,14 +74,44 @@ def pipe():
         ("resources\\..\\..\\escape", "leads out of it"),
         (link(), "is a link"),
         (pipe(), "neither a file nor a folder"),
+        (device(), "neither a file nor a folder"),
+        ("..", "leads out of it"),
+        ("../", "leads out of it"),
+        ("./../canary", "leads out of it"),
+        ("resources/x/../../../../canary", "leads out of it"),
+        ("//host/share/canary", "leads out of it"),
+        ("\\\\host\\share\\canary", "leads out of it"),
+        ("..\\canary", "leads out of it"),
+        ("c:canary", "leads out of it"),
     ],
 )
 def test_entries_that_are_refused(tmp_path, entry, message):
-    path = written(tmp_path / "a.fmu", entries=[(entry, b"x")])
+    folder = tmp_path / "here"
+    folder.mkdir()
+    path = written(folder / "a.fmu", entries=[(entry, b"x")])
+    for place in (tmp_path, folder):
+        (place / "canary").write_text("sings")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(ModelError, match=message):
         load_model(path)
     assert sorted(tmp_path.rglob("*")) == before
+    assert all((place / "canary").read_text() == "sings" for place in (tmp_path, folder))
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        [("resources", b"a file"), ("resources/a", b"below a file")],
+        [("resources/" + "n" * 300, b"x")],
+        [("n" * 300 + "/a", b"x")],
+    ],
+)
+def test_entries_that_cannot_be_unpacked(tmp_path, entries):
+    path, folder = written(tmp_path / "a.fmu", entries=entries), tmp_path / "unpacked"
+    checks.check_archive(path)
+    with pytest.raises(ModelError, match="cannot be unpacked") as caught:
+        checks.unpack(path, folder)
+    assert str(folder) not in str(caught.value) and len(str(caught.value)) < 400
 
 
 def test_sizes_that_are_refused(tmp_path, monkeypatch):
@@ -102,6 +139,38 @@ def test_the_xml_is_well_formed_and_has_no_doctype(tmp_path):
     built = written(tmp_path / "c.fmu", version=3, entries=[("sources/buildDescription.xml", bomb)])
     with pytest.raises(ModelError, match=r"buildDescription.*DOCTYPE"):
         load_model(built)
+
+
+HEAD = '<?xml version="1.0"?>'
+REFUSED = {
+    "empty": "",
+    "no xml": "PK",
+    "laughs": HEAD
+    + '<!DOCTYPE l [<!ENTITY a "ha">'
+    + "".join(f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in pairwise("abcdefghij"))
+    + "]><fmiModelDescription>&j;</fmiModelDescription>",
+    "parameter entity": HEAD + '<!DOCTYPE x [<!ENTITY % p SYSTEM "file:///etc/passwd"> %p;]><fmiModelDescription/>',
+    "outer doctype": HEAD + '<!DOCTYPE x PUBLIC "-//x" "http://127.0.0.1:9/x.dtd"><fmiModelDescription/>',
+    "entity without doctype": HEAD + "<fmiModelDescription>&a;</fmiModelDescription>",
+    "nul": HEAD + "<fmiModelDescription>\0</fmiModelDescription>",
+    "two roots": HEAD + "<fmiModelDescription/><fmiModelDescription/>",
+    "attribute twice": HEAD + '<fmiModelDescription fmiVersion="2.0" fmiVersion="3.0"/>',
+    "unknown encoding": '<?xml version="1.0" encoding="x-none"?><fmiModelDescription/>',
+    "false utf-8": HEAD.encode() + b"<fmiModelDescription modelName='\xff\xfe'/>",
+    "never closed": HEAD + "<a>" * 200_000,
+    "deep": HEAD + "<a>" * 200_000 + "</a>" * 200_000,
+    "another root": HEAD + '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="file:///etc/passwd"/>',
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_hostile_xml_is_refused(tmp_path, name):
+    path = written(tmp_path / "a.fmu", REFUSED[name])
+    (tmp_path / "canary").write_text("sings")
+    with pytest.raises(ModelError) as caught:
+        load_model(path)
+    assert "root:" not in str(caught.value) and len(str(caught.value)) < 1000
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.fmu", "canary"]
 
 
 @pytest.mark.parametrize("name", ["../lag", "a/b", "", "9lag", "lag.so", "la g", "..\\lag"])

@@ -1,6 +1,6 @@
 """Files and texts spoilt at random: each ends well or in an InputError, never in anything else.
 
-As a test, 500 of every kind (test_fuzz.py). As a program, as many as asked for, with the longest time and the memory:
+As a test, 500 of every kind (test_fuzz.py). As a program, as many as asked for, where over 5 s or 1 GB is wrong too:
 
     python tests/hostile/fuzz.py --runs 10000 [--only csv]
 
@@ -30,6 +30,8 @@ from hvdc_ident.models import load_model
 from hvdc_ident.study.study import load_study
 
 Rng = np.random.Generator
+LONGEST = 5.0  # s a case may take
+MOST_MEMORY = 1024  # MiB of this process
 
 WORDS = [
     b"nan", b"inf", b"-", b"1e999", b"1e-999", b"0", b"-1", b"99999999999999999999", b"\x00", b"\xff", b"\xef\xbb\xbf",
@@ -288,10 +290,15 @@ def main() -> int:
                 begin = time.perf_counter()
                 bad = outcome(KINDS[name], content, folder)
                 longest = max(longest, time.perf_counter() - begin)
+                if not bad and time.perf_counter() - begin > LONGEST:
+                    bad = f"took over {LONGEST:g} s"
                 if bad:
                     wrong += 1
                     print(f"{name}, seed {asked.seed}, case {number}: {bad}", file=sys.stderr)
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        if memory > MOST_MEMORY:
+            wrong += 1
+            print(f"{name}: {memory:.0f} MiB by now, over {MOST_MEMORY}", file=sys.stderr)
         print(f"{name}: {asked.runs} cases, longest {longest:.3f} s, {memory:.0f} MiB so far", flush=True)
     print(f"{wrong} went wrong")
     return 1 if wrong else 0
