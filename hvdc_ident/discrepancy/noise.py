@@ -39,6 +39,8 @@ COARSE = 1.0
 """Noise of less than so many steps does not hide the rounding; above, that is white noise of step/sqrt(12) beside it."""
 FINEST = 0.1
 """The least noise below a quantiser, in steps, for a model is not exact to less."""
+FLICKER = 1.0 / 3.0
+"""Standard error of the logarithm of the noise that flicker tells: records stand on few levels (over 103 of 3 x 300 rows)."""
 SLOW = 0.5
 """Lag-1 coefficient from which the noise of a rounded record is coloured, and not white noise that flickers."""
 
@@ -271,8 +273,9 @@ def draws(
     """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
 
     fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
-    drawn too, within its error: what is not known of the noise widens what noise can do. Where the standard deviation is
-    not given it goes with the coefficient, for the steps from row to row are what is sure.
+    drawn too, within its error, and so is the size of the noise below a quantiser: what is not known of the noise widens
+    what noise can do. Where the standard deviation is not given it goes with the coefficient, for the steps from row to
+    row are what is sure.
     """
     times = {e.name: e.time for e in problem.fitted_experiments}
     outputs = list(dict.fromkeys(b.output for b in blocks))
@@ -288,8 +291,12 @@ def draws(
         if len(n.model) == 1 and n.source != GIVEN:
             e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
         if n.step:
+            size = n.below * np.ones(count)
+            if n.rounding is not None:
+                spread = np.random.default_rng([seed, 3, outputs.index(b.output)]).standard_normal(count)
+                size = size * np.exp(FLICKER * spread)
             placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
-            e = np.round((placed + n.below * e) / n.step) * n.step - placed
+            e = np.round((placed + size * e) / n.step) * n.step - placed
             rounding = problem.treatment.rounded(b.output)
             if rounding is not None:
                 found.append(rounding.residual(e)[0])
