@@ -21,7 +21,6 @@ from hvdc_ident.identifiability.pilot import Optimum, pilot
 from hvdc_ident.sensitivity.fisher import independent, null_directions
 from hvdc_ident.trajectory import Array
 
-
 NEAR = 0.05
 """Share of the rows' interval: a row this near to a jump of an input lies on it."""
 
@@ -164,7 +163,9 @@ def off_jumps(experiment: Experiment) -> Experiment:
     time = experiment.time
     steps = np.diff(time)
     near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    jumps = [t for s in experiment.inputs.values() for t in s.times[1:][(np.diff(s.times) == 0) & (np.diff(s.values) != 0)]]
+    jumps = [
+        t for s in experiment.inputs.values() for t in s.times[1:][(np.diff(s.times) == 0) & (np.diff(s.values) != 0)]
+    ]
     on = np.zeros(time.size, dtype=bool)
     for t in jumps:
         on |= np.abs(time - t) <= near

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.refit import Job, added, run
+from hvdc_ident.discrepancy.refit import Job, Refit, added, run
 from hvdc_ident.discrepancy.rounds import Round, Search, Trial, _gained, objections
 from hvdc_ident.discrepancy.scores import signature_rows
-from hvdc_ident.discrepancy.select import Ruler, best_of
+from hvdc_ident.discrepancy.select import Pick, Ruler, best_of
 from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.trajectory import Array
 
 LOOKED_AT = 60
 TRIED = 3
 
 
-def pair(search: Search, before, found: Round) -> tuple[Round, Round] | None:  # type: ignore[no-untyped-def]
+def pair(search: Search, before: Refit, found: Round) -> tuple[Round, Round] | None:
     """Two rounds, each with one of the pair as its winner, where a pair passes that no single effect does; else None."""
     nominal = before.nominal()
-    picks = best_of(found.scores, found.candidates)[:LOOKED_AT]
+    # A size that has to be met cannot be told from the score while something else is missing.
+    picks = [p for p in best_of(found.scores, found.candidates) if not _scanned(found, p)][:LOOKED_AT]
     if len(picks) < 2:
         return None
     rows = signature_rows(nominal, found.candidates, found.paths, [Column(p.candidate, p.probe) for p in picks])
@@ -37,7 +41,11 @@ def pair(search: Search, before, found: Round) -> tuple[Round, Round] | None:  #
     return None
 
 
-def _best(rows, residual):  # type: ignore[no-untyped-def]
+def _scanned(found: Round, pick: Pick) -> bool:
+    return effects()[found.candidates[pick.candidate].effect].scanned
+
+
+def _best(rows: Array, residual: Array) -> list[tuple[int, int]]:
     """Pairs by falling joint score, those left out that hardly beat their better half or are nearly one."""
     g, b = rows @ rows.T, rows @ residual
     d = np.maximum(np.diag(g), 1e-300)
@@ -54,35 +62,14 @@ def _best(rows, residual):  # type: ignore[no-untyped-def]
     return [(i, j) for _, i, j in sorted(found, reverse=True)]
 
 
-def _tried(search: Search, before, found: Round, one, two):  # type: ignore[no-untyped-def]
+def _tried(search: Search, before: Refit, found: Round, one: Pick, two: Pick) -> tuple[Round, Round] | None:
     """The two rounds of a pair that passes; None where it does not."""
-    k = len(before.problem.free)
     try:
-        m1, p1, placed1, s1 = added(
-            before.model, before.problem, found.candidates[one.candidate], one.probe, one.factor
-        )
-        m2, p2, placed2, s2 = added(m1, p1, found.candidates[two.candidate], two.probe, two.factor)
-        nuisance = before.theta[k:]
-        both = run(
-            Job(
-                m2,
-                (*before.placed, placed1, placed2),
-                p2,
-                (np.concatenate([before.theta[:k], s1, s2, nuisance]),),
-                before.noise,
-            )
-        )
+        both = run(_job(before, found, (one, two)))
         if both.failure:
             return None
-        halves = [
-            run(
-                Job(
-                    m1, (*before.placed, placed1), p1, (np.concatenate([before.theta[:k], s1, nuisance]),), before.noise
-                )
-            ),
-            _other(before, found, two),
-        ]
-    except HvdcIdentError:
+        halves = [run(_job(before, found, (p,))) for p in (one, two)]
+    except HvdcIdentError:  # one of them cannot sit there beside the other: no pair
         return None
     if any(h.failure for h in halves):
         return None
@@ -99,9 +86,12 @@ def _tried(search: Search, before, found: Round, one, two):  # type: ignore[no-u
     return left, right
 
 
-def _other(before, found: Round, pick):  # type: ignore[no-untyped-def]
+def _job(before: Refit, found: Round, picks: Sequence[Pick]) -> Job:
+    """The refit of the model with some more effects, from where their scores put them."""
     k = len(before.problem.free)
-    m, p, placed, s = added(before.model, before.problem, found.candidates[pick.candidate], pick.probe, pick.factor)
-    return run(
-        Job(m, (*before.placed, placed), p, (np.concatenate([before.theta[:k], s, before.theta[k:]]),), before.noise)
-    )
+    model, problem, placed, begin = before.model, before.problem, list(before.placed), [before.theta[:k]]
+    for p in picks:
+        model, problem, one, start = added(model, problem, found.candidates[p.candidate], p.probe, p.factor)
+        placed.append(one)
+        begin.append(start)
+    return Job(model, tuple(placed), problem, (np.concatenate([*begin, before.theta[k:]]),), before.noise)

@@ -22,9 +22,11 @@ from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
-PATIENCE = Tolerance(max_steps=20_000)
+PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=6_000)
 """Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-6, reduction=1e-7, step=1e-7)
+SCANNED = replace(METHOD, max_evaluations=15)
+"""Where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
 
 
 @dataclass(frozen=True)
@@ -177,9 +179,10 @@ def run(job: Job) -> Refit:
     """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
     best: Refit | None = None
     why = ""
+    method = SCANNED if any(effects()[p.candidate.effect].scanned for p in job.placed) else METHOD
     for begin in job.begins:
         try:
-            end = METHOD.run(job.problem, begin)
+            end = method.run(job.problem, begin)
             # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
             if end.cost is None:
                 why = end.message

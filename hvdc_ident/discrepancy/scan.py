@@ -32,8 +32,8 @@ PLACES = 3
 """Places of an effect that are refitted then."""
 BETWEEN = 10
 """Sizes between one of the scan and its neighbour, then."""
-QUICK = Tolerance(rtol=1e-5, atol=1e-8, max_steps=600)
-"""Of a scan's runs: one that takes more steps, chattering in a loop, is passed over."""
+QUICK = Tolerance(rtol=1e-5, atol=1e-8, max_steps=600, search=False)
+"""Of a scan's runs: one that takes more steps, chattering in a loop, or hardly comes to rest, is passed over."""
 SAMPLE = 16
 """Sizes, spread over all, that are run first: where most of them are passed over, so is the place."""
 
@@ -121,7 +121,12 @@ def _falling(scores: Scores) -> list[Column]:
 
 
 def _looked(
-    before: Refit, found: Sequence[Candidate], right: Array, executor: Executor | None, progress: Progress | None, text: str
+    before: Refit,
+    found: Sequence[Candidate],
+    right: Array,
+    executor: Executor | None,
+    progress: Progress | None,
+    text: str,
 ) -> Scores:
     """The scores of every size of some candidates, by running the model."""
     jobs = [Job(before, c, right) for c in found]

@@ -27,11 +27,15 @@ Method = Literal["auto", "explicit", "rosenbrock"]
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run."""
+    """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run.
+
+    search: whether a steady start that Newton's method does not find at once is looked for by slower means.
+    """
 
     rtol: float = 1e-8
     atol: float = 1e-10
     max_steps: int = 200_000
+    search: bool = True
 
 
 class Engine:
@@ -66,10 +70,11 @@ class Engine:
 
     # --- the start ---
 
-    def start(self, p: Array, u: Array, time: float = 0.0) -> tuple[Array, Array]:
+    def start(self, p: Array, u: Array, time: float = 0.0, *, search: bool = True) -> tuple[Array, Array]:
         """The steady state and held values at parameters p, inputs u and a time, as the flat vectors y and w with their rows.
 
-        Raises SteadyStateError where Newton's method and its fallbacks find none.
+        search: whether Newton's method may begin elsewhere than at the guesses, and its fallbacks are tried. Raises
+        SteadyStateError where none is found.
         """
         s = self.structure.sizes
         p = np.ascontiguousarray(p, dtype=float)
@@ -82,6 +87,11 @@ class Engine:
             given = (self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst)
             if _status(self._integrators.rest(*given)) == 0:
                 return y, w
+            if not search:
+                raise SteadyStateError(
+                    "no steady state was found at once", where=f"model '{self.structure.model.name}'",
+                    hint="let it be searched for: Tolerance(search=True)",
+                )  # fmt: skip
         from hvdc_ident.simulate.steady import fallback
 
         return fallback(self.structure, self._address, p, u, self._guesses[0], time)
@@ -167,7 +177,7 @@ class Engine:
         begin, end = float(time[0] if first is None else first), float(time[-1])
         p = np.ascontiguousarray(p, dtype=float)
         u, *tables = _tables(tuple(inputs), begin, end)
-        y, w = self.start(p, u, begin)
+        y, w = self.start(p, u, begin, search=tolerance.search)
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float)
