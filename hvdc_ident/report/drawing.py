@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(\.\d)\d+")  # tenths of a point are seen at most
 POINTS = 700
+WIDEST = 8.4
+"""rem on the page for an inch of a figure: one of 7.4 inches fills it."""
 MEASURED, BEFORE, AFTER, MARK = "#222222", "#d08020", "#1f5fa8", "#999999"
 
 
@@ -52,7 +54,9 @@ def svg(fig: Figure, label: str) -> str:
     with matplotlib.rc_context(style):
         fig.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     drawn = _LINE.sub(lambda line: _DIGITS.sub(r"\1", line[0]), stream.getvalue())
-    return drawn[drawn.index("<svg") :].replace("<svg", f'<svg role="img" aria-label="{text(label)}"', 1)
+    widest = f"{WIDEST * fig.get_figwidth():.1f}rem"  # a narrow figure is not blown up to the page's width
+    opening = f'<svg role="img" aria-label="{text(label)}" style="max-width: {widest}"'
+    return drawn[drawn.index("<svg") :].replace("<svg", opening, 1)
 
 
 def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:

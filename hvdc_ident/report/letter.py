@@ -106,7 +106,7 @@ def _consistent(found: dict[str, Any]) -> str:
     if not effects:
         return str(found.get("text", ""))
     told = [" ".join([e["text"].rstrip("."), _interval(e)]).strip() for e in effects]
-    first = f"It is consistent with this: {'; and '.join(told)}."
+    first = f"The difference is consistent with this: {'; and '.join(told)}."
     rivals = [r for group in found.get("ambiguity") or [] for r in group[1:]]
     if not rivals:
         return first + " No other effect of the catalogue, and no other place, explains the recordings as well."

@@ -48,7 +48,7 @@
     figure.querySelector("svg").replaceWith(place);
     button.remove();
     await Plotly.newPlot(place, traces(data), {
-      xaxis: { title: { text: x }, anchor: "y2" }, yaxis: { title: { text: upper }, domain: [0.3, 1] },
+      xaxis: { title: { text: x }, anchor: "y2" }, yaxis: { title: { text: upper }, zeroline: false, domain: [0.3, 1] },
       yaxis2: { title: { text: lower }, domain: [0, 0.24] }, margin: { t: 30, r: 10, b: 45, l: 65 },
       legend: { orientation: "h", y: 1.12 }, hovermode: "x unified",
     }, { responsive: true, displaylogo: false });
