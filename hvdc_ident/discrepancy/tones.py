@@ -8,6 +8,8 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.trajectory import Array
 
 MOST = 4
+FULL = 0.9
+"""Share of the rows of an even grid that have to be there; those that are not, on a jump of an input say, count as 0."""
 OUT = 6.0
 """Standard deviations by which the power at a frequency, over all records, must exceed that of white noise."""
 APART = 0.08
@@ -15,7 +17,7 @@ APART = 0.08
 
 
 def tones(nominal: Nominal) -> tuple[float, ...]:
-    """Hz, the strongest first; none where no frequency stands out, or rows are unevenly spaced.
+    """Hz, the strongest first; none where no frequency stands out, or rows lie on no even grid.
 
     The whitened residuals' periodograms are added up over outputs and experiments: a disturbance is in many of them.
     """
@@ -23,12 +25,18 @@ def tones(nominal: Nominal) -> tuple[float, ...]:
     spectra: list[tuple[Array, Array]] = []
     for b in nominal.blocks:
         t = experiments[b.experiment].time[b.rows]
-        steps = np.diff(t)
-        if t.size < 64 or (steps <= 0).any() or np.ptp(steps) > 0.02 * float(np.median(steps)):
+        if t.size < 64:
             continue
-        window = np.hanning(t.size)
-        line = np.abs(np.fft.rfft((b.residual - b.residual.mean()) * window, 4 * t.size)) ** 2
-        axis = np.asarray(np.fft.rfftfreq(4 * t.size, float(np.median(steps))), dtype=float)
+        step = float(np.median(np.diff(t)))
+        at = np.rint((t - t[0]) / step).astype(np.intp) if step > 0 else np.zeros(1, dtype=np.intp)
+        count = int(at[-1]) + 1
+        if (np.diff(at) <= 0).any() or t.size < FULL * count or np.abs(t - t[0] - at * step).max() > 0.02 * step:
+            continue
+        even = np.zeros(count)
+        even[at] = b.residual - b.residual.mean()
+        window = np.hanning(count)
+        line = np.abs(np.fft.rfft(even * window, 4 * count)) ** 2
+        axis = np.asarray(np.fft.rfftfreq(4 * count, step), dtype=float)
         spectra.append((axis, line / float(window @ window)))
     if not spectra:
         return ()
