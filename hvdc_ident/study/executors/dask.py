@@ -30,6 +30,7 @@ class DaskPool:
 
     def __init__(self, client: Any, threads: int) -> None:
         self._client, self._threads = client, threads
+        self._sent: tuple[str, Any] = ("", None)  # the last function's digest, and where the cluster has it
 
     @staticmethod
     @contextmanager
@@ -69,7 +70,7 @@ class DaskPool:
 
         content = pickle.dumps(function)
         name = hashlib.sha256(content).hexdigest()
-        [shared] = self._client.scatter([content], broadcast=True)
+        shared = self._shared(name, content)
         batches = _batches(items)
         size = {}
         running = as_completed(loop=self._client.loop, with_results=False, raise_errors=False)
@@ -94,6 +95,13 @@ class DaskPool:
             following = next(batches, None)
             if following is not None:
                 send(following)
+
+    def _shared(self, name: str, content: bytes) -> Any:
+        """Where the cluster has the function. One sent again is not sent: its release would race with the sending."""
+        if self._sent[0] != name:
+            [future] = self._client.scatter([content], broadcast=True, hash=False)
+            self._sent = name, future
+        return self._sent[1]
 
 
 def _batches(items: Iterable[Any]) -> Iterator[list[tuple[int, Any]]]:
