@@ -75,3 +75,16 @@ def _sum(a, x, b, d, e, w, out):  # type: ignore[no-untyped-def]
         if f != 0.0:
             for c in range(nc):
                 out[c] += f * w[j, c]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def replaced(y, columns, whole, size, moved):  # type: ignore[no-untyped-def]
+    """Puts y (o, R, nc) into columns of whole (o, R, C); adds up into size (nc,) its squares, into moved those of the change."""
+    for o in range(y.shape[0]):
+        for r in range(y.shape[1]):
+            for k in range(y.shape[2]):
+                new, c = y[o, r, k], columns[k]
+                change = new - whole[o, r, c]
+                size[k] += new * new
+                moved[k] += change * change
+                whole[o, r, c] = new

@@ -14,12 +14,15 @@ from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.transform import slot
+from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
 MOST_OF = 0.8
 """Share of the gap that a time window, a band or a region has to hold."""
 SEGMENTS = 6
+ROUGH = Tolerance(rtol=1e-4, atol=1e-6)
+"""Of runs driven by records: every row of noise is a corner, and where a gap lies takes no more digits."""
 
 
 def localise(model: Model | None, nominal: Nominal) -> dict[str, Any]:
@@ -183,7 +186,7 @@ def _blocks(model: Model, nominal: Nominal) -> list[dict[str, Any]]:
             inputs = {o: InputSignal(*_even(e, o), np.empty(0)) for o in driven}
             played = e.with_(inputs=FrozenMap({**e.inputs, **inputs}), drive=(*e.drive, *driven), instrument={})
             try:
-                seen = observe(ModelSimulator(model), played, nominal.values)
+                seen = observe(ModelSimulator(model, ROUGH), played, nominal.values)
             except HvdcIdentError as error:
                 why = str(error)
                 continue

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hvdc_ident.discrepancy.block import block, parameter
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.ends import Ends
+from hvdc_ident.discrepancy.kernel import replaced
 from hvdc_ident.discrepancy.response import Along
 from hvdc_ident.effects import effects
 from hvdc_ident.trajectory import Array
@@ -168,12 +169,11 @@ class _Parcel:
             for k, c in enumerate(members):
                 put[: d[c].shape[0], :, k] = d[c]
             du, y = self.model.answer(places, put)
-            size = np.sqrt(np.einsum("orc,orc->c", y, y))
-            away = y - self.y[:, :, members]
-            moved = np.sqrt(np.einsum("orc,orc->c", away, away))
+            size, moved = np.zeros(len(members)), np.zeros(len(members))
+            replaced(y, np.array(members, dtype=np.intp), self.y, size, moved)
+            size, moved = np.sqrt(size), np.sqrt(moved)
             with np.errstate(invalid="ignore", divide="ignore"):
                 ratio = np.where(size > 0, moved / size if step else np.inf, 0.0)
-            self.y[:, :, members] = y
             for k, c in enumerate(members):
                 self.change[c] = ratio[k]
                 self.u[c] = self.base[c] + du[:, :, k]
