@@ -201,7 +201,8 @@ def _refitted(
     more = neighbours(looked, found, done, best, max(options.refits // 3, 2))
     trials += _trials(search, before, found, more, f"round {number}: refits beside the best")
     sound = [t for t in trials if not t.refit.failure]
-    if all(excess(t.refit) for t in sound):
+    # Beside an effect that is there already a closer look costs more than it has been seen to find.
+    if number == 1 and all(excess(t.refit) for t in sound):
         found, scores, extra = _scanned(search, before, number, paths, found, scores)
         trials += _trials(search, before, found, extra, f"round {number}: refits of the closer look")
         sound = [t for t in trials if not t.refit.failure]

@@ -68,7 +68,7 @@ EFFECT = Effect(
                 measure="peak/n",
                 probes=(3.0, 10.0, 30.0, 100.0, 300.0),
                 # A level of n is told from the next where the signal is at its peak: even steps in n, a part of a level each.
-                scan=tuple(0.8 + 0.4 * k for k in range(250)),
+                scan=tuple(0.8 + 0.4 * k for k in range(150)),
             )
         }
     ),
