@@ -113,17 +113,26 @@ def _machine(effort: int) -> llvm.TargetMachine:
     )
 
 
+@cache
+def _simplifier(effort: int) -> tuple[llvm.ModulePassManager, llvm.PassBuilder]:
+    """The pass that simplifies instructions. One for the process: LLVM keeps 10 KiB of each that is made, for ever.
+
+    The ready-made pipelines would keep 60 KiB of every module besides.
+    """
+    passes = llvm.create_new_module_pass_manager()
+    passes.add_instruction_combine_pass()
+    return passes, llvm.create_pass_builder(_machine(effort), llvm.create_pipeline_tuning_options(speed_level=effort))
+
+
 def compiled(text: str, effort: int, combine: bool = False) -> bytes:
     """The object code of a module of LLVM IR. effort: 0 (quick) to 3; combine: simplify the instructions before."""
     machine = _machine(effort)
     module = llvm.parse_assembly(text, llvm.create_context())
     module.verify()
     module.triple = llvm.get_default_triple()
-    # The ready-made pipelines would also keep 60 KiB of every module for ever.
     if combine:
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_instruction_combine_pass()
-        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=effort)))
+        passes, builder = _simplifier(effort)
+        passes.run(module, builder)
     return bytes(machine.emit_object(module))
 
 
