@@ -1,7 +1,7 @@
 """The demonstration: the phasor link calibrated on waveforms of the average-value link, which has physics it lacks.
 
 The whole chain of the paper, and what it leaves open: errors and poles along KIVDC, what the recordings tell about each
-gain, and the fit.
+gain, the fit, and what is missing from the model.
 """
 
 from __future__ import annotations
@@ -24,6 +24,12 @@ min = 250
 max = 1500
 points = 51
 want = ["rmse", "poles"]
+
+# What the phasor link lacks beside these recordings. Three effects and one at most, to be quick: without these two lines
+# the whole catalogue is tried, and up to three effects beside each other.
+[diagnose]
+effects = ["lag", "delay", "limit"]
+most = 1
 """
 
 

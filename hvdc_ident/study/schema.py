@@ -260,10 +260,11 @@ class Fit(Table):
 
 
 class Diagnose(Table):
-    """[diagnose]: which effects to try, and what is too small to matter."""
+    """[diagnose]: which effects to try, what is too small to matter, and how many effects may be missing at most."""
 
     effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = "all"
     material: dict[Name, Positive] = {}
+    most: Annotated[int, Field(ge=1)] = 3
 
 
 class StudyFile(Table):

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The verdict with its evidence, the gap before and after, and the augmented model as a card."""
+    from hvdc_ident.discrepancy import Options as Budget
     from hvdc_ident.discrepancy import diagnose
     from hvdc_ident.discrepancy.sizes import size_curves
     from hvdc_ident.model.definition import Model
@@ -39,6 +40,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             effects="all" if asked.effects == "all" else list(asked.effects),
             material=asked.material,
             report=report,
+            options=Budget(most=asked.most),
             seed=options.seed,
             executor=executor,
             progress=options.progress,
