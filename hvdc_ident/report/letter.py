@@ -134,6 +134,11 @@ def _gains(found: dict[str, Any]) -> str:
         return ""
     name = max(moved, key=lambda n: abs(moved[n][0]))
     alone, with_it = moved[name]
+    if found.get("verdict") == "unnameable":
+        return (
+            f"Your gains cannot be judged while that is missing: a fit moves {name} by {_percent(alone)}, and how much of it "
+            "makes up for what is missing these records do not tell."
+        )
     if not found.get("effects"):
         if abs(alone) < 0.02:
             return "Your gains are not to blame: a fit leaves them within 2 % of what you gave."
