@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.refit import Job, Refit, added, run
+from hvdc_ident.discrepancy.race import raced
+from hvdc_ident.discrepancy.refit import Job, Refit, added
 from hvdc_ident.discrepancy.rounds import Round, Search, Trial, _gained, objections
 from hvdc_ident.discrepancy.scores import signature_rows
 from hvdc_ident.discrepancy.select import Pick, Ruler, best_of
@@ -29,15 +31,12 @@ def pair(search: Search, before: Refit, found: Round) -> tuple[Round, Round] | N
         return None
     rows = signature_rows(nominal, found.candidates, found.paths, [Column(p.candidate, p.probe) for p in picks])
     residual = nominal.projected(nominal.residual[:, None])[:, 0]
-    for i, j in _best(rows, residual)[:TRIED]:
-        search.tell(
-            0,
-            TRIED,
-            f"pair: {found.candidates[picks[i].candidate].label} with {found.candidates[picks[j].candidate].label}",
-        )
-        both = _tried(search, before, found, picks[i], picks[j])
-        if both is not None:
-            return both
+    couples = [(picks[i], picks[j]) for i, j in _best(rows, residual)[:TRIED]]
+    best = min((t.refit.chi2 for t in found.trials), default=before.chi2)
+    for couple, both in _refitted(search, before, found, couples, best):
+        rounds = None if both.failure else _judged(search, before, found, couple, both)
+        if rounds is not None:
+            return rounds
     return None
 
 
@@ -62,24 +61,43 @@ def _best(rows: Array, residual: Array) -> list[tuple[int, int]]:
     return [(i, j) for _, i, j in sorted(found, reverse=True)]
 
 
-def _tried(search: Search, before: Refit, found: Round, one: Pick, two: Pick) -> tuple[Round, Round] | None:
+def _refitted(
+    search: Search, before: Refit, found: Round, groups: Sequence[tuple[Pick, ...]], best: float
+) -> list[tuple[tuple[Pick, ...], Refit]]:
+    """The refits of some effects together, group by group; those that cannot sit there beside each other left out."""
+    jobs: list[tuple[tuple[Pick, ...], Job]] = []
+    for picks in groups:
+        with suppress(HvdcIdentError):
+            jobs.append((picks, _job(before, found, picks)))
+    texts = ["pair: " + " with ".join(found.candidates[p.candidate].label for p in picks) for picks, _ in jobs]
+    refits = raced(search, before.chi2, [j for _, j in jobs], texts, best)
+    return [(picks, refit) for (picks, _), refit in zip(jobs, refits, strict=True)]
+
+
+def _halves(search: Search, before: Refit, found: Round, couple: tuple[Pick, ...]) -> list[Refit]:
+    """Each effect of a pair by itself, as it was refitted in the round, or now; fewer than two where one cannot be."""
+    known = {t.pick.candidate: t.refit for t in found.trials}
+    missing = [(p,) for p in couple if p.candidate not in known]
+    known |= {p.candidate: refit for (p,), refit in _refitted(search, before, found, missing, np.inf)}
+    return [known[p.candidate] for p in couple if p.candidate in known and not known[p.candidate].failure]
+
+
+def _judged(
+    search: Search, before: Refit, found: Round, couple: tuple[Pick, ...], both: Refit
+) -> tuple[Round, Round] | None:  # fmt: skip
     """The two rounds of a pair that passes; None where it does not."""
-    try:
-        both = run(_job(before, found, (one, two)))
-        if both.failure:
-            return None
-        halves = [run(_job(before, found, (p,))) for p in (one, two)]
-    except HvdcIdentError:  # one of them cannot sit there beside the other: no pair
-        return None
-    if any(h.failure for h in halves):
-        return None
+    one, two = couple
     ruler = Ruler.of(both)
+    whole = _gained(Trial(two, both, 0.0), before, ruler)
+    if objections(search, before, whole, found.scores, first=True):
+        return None
+    halves = _halves(search, before, found, couple)
+    if len(halves) < 2:
+        return None
     alone = min(halves, key=lambda h: h.chi2)
     trial = Trial(two, both, ruler.gain(alone.chi2, both.chi2, both.count - alone.count))
-    whole = _gained(Trial(two, both, 0.0), before, ruler)
-    for t, reference in ((trial, alone), (whole, before)):
-        if objections(search, reference, t, found.scores, first=True):
-            return None
+    if objections(search, alone, trial, found.scores, first=True):
+        return None
     first = Trial(one, halves[0], ruler.gain(before.chi2, halves[0].chi2, halves[0].count - before.count))
     left = replace(found, trials=(first,), winner=first, ruler=ruler, same={}, why="")
     right = replace(found, before=halves[0], trials=(trial,), winner=trial, ruler=ruler, same={}, why="")

@@ -13,6 +13,7 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import uncertainty
@@ -24,9 +25,12 @@ from hvdc_ident.trajectory import Array
 
 PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=6_000)
 """Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
-METHOD = TrustRegion(max_evaluations=60, gradient=1e-6, reduction=1e-7, step=1e-7)
-SCANNED = replace(METHOD, max_evaluations=15)
-"""Where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
+METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
+"""A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
+GLANCE = 6
+"""Evaluations of a further start, which goes on only where it is better by then than the first at its end."""
+SCANNED = 15
+"""Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +46,17 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start)."""
+    """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
+
+    evaluations: of each start at most.
+    """
 
     model: AnyModel
     placed: tuple[Placed, ...]
     problem: Problem
     begins: tuple[Array, ...]
     noise: FrozenMap[Noise]
+    evaluations: int = METHOD.max_evaluations
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +66,8 @@ class Refit:
     chi2: sum of squared residuals (`Block.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them. holdout: root
     mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press: the same for
     parts of the fitted ones predicted from the rest.
-    std: standard deviation of each effect parameter, by its name in the model.
+    std: standard deviation of each effect parameter, by its name in the model. ended: whether it came to its end, and
+    was not only left where its evaluations were used up.
     """
 
     model: AnyModel
@@ -73,6 +82,7 @@ class Refit:
     press: float | None = None
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     failure: str = ""
+    ended: bool = True
 
     @property
     def values(self) -> dict[str, float]:
@@ -107,6 +117,7 @@ class Found:
     press: float | None
     std: FrozenMap[float | None]
     failure: str
+    ended: bool
 
     def refit(self, job: Job) -> Refit:
         """The refit of the job that found this."""
@@ -179,16 +190,20 @@ def run(job: Job) -> Refit:
     """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
     best: Refit | None = None
     why = ""
-    method = SCANNED if any(effects()[p.candidate.effect].scanned for p in job.placed) else METHOD
-    for begin in job.begins:
+    scanned = any(effects()[p.candidate.effect].scanned for p in job.placed)
+    most = min(job.evaluations, SCANNED) if scanned else job.evaluations
+    for begin in _apart(job.begins):
         try:
-            end = method.run(job.problem, begin)
+            end = _walked(job.problem, begin, most, None if best is None else best.chi2)
             # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
             if end.cost is None:
                 why = end.message
                 continue
             if best is None or 2.0 * end.cost < best.chi2:
-                best = Refit(job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost)
+                best = Refit(
+                    job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost,
+                    ended=scanned or end.status != "max-evaluations",
+                )  # fmt: skip
         except HvdcIdentError as error:
             why = str(error)
     if best is None:
@@ -197,6 +212,21 @@ def run(job: Job) -> Refit:
         return judged(best)
     except HvdcIdentError as error:
         return replace(best, failure=str(error))
+
+
+def _apart(begins: Sequence[Array]) -> list[Array]:
+    """The starts, each once."""
+    return [b for k, b in enumerate(begins) if not any(np.array_equal(b, a) for a in begins[:k])]
+
+
+def _walked(problem: Problem, begin: Array, most: int, beat: float | None) -> OptimiserResult:
+    """The end of a walk of so many evaluations; with a chi2 to beat, that of a glance unless it is beaten by then."""
+    if beat is None or most <= GLANCE:
+        return replace(METHOD, max_evaluations=most).run(problem, begin)
+    end = replace(METHOD, max_evaluations=GLANCE).run(problem, begin)
+    if end.status != "max-evaluations" or end.cost is None or not 2.0 * end.cost < beat:
+        return end
+    return replace(METHOD, max_evaluations=most - GLANCE).run(problem, end.theta)
 
 
 def judged(refit: Refit) -> Refit:
@@ -242,9 +272,10 @@ def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:
     others = [e for e in others if set(e.outputs) & set(problem.outputs)]
     if not others:
         return None
-    # An output that was never fitted has no weight of its own; its records then judge nothing.
+    # An output that was never fitted has no weight of its own; its records then judge nothing. The derivatives are not
+    # needed, but with them the machine code is that of the fit: compiling another takes longer than running these.
     try:
-        blocks = replace(problem, experiments=tuple(others)).blocks(theta[: len(problem.free)], derivatives=False)
+        blocks = replace(problem, experiments=tuple(others)).blocks(theta[: len(problem.free)])
     except SimulationError:
         return ()
     return tuple(b for b in blocks if b.output in problem.outputs)

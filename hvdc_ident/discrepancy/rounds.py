@@ -10,7 +10,8 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates, kind_of
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Job, Refit, added, find, held_out, moved, unseen
+from hvdc_ident.discrepancy.race import raced
+from hvdc_ident.discrepancy.refit import Job, Refit, added, held_out, moved, unseen
 from hvdc_ident.discrepancy.scan import joined, scan
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import (
@@ -199,7 +200,7 @@ def _refitted(
     sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2 + 8.0 * t.refit.count)
     best = [found[t.pick.candidate] for t in sound[:2]]
     more = neighbours(looked, found, done, best, max(options.refits // 3, 2))
-    trials += _trials(search, before, found, more, f"round {number}: refits beside the best")
+    trials += _trials(search, before, found, more, f"round {number}: refits beside the best", trials)
     sound = [t for t in trials if not t.refit.failure]
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1 and all(excess(t.refit) for t in sound):
@@ -230,7 +231,15 @@ def _gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
     return Trial(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
 
 
-def _trials(search: Search, before: Refit, found: Sequence[Candidate], picks: Sequence[Pick], text: str) -> list[Trial]:
+def _trials(
+    search: Search,
+    before: Refit,
+    found: Sequence[Candidate],
+    picks: Sequence[Pick],
+    text: str,
+    earlier: Sequence[Trial] = (),
+) -> list[Trial]:
+    """The picks refitted, in a race with each other and with those refitted earlier."""
     jobs, of, trials = [], [], []
     for p in picks:
         try:
@@ -239,11 +248,10 @@ def _trials(search: Search, before: Refit, found: Sequence[Candidate], picks: Se
         except HvdcIdentError as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
             trials.append(Trial(p, none, -np.inf))
-    outcomes = search.executor.map(find, jobs) if search.executor is not None else map(find, jobs)
-    for k, (p, job, outcome) in enumerate(zip(of, jobs, outcomes, strict=True)):
-        search.tell(k + 1, len(jobs), f"{text}: {found[p.candidate].label}")
-        trials.append(Trial(p, outcome.refit(job), -np.inf))
-    return trials
+    texts = [f"{text}: {found[p.candidate].label}" for p in of]
+    best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
+    refits = raced(search, before.chi2, jobs, texts, best)
+    return [*trials, *(Trial(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
 
 
 def _job(before: Refit, candidate: Candidate, pick: Pick) -> Job:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
+from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
 from hvdc_ident.discrepancy.rounds import Round, Search, Trial, excess, one_round
 from hvdc_ident.effects import EffectUse, effects
@@ -89,20 +91,27 @@ def _beside(search: Search, first: Refit, here: Refit, found: Round, k: int, wit
     """The effect in place k and its rivals, each refitted with the other effects; gains over doing without."""
     assert found.ruler is not None and found.winner is not None
     own = here.placed[k]
-    trials = []
+    refits: list[tuple[Trial, Refit]] = []
+    others: list[tuple[Trial, Job]] = []
     for trial in found.trials[: OTHERS + 1]:
         placed = trial.refit.placed[-1]
         if (placed.candidate.effect, placed.candidate.at, placed.candidate.source) == (
             own.candidate.effect, own.candidate.at, own.candidate.source,
         ):  # fmt: skip
-            refit = here
-        else:
-            among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
-            refit = _again(first, here, among, {k: trial.refit.sizes(placed)})
-        if not refit.failure:
-            gain = found.ruler.gain(without.chi2, refit.chi2, refit.count - without.count)
-            # The rivals' own effect stands last in their list, as elsewhere.
-            trials.append(Trial(trial.pick, _last(refit, k), gain))
+            refits.append((trial, here))
+            continue
+        among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
+        with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival
+            others.append((trial, job_of(first, here, among, {k: trial.refit.sizes(placed)})))
+    texts = [f"again with the others: {t.refit.placed[-1].candidate.label}" for t, _ in others]
+    found_again = done(search, [j for _, j in others], texts)
+    refits += [(t, r) for (t, _), r in zip(others, found_again, strict=True)]
+    trials = [
+        # The rivals' own effect stands last in their list, as elsewhere.
+        Trial(t.pick, _last(r, k), found.ruler.gain(without.chi2, r.chi2, r.count - without.count))
+        for t, r in refits
+        if not r.failure
+    ]
     if not any(t.refit.placed[-1].candidate == own.candidate for t in trials):
         trials.append(
             Trial(

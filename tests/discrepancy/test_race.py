@@ -1,0 +1,70 @@
+"""Refits in a race: what leads comes to the end it would have come to alone, what cannot catch up is left where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import FREE, experiments, model
+
+from hvdc_ident.discrepancy import race
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.nominal import nominal
+from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.race import raced
+from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
+from hvdc_ident.discrepancy.rounds import Search
+from hvdc_ident.effects import Probe
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+
+SEARCH = Search("all", None, FrozenMap(), Options(), 0)
+
+
+@pytest.fixture(scope="module")
+def before() -> Refit:
+    """The drive without the lag of 30 ms that its records have."""
+    start, _ = nominal(ModelSimulator(model()), experiments(lag=0.03), FREE, {}, None, starts=1, seed=0, executor=None)
+    return judged(Refit(model(), (), start.problem, start.noise, start.theta))
+
+
+def job(before: Refit, effect: str, at: str, size: float, begins: int = 1) -> Job:
+    probe = Probe(effect, FrozenMap({"T": size}), FrozenMap({"T": (1e-4, 1.0)}))
+    larger, problem, placed, start = added(before.model, before.problem, Candidate(effect, (at,), (probe,)), 0, 1.0)
+    return Job(larger, (placed,), problem, (np.concatenate([before.theta, start]),) * begins, before.noise)
+
+
+def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
+    before: Refit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs = [job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)]
+    alone = [run(j) for j in jobs]
+    monkeypatch.setattr(race, "SPRINT", 4)
+    for found, expected in zip(raced(SEARCH, before.chi2, jobs, ["a", "b"]), alone, strict=True):
+        assert found.ended
+        assert found.chi2 == pytest.approx(expected.chi2, rel=1e-5)
+        assert found.theta == pytest.approx(expected.theta, rel=1e-2)
+
+
+def test_nothing_goes_on_that_is_out_of_reach_of_what_is_known(
+    before: Refit, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    monkeypatch.setattr(race, "SPRINT", 2)
+    (left,) = raced(SEARCH, before.chi2, [job(before, "lag", "wm", 0.2)], ["a"], best=-1e9)
+    assert not left.ended
+    assert left.chi2 > run(job(before, "lag", "wm", 0.2)).chi2
+
+
+def test_a_start_given_twice_is_run_once(before: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = []
+    plain = ModelSimulator.simulate
+
+    def counted(self, *given, **named):  # type: ignore[no-untyped-def]
+        count.append(1)
+        return plain(self, *given, **named)
+
+    monkeypatch.setattr(ModelSimulator, "simulate", counted)
+    one = run(job(before, "lag", "wm", 0.05))
+    runs = len(count)
+    two = run(job(before, "lag", "wm", 0.05, begins=2))
+    assert len(count) == 2 * runs
+    assert np.array_equal(one.theta, two.theta)
