@@ -35,3 +35,8 @@ class Unloadable:
 
     def __call__(self, x):
         return x
+
+
+def environment(name):
+    """A variable of the worker's environment."""
+    return os.environ.get(name)

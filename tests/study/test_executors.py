@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pool_jobs
 import pytest
 
@@ -39,3 +41,15 @@ def test_nothing_to_do_and_nothing_that_works():
         list(LocalPool(1).run(pool_jobs.Unloadable(), [1]))
     with pytest.raises(InputError):
         LocalPool(0)
+
+
+@pytest.mark.parametrize(("told", "expected"), [({}, ["1", "1", None]), ({"OMP_NUM_THREADS": "3"}, ["3", None, None])])
+def test_workers_compute_in_one_thread_unless_told_otherwise(told, expected, monkeypatch):
+    """And the parent's own environment stays as it is."""
+    names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NO_SUCH_NUM_THREADS"]
+    for name in (*names, "MKL_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in told.items():
+        monkeypatch.setenv(name, value)
+    assert list(LocalPool(1).map(pool_jobs.environment, names)) == expected
+    assert [os.environ.get(n) for n in names] == [told.get(n) for n in names]

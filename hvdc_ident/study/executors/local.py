@@ -30,6 +30,7 @@ START = 180.0  # s a worker may take to begin
 MOST = 1000  # items sent to a worker at a time
 DEATHS = 2  # of workers at the same item before it is given up
 IDLE = -1
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(eq=False)
@@ -268,9 +269,25 @@ def _started(memory: int | None) -> _Worker:
     current = context.RawValue("q", IDLE)
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(there, current, memory, os.getpid()), daemon=True)
-    process.start()
+    with _one_thread():
+        process.start()
     there.close()
     return _Worker(process, here, current, time.monotonic())
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """An environment whose new processes do their linear algebra in one thread each, unless it says otherwise already.
+
+    There is a worker for every core: further threads wait for each other, which took two thirds of the time.
+    """
+    told = () if any(n in os.environ for n in THREADS) else THREADS
+    os.environ.update(dict.fromkeys(told, "1"))
+    try:
+        yield
+    finally:
+        for name in told:
+            os.environ.pop(name, None)
 
 
 def _end(worker: _Worker) -> None:
