@@ -20,6 +20,7 @@ from hvdc_ident.errors import ModelError
 MOST_ENTRIES = 10_000
 MOST_BYTES = 2**30
 MOST_RATIO = 200
+MOST_LEVELS = 100  # of elements in each other; a description has six
 MOST_XML = 64 * 2**20  # bytes of a model description; a hundred thousand variables take half of it
 DESCRIPTION = "modelDescription.xml"
 PARSED = (DESCRIPTION, "sources/buildDescription.xml")
@@ -135,7 +136,7 @@ def _plain(name: str) -> str:
 
 
 def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
-    """Raises ModelError where the XML is too large, not well-formed, or has a DOCTYPE, where entities would come from."""
+    """Raises ModelError where the XML is too large or deep, not well-formed, or has a DOCTYPE, where entities would come from."""
     where = f"{path}, {name}"
     size = archive.getinfo(name).file_size
     if size > MOST_XML:
@@ -147,7 +148,19 @@ def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
             "the XML has a DOCTYPE", where=where, expected="none: no FMU needs one, and entity bombs come that way"
         )
 
-    parser.StartDoctypeDeclHandler = doctype
+    depth = 0
+
+    def deeper(*_: object) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > MOST_LEVELS:
+            raise ModelError("the XML is nested too deep", where=where, expected=f"at most {MOST_LEVELS} levels")
+
+    def higher(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = doctype, deeper, higher
     try:
         with archive.open(name) as source:
             while block := source.read(1 << 16):

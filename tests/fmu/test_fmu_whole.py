@@ -124,7 +124,7 @@ def test_the_page_has_every_stage_and_its_figures(whole):
         assert figures[name] > 0, name
     assert {"Gains", "Error before and after", "Provenance"} <= set(sections)
     for words in (
-        "Structure: decided (numerical, local)",
+        "From perfect data of these signals every candidate could be told (numerical, local)",
         "lag at y",
         "The model is closed inside",
         "the gap shrinks by",

@@ -103,7 +103,10 @@ def test_without_evidence_nothing_is_named_and_the_gains_are_judged(tmp_path: Pa
 def test_gains_are_not_blamed_while_something_without_a_name_is_missing(tmp_path: Path) -> None:
     found = diagnosis(verdict="unnameable", effects=[], ambiguity=[], text="Something is missing.", sizes=None)
     told = " ".join(letter_of(Results(folder_with(tmp_path, found))).sentences)
-    assert "Your gains cannot be judged while that is missing: a fit moves KIP by +5.0 %" in told and "to blame" not in told
+    assert (
+        "Your gains cannot be judged while that is missing: a fit moves KIP by +5.0 %" in told
+        and "to blame" not in told
+    )
 
 
 def test_the_page_has_one_curve_to_see_and_a_slider_for_the_others(tmp_path: Path) -> None:
