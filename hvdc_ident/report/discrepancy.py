@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CHANNELS = 6
+CHANNELS = 3
+"""Channels that are drawn: those in which the record tells most frequencies."""
 ACROSS = 3
 """Channels beside each other: more would be too small to read."""
 
@@ -40,7 +41,8 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
     """Gain above phase over frequency for each channel, three beside each other: the record, the nominal and the augmented model."""
-    shown = [c for c in channels if c.get("omega")][:CHANNELS]
+    most = sorted((c for c in channels if c.get("omega")), key=lambda c: -len(c["omega"]))[:CHANNELS]
+    shown = [c for c in channels if c in most]
     wide, bands = min(max(len(shown), 1), ACROSS), max(-(-len(shown) // ACROSS), 1)
     fig = figure(3.2 * wide, 4.6 * bands)
     grid = fig.subplots(2 * bands, wide, squeeze=False)
