@@ -23,7 +23,8 @@ MOST_RATIO = 200
 MOST_LEVELS = 100  # of elements in each other; a description has six
 MOST_XML = 64 * 2**20  # bytes of a model description; a hundred thousand variables take half of it
 DESCRIPTION = "modelDescription.xml"
-PARSED = (DESCRIPTION, "sources/buildDescription.xml")
+ROOTS = {DESCRIPTION: "fmiModelDescription", "sources/buildDescription.xml": "fmiBuildDescription"}
+PARSED = tuple(ROOTS)
 """Files that are read as XML."""
 DAMAGE = (
     zipfile.BadZipFile,
@@ -150,9 +151,11 @@ def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
 
     depth = 0
 
-    def deeper(*_: object) -> None:
+    def deeper(tag: str, _: object) -> None:
         nonlocal depth
         depth += 1
+        if depth == 1 and tag != ROOTS[name]:
+            raise ModelError("the XML is another document", where=where, expected=ROOTS[name], got=tag[:80])
         if depth > MOST_LEVELS:
             raise ModelError("the XML is nested too deep", where=where, expected=f"at most {MOST_LEVELS} levels")
 
