@@ -8,11 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.race import raced
-from hvdc_ident.discrepancy.refit import Job, Refit, added
-from hvdc_ident.discrepancy.rounds import Round, Search, Trial, _gained, objections
+from hvdc_ident.discrepancy.jobs import job
+from hvdc_ident.discrepancy.race import Race
+from hvdc_ident.discrepancy.refit import Job, Refit
+from hvdc_ident.discrepancy.rounds import Round, Search, against, gained
 from hvdc_ident.discrepancy.scores import signature_rows
-from hvdc_ident.discrepancy.select import Pick, Ruler, best_of
+from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, best_of
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
@@ -68,9 +69,9 @@ def _refitted(
     jobs: list[tuple[tuple[Pick, ...], Job]] = []
     for picks in groups:
         with suppress(HvdcIdentError):
-            jobs.append((picks, _job(before, found, picks)))
+            jobs.append((picks, job(before, found.candidates, picks)))
     texts = ["pair: " + " with ".join(found.candidates[p.candidate].label for p in picks) for picks, _ in jobs]
-    refits = raced(search, before.chi2, [j for _, j in jobs], texts, best)
+    refits = Race().run(search, before.chi2, [j for _, j in jobs], texts, best)
     return [(picks, refit) for (picks, _), refit in zip(jobs, refits, strict=True)]
 
 
@@ -88,28 +89,17 @@ def _judged(
     """The two rounds of a pair that passes; None where it does not."""
     one, two = couple
     ruler = Ruler.of(both)
-    whole = _gained(Trial(two, both, 0.0), before, ruler)
-    if objections(search, before, whole, found.scores, first=True):
+    whole = gained(Trial(two, both, 0.0), before, ruler)
+    if against(search, before, whole, found.scores, first=True):
         return None
     halves = _halves(search, before, found, couple)
     if len(halves) < 2:
         return None
     alone = min(halves, key=lambda h: h.chi2)
     trial = Trial(two, both, ruler.gain(alone.chi2, both.chi2, both.count - alone.count))
-    if objections(search, alone, trial, found.scores, first=True):
+    if against(search, alone, trial, found.scores, first=True):
         return None
     first = Trial(one, halves[0], ruler.gain(before.chi2, halves[0].chi2, halves[0].count - before.count))
     left = replace(found, trials=(first,), winner=first, ruler=ruler, same={}, why="")
     right = replace(found, before=halves[0], trials=(trial,), winner=trial, ruler=ruler, same={}, why="")
     return left, right
-
-
-def _job(before: Refit, found: Round, picks: Sequence[Pick]) -> Job:
-    """The refit of the model with some more effects, from where their scores put them."""
-    k = len(before.problem.free)
-    model, problem, placed, begin = before.model, before.problem, list(before.placed), [before.theta[:k]]
-    for p in picks:
-        model, problem, one, start = added(model, problem, found.candidates[p.candidate], p.probe, p.factor)
-        placed.append(one)
-        begin.append(start)
-    return Job(model, tuple(placed), problem, (np.concatenate([*begin, before.theta[k:]]),), before.noise)

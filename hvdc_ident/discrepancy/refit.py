@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
@@ -10,13 +11,13 @@ import numpy as np
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.noise import Noise
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, clearance, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
-from hvdc_ident.fit.uncertainty import uncertainty
+from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.engine import Tolerance
@@ -63,11 +64,11 @@ class Job:
 class Refit:
     """What a refit came to. failure: why it has no result, empty where it has one.
 
-    chi2: sum of squared residuals (`Block.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them. holdout: root
-    mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press: the same for
-    parts of the fitted ones predicted from the rest.
-    std: standard deviation of each effect parameter, by its name in the model. ended: whether it came to its end, and
-    was not only left where its evaluations were used up.
+    chi2: sum of squared residuals (`Block.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
+    holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
+    the same for parts of the fitted ones predicted from the rest. std: standard deviation of each effect parameter, by its
+    name in the model. apart: of each effect, by how many standard deviations its parameters together are off doing
+    nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
     """
 
     model: AnyModel
@@ -81,6 +82,7 @@ class Refit:
     holdout: float | None = None
     press: float | None = None
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
+    apart: tuple[float, ...] = ()
     failure: str = ""
     ended: bool = True
 
@@ -93,6 +95,12 @@ class Refit:
     def count(self) -> int:
         """How many parameters the effects added."""
         return sum(len(p.bounds) for p in self.placed)
+
+    @property
+    def effective(self) -> float:
+        """How many independent residuals there are: fewer than rows where neighbours are alike."""
+        rho = min(max(self.correlation, 0.0), 0.999)
+        return max(self.rows * (1.0 - rho) / (1.0 + rho), 4.0)
 
     def sizes(self, placed: Placed) -> dict[str, float]:
         """The effect's own parameters at the optimum."""
@@ -116,6 +124,7 @@ class Found:
     holdout: float | None
     press: float | None
     std: FrozenMap[float | None]
+    apart: tuple[float, ...]
     failure: str
     ended: bool
 
@@ -127,7 +136,11 @@ class Found:
 
 def find(job: Job) -> Found:
     """What `run` finds."""
-    refit = run(job)
+    return found_by(run(job))
+
+
+def found_by(refit: Refit) -> Found:
+    """What a refit came to, without what it was given."""
     return Found(**{f.name: getattr(refit, f.name) for f in fields(Found)})
 
 
@@ -240,11 +253,36 @@ def judged(refit: Refit) -> Refit:
     rows = sum(b.residual.size for b in blocks)
     wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
     own = [n for p in refit.placed for n in p.names.values() if n in names]
-    std = {n: (None if known.std(n) is None else wider * float(known.std(n) or 0.0)) for n in own}
+    std = {n: None if (s := known.std(n)) is None else wider * s for n in own}
+    apart = tuple(_apart_from_nothing(refit, p, known) / wider for p in refit.placed)
     return replace(
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
-        press=press(blocks), std=FrozenMap(std),
+        press=press(blocks), std=FrozenMap(std), apart=apart,
     )  # fmt: skip
+
+
+def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty) -> float:
+    """How many standard deviations an effect's parameters together are from doing nothing; 0 where that is not known."""
+    entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
+    fitted = [n for n, name in placed.names.items() if name in known.names and name not in known.reasons]
+    here = clearance(entry, sizes)
+    if not fitted or not here:
+        return 0.0
+    slopes: Array = np.zeros((len(here), len(fitted)))
+    for k, n in enumerate(fitted):
+        h = 1e-6 * abs(sizes[n]) or 1e-9
+        there = clearance(entry, {**sizes, n: sizes[n] + h})
+        slopes[:, k] = np.array([there.get(m, v) - v for m, v in here.items()]) / h
+    at = [known.names.index(placed.names[n]) for n in fitted]
+    spread = slopes @ known.corrected[np.ix_(at, at)] @ slopes.T
+    distance = np.array(list(here.values()))
+    scale = np.sqrt(np.diag(spread))
+    seen = scale > 0
+    if not seen.any():
+        return 0.0
+    d, unit = distance[seen] / scale[seen], spread[np.ix_(seen, seen)] / np.outer(scale[seen], scale[seen])
+    square = float(d @ np.linalg.pinv(unit, rcond=1e-9, hermitian=True) @ d)
+    return math.sqrt(max(square, 0.0))
 
 
 def _correlation(blocks: Sequence[Block]) -> float:

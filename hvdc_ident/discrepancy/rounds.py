@@ -9,21 +9,16 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates, kind_of
+from hvdc_ident.discrepancy.hops import hop
+from hvdc_ident.discrepancy.jobs import job
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.objections import evidence, objections
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.race import raced
-from hvdc_ident.discrepancy.refit import Job, Refit, added, held_out, moved, unseen
+from hvdc_ident.discrepancy.race import Race, done
+from hvdc_ident.discrepancy.refit import Job, Refit, unseen
 from hvdc_ident.discrepancy.scan import joined, scan
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
-from hvdc_ident.discrepancy.select import (
-    Pick,
-    Ruler,
-    at_edge,
-    best_of,
-    clear,
-    material_gap,
-    neighbours,
-    shortlist,
-)
+from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, best_of, neighbours, others, shortlist
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.tones import tones
 from hvdc_ident.effects import effects
@@ -34,12 +29,16 @@ from hvdc_ident.trajectory import Array
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
-AGREED = 10.0
-"""By how much chi2 of the held-out data has to fall for them to agree."""
-SILENT = 30.0
-"""Squared difference of held-out answers, in noise units, below which those data cannot judge an effect."""
-STEP = 0.05
-"""Share of the gap that a second effect has to take away at least."""
+WIDER = 80
+"""Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
+HEAT = Race(sprint=5, reach=0.4)
+"""Of those many a short sprint."""
+REFIT_SCORE = 0.5
+"""What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
+NEAR = 0.05
+"""Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
+AGAIN = 4
+"""Refits of one effect at most whose size is looked for again beside the gains they came to."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +61,6 @@ class Search:
         """Nothing; whoever watches is told."""
         if self.progress:
             self.progress(done, total, text)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC)."""
-
-    pick: Pick
-    refit: Refit
-    gain: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,17 +128,22 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     p = scores.p(picks[0].score)
     if p > options.significance:
         return nothing(f"the best score of all is what noise gives (p = {p:.2g})")
-    return _refitted(search, before, number, paths, found, scores, picks)
+    return _refitted(search, before, nominal, number, paths, found, scores, picks)
 
 
 def excess(refit: Refit) -> bool:
     """Whether a model leaves more than noise, by size."""
-    rows = refit.rows * (1.0 - refit.correlation) / (1.0 + refit.correlation)
-    return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / max(rows, 4.0)))
+    return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))
 
 
 def _scanned(
-    search: Search, before: Refit, number: int, paths: Mapping[str, Path], found: tuple[Candidate, ...], scores: Scores
+    search: Search,
+    before: Refit,
+    nominal: Nominal,
+    number: int,
+    paths: Mapping[str, Path],
+    found: tuple[Candidate, ...],
+    scores: Scores,
 ) -> tuple[tuple[Candidate, ...], Scores, tuple[Pick, ...]]:
     """Candidates and scores with the sizes that a closer look found, and the picks to refit for them."""
     dense = candidates(
@@ -164,7 +159,9 @@ def _scanned(
     if not dense:
         return found, scores, ()
     text = f"round {number}: a closer look at {', '.join(dict.fromkeys(c.effect for c in dense))}"
-    seen = scan(before, dense, search.options.bootstraps, search.seed + number, search.executor, search.progress, text)
+    seen = scan(
+        before, nominal, dense, search.options.bootstraps, search.seed + number, search.executor, search.progress, text
+    )
     found = joined(found, [s.candidate for s in seen.spots])
     at = [known[s.candidate.effect, s.candidate.at] for s in seen.spots]
     columns = tuple(Column(k, len(found[k].probes) - 1) for k in at)
@@ -184,51 +181,103 @@ def _worth_a_scan(before: Refit, candidate: Candidate) -> bool:
 def _refitted(
     search: Search,
     before: Refit,
+    nominal: Nominal,
     number: int,
     paths: Mapping[str, Path],
     found: tuple[Candidate, ...],
     scores: Scores,
     picks: tuple[Pick, ...],
 ) -> Round:
-    options, nominal = search.options, before.nominal()
+    options = search.options
     threshold = scores.threshold(0.5)  # what noise reaches every other time is not worth a look
     looked = [p for p in picks[:LOOKED_AT] if p.score > threshold]
     rows = signature_rows(nominal, found, paths, [Column(p.candidate, p.probe) for p in looked])
     chosen, same = shortlist(looked, found, rows, options)
     trials = _trials(search, before, found, chosen, f"round {number}: refits")
-    done = [t.pick.candidate for t in trials] + [p.candidate for twins in same.values() for p in twins]
+    tried = [t.pick.candidate for t in trials] + [p.candidate for twins in same.values() for p in twins]
     sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2 + 8.0 * t.refit.count)
     best = [found[t.pick.candidate] for t in sound[:2]]
-    more = neighbours(looked, found, done, best, max(options.refits // 3, 2))
+    more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
     trials += _trials(search, before, found, more, f"round {number}: refits beside the best", trials)
-    sound = [t for t in trials if not t.refit.failure]
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
-    if number == 1 and all(excess(t.refit) for t in sound):
-        found, scores, extra = _scanned(search, before, number, paths, found, scores)
+    if number == 1 and _far(before, trials):
+        tried += [t.pick.candidate for t in trials]
+        wide = others(picks, scores, found, tried, WIDER)
+        trials += _trials(search, before, found, wide, f"round {number}: the other candidates", trials, HEAT)
+    if number == 1 and _far(before, trials):
+        found, scores, extra = _scanned(search, before, nominal, number, paths, found, scores)
         trials += _trials(search, before, found, extra, f"round {number}: refits of the closer look")
-        sound = [t for t in trials if not t.refit.failure]
-    failed = tuple(t for t in trials if t.refit.failure)
+    if number == 1 and _far(before, trials):
+        trials = _again(search, before, found, trials, f"round {number}: once more")
+    return _closed(search, Round(before, paths, found, scores, (), (), same, None, "", True, None), trials, number)
+
+
+def _far(before: Refit, trials: Sequence[Trial]) -> bool:
+    """Whether no refit comes near the noise, on the fitted data and on the others, or near enough."""
+    was = _left(before)
+    return all(
+        (excess(t.refit) or _misses(t.refit)) and _left(t.refit) > NEAR * was for t in trials if not t.refit.failure
+    )
+
+
+def _misses(refit: Refit) -> bool:
+    """Whether a model leaves more of data it has not seen than of those it was fitted to, by more than chance."""
+    seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
+    return now is not None and now**2 > seen * (1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective)))
+
+
+def _left(refit: Refit) -> float:
+    """What a model leaves beyond noise, a row, of the fitted data or of the others."""
+    return max(refit.chi2 / refit.rows, (unseen(refit) or 0.0) ** 2) - 1.0
+
+
+def _closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> Round:
+    """The round with its refits ranked and its winner, or what speaks against the best.
+
+    Of those that explain the fitted data equally well the winner is the one that with the held-out data explains most.
+    """
+    before, found = opened.before, opened.candidates
+    sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
-        return Round(
-            before, paths, found, scores, (), failed, same, None, "no candidate could be refitted", True, None
-        )  # fmt: skip
-    least = min(sound, key=lambda t: t.refit.chi2)
-    ruler = Ruler.of(least.refit)
-    ranked = sorted((_gained(t, before, ruler) for t in sound), key=lambda t: -t.gain)
-    why = ""
-    for trial in ranked:
-        if ranked[0].gain - trial.gain > options.set_bic:
-            break
-        against = objections(search, before, trial, scores, first=number == 1)
-        if not against:
-            return Round(before, paths, found, scores, tuple(ranked), failed, same, trial, "", True, ruler)
-        why = why or f"{found[trial.pick.candidate].label}: {against}"
-    return Round(before, paths, found, scores, tuple(ranked), failed, same, None, why, True, ruler)
+        return replace(opened, failed=failed, why="no candidate could be refitted")
+    ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
+    ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.gain)
+    level = [t for t in ranked if ranked[0].gain - t.gain <= search.options.set_bic]
+    refused = {id(t): against(search, before, t, opened.scores, first=number == 1) for t in level}
+    standing = [t for t in level if not refused[id(t)]]
+    share = ruler.effective / ruler.rows / ruler.scale
+    winner = max(standing, key=lambda t: evidence(before, t, share), default=None)
+    why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
+    return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
 
 
-def _gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
+def gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
+    """The trial with what it gains in BIC over the model before."""
     more = trial.refit.count - before.count
     return Trial(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
+
+
+def against(search: Search, before: Refit, trial: Trial, scores: Scores, *, first: bool) -> str:
+    """What speaks against naming a trial's effect; empty where nothing does."""
+    # A candidate whose answer no expansion gave was scored by its refit.
+    score = trial.pick.score or REFIT_SCORE * (before.chi2 - trial.refit.chi2)
+    return objections(before, trial, scores.p(score), search.options, search.material, first=first)
+
+
+def _again(
+    search: Search, before: Refit, found: Sequence[Candidate], trials: Sequence[Trial], text: str
+) -> list[Trial]:
+    """The trials, with another size where one is found beside the gains that a refit came to."""
+    chosen: dict[str, list[Trial]] = {}
+    for t in sorted(trials, key=lambda t: t.refit.chi2):
+        effect = found[t.pick.candidate].effect
+        if effects()[effect].scanned and not t.refit.failure and len(chosen.setdefault(effect, [])) < AGAIN:
+            chosen[effect].append(t)
+    again = [t for group in chosen.values() for t in group]
+    jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
+    refits = done(search, jobs, [f"{text}: {found[t.pick.candidate].label}" for t in again], hop)
+    better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
+    return [better.get(id(t), t) for t in trials]
 
 
 def _trials(
@@ -238,86 +287,18 @@ def _trials(
     picks: Sequence[Pick],
     text: str,
     earlier: Sequence[Trial] = (),
+    race: Race = Race(),  # noqa: B008 - frozen
 ) -> list[Trial]:
     """The picks refitted, in a race with each other and with those refitted earlier."""
     jobs, of, trials = [], [], []
     for p in picks:
         try:
-            jobs.append(_job(before, found[p.candidate], p))
+            jobs.append(job(before, found, [p]))
             of.append(p)
         except HvdcIdentError as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
             trials.append(Trial(p, none, -np.inf))
     texts = [f"{text}: {found[p.candidate].label}" for p in of]
     best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
-    refits = raced(search, before.chi2, jobs, texts, best)
+    refits = race.run(search, before.chi2, jobs, texts, best)
     return [*trials, *(Trial(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
-
-
-def _job(before: Refit, candidate: Candidate, pick: Pick) -> Job:
-    model, problem, placed, start = added(before.model, before.problem, candidate, pick.probe, pick.factor)
-    k = len(before.problem.free)
-    own = np.concatenate([before.theta[:k], start, before.theta[k:]])
-    begins = [own]
-    if abs(pick.factor) < 0.5 or abs(pick.factor) > 2.0:
-        at = moved(candidate, pick.probe, float(np.sign(pick.factor)) or 1.0)
-        plain = np.array([at[n] for n in placed.bounds])
-        begins.append(np.concatenate([before.theta[:k], plain, before.theta[k:]]))
-    return Job(model, (*before.placed, placed), problem, tuple(begins), before.noise)
-
-
-def objections(search: Search, before: Refit, trial: Trial, scores: Scores, *, first: bool) -> str:
-    """What speaks against naming a trial's effect; empty where nothing does."""
-    options, refit = search.options, trial.refit
-    last = len(refit.placed) - 1
-    if scores.p(trial.pick.score) > options.significance:
-        return f"its score is what noise gives somewhere (p = {scores.p(trial.pick.score):.2g})"
-    if not trial.gain > options.named_bic:
-        return f"it gains {trial.gain:.3g} in BIC, {options.named_bic:g} would be needed"
-    if at_edge(refit, last) or not clear(refit, last):
-        return "its size cannot be told from nothing"
-    was, now = unseen(before), unseen(refit)
-    if was is None or now is None:
-        return "nothing can be left out to judge it by"
-    if not now < was:
-        return f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
-    tables = _tables(before, refit) if search.material else None
-    # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
-    # nothing to say, and the fitted ones show the size.
-    agree = (was**2 - now**2) * _unseen_rows(refit) > AGREED or _silent(before, refit)
-    fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))
-    if not material_gap(was, now, options.holdout_share, search.material, tables) and not (
-        agree and not search.material and material_gap(*fitted, options.holdout_share, None, None)
-    ):
-        return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
-    if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
-        return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
-    return ""
-
-
-def _unseen_rows(refit: Refit) -> int:
-    """Rows of the data that judge: the held-out ones, or all of the fitted ones, each left out in turn."""
-    held = [e for e in refit.problem.experiments if e.role == "holdout" and e.outputs]
-    return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows
-
-
-def _silent(before: Refit, after: Refit) -> bool:
-    """Whether the held-out experiments would look the same with the effect and without."""
-    one, two = (held_out(r.problem, r.theta) for r in (before, after))
-    if not one or not two:
-        return False
-    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < SILENT
-
-
-def _tables(before: Refit, after: Refit) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    return _worst(before), _worst(after)
-
-
-def _worst(refit: Refit) -> dict[str, float]:
-    """The largest RMSE of each output over all experiments, in its unit."""
-    found: dict[str, float] = {}
-    for output, row in refit.problem.rmse(refit.theta).items():
-        known = [v for v in row.values() if v is not None]
-        if known:
-            found[output] = max(known)
-    return found

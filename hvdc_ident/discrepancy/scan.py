@@ -57,15 +57,18 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One place: the model without the effect, the candidate with all sizes, and what traces are multiplied with."""
+    """One place: the model without the effect and what it leaves, the candidate with all sizes, and what traces are
+    multiplied with."""
 
     before: Refit
+    residual: Array
     candidate: Candidate
     right: Array
 
 
 def scan(
     before: Refit,
+    nominal: Nominal,
     dense: Sequence[Candidate],
     bootstraps: int,
     seed: int,
@@ -73,11 +76,14 @@ def scan(
     progress: Progress | None,
     text: str,
 ) -> Scan:
-    """The best sizes of effects that are scanned, and how large a score noise alone gives among so many."""
-    right = _right_sides(before.nominal(), bootstraps, seed)
-    rough = _looked(before, dense, right, executor, progress, text)
+    """The best sizes of effects that are scanned, and how large a score noise alone gives among so many.
+
+    before: the model without them; nominal: the same at its optimum.
+    """
+    right = _right_sides(nominal, bootstraps, seed)
+    rough = _looked(before, nominal, dense, right, executor, progress, text)
     best = [_neighbourhood(dense[c.candidate], c.probe) for c in _tops(dense, rough)]
-    fine = _looked(before, best, right, executor, progress, f"{text}, closer still")
+    fine = _looked(before, nominal, best, right, executor, progress, f"{text}, closer still")
     chosen = _best(best, fine)
     at = [fine.columns.index(c) for c in chosen]
     kept = [replace(best[c.candidate], probes=(best[c.candidate].probes[c.probe],)) for c in chosen]
@@ -122,6 +128,7 @@ def _falling(scores: Scores) -> list[Column]:
 
 def _looked(
     before: Refit,
+    nominal: Nominal,
     found: Sequence[Candidate],
     right: Array,
     executor: Executor | None,
@@ -129,7 +136,7 @@ def _looked(
     text: str,
 ) -> Scores:
     """The scores of every size of some candidates, by running the model."""
-    jobs = [Job(before, c, right) for c in found]
+    jobs = [Job(before, nominal.residual, c, right) for c in found]
     outcomes = executor.map(_traces, jobs) if executor is not None else map(_traces, jobs)
     products, squares = [np.zeros((0, right.shape[1]))], [np.zeros(0)]
     for k, (p, s) in enumerate(outcomes):
@@ -140,7 +147,7 @@ def _looked(
     size, product = np.concatenate(squares), np.concatenate(products)
     sound = np.isfinite(size)
     size, product = np.where(sound, size, 0.0), np.where(sound[:, None], product, 0.0)
-    k = before.nominal().basis.shape[1]
+    k = nominal.basis.shape[1]
     left = np.maximum(size - np.sum(product[:, 1 : 1 + k] ** 2, axis=1), 0.0)
     columns = tuple(Column(i, k) for i, c in enumerate(found) for k in range(len(c.probes)))
     either = np.array([two_sided(found[c.candidate]) for c in columns], dtype=bool)
@@ -157,7 +164,6 @@ def _traces(job: Job) -> tuple[Array, Array]:
     except HvdcIdentError:  # it cannot sit there: no size of it is sound
         return products, squares
     problem = replace(problem, simulator=ModelSimulator(model, QUICK))
-    residual = before.nominal().residual
     k, at = len(before.problem.free), list(placed.bounds).index(scanned(c))
     apart = max(len(c.probes) // SAMPLE, 1)
     order = sorted(range(len(c.probes)), key=lambda i: (i % apart > 0, i))
@@ -169,7 +175,7 @@ def _traces(job: Job) -> tuple[Array, Array]:
             blocks = problem.blocks(np.concatenate([before.theta[:k], start, before.theta[k:]]), derivatives=False)
         except SimulationError:
             continue
-        s = residual - np.concatenate([b.residual for b in blocks])
+        s = job.residual - np.concatenate([b.residual for b in blocks])
         products[i], squares[i] = s @ job.right, float(s @ s)
     return products, squares
 

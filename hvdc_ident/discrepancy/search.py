@@ -12,7 +12,8 @@ from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
-from hvdc_ident.discrepancy.rounds import Round, Search, Trial, excess, one_round
+from hvdc_ident.discrepancy.rounds import Round, Search, excess, one_round
+from hvdc_ident.discrepancy.select import Trial
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free

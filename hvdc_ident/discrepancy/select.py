@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.scores import Scores
-from hvdc_ident.effects import clearance, effects
+from hvdc_ident.discrepancy.scores import SEEN, Scores
+from hvdc_ident.discrepancy.signatures import is_linear, kind_of
+from hvdc_ident.effects import effects
 from hvdc_ident.trajectory import Array
 
 SAME = 1.0
 """Difference of scores, in units of chi2, up to which two signatures of one effect are one: its places cannot be told apart."""
+CLEAR = 2.0
+"""Standard deviations by which an effect has to be off doing nothing."""
 EACH = 4
 """Places of one effect that are refitted at first."""
 
@@ -28,6 +32,15 @@ class Pick:
     probe: int
     factor: float
     score: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC)."""
+
+    pick: Pick
+    refit: Refit
+    gain: float
 
 
 def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:
@@ -93,6 +106,37 @@ def neighbours(
     return tuple(near[:limit])
 
 
+def others(
+    picks: Sequence[Pick], scores: Scores, found: Sequence[Candidate], done: Sequence[int], limit: int
+) -> tuple[Pick, ...]:
+    """One candidate for every effect and place that was not tried, the best by score first.
+
+    Those that bend the signal and yet score no more than noise, for the answer of a loop that is not near a linear one
+    was not to be had beforehand, stand beside those with a score, in turn, at the size in the middle of what was
+    probed; those first whose trace is the largest.
+    """
+    tried = {(found[k].effect, found[k].at) for k in done}
+    threshold = scores.threshold(0.5)
+    seen: dict[tuple[str, tuple[str, ...]], Pick] = {}
+    for p in picks:
+        key = found[p.candidate].effect, found[p.candidate].at
+        if key not in tried and p.score > threshold:
+            seen.setdefault(key, p)
+    rest: dict[tuple[str, tuple[str, ...]], Pick] = {}
+    for k in np.argsort(-scores.size, kind="stable"):
+        c = scores.columns[k]
+        key = found[c.candidate].effect, found[c.candidate].at
+        if (
+            scores.size[k] > SEEN
+            and key not in tried
+            and key not in seen
+            and not is_linear(kind_of(found[c.candidate], c.probe))
+        ):
+            rest.setdefault(key, Pick(c.candidate, len(found[c.candidate].probes) // 2, 1.0, 0.0))
+    pairs = zip_longest(seen.values(), rest.values())
+    return tuple([p for pair in pairs for p in pair if p is not None][:limit])
+
+
 @dataclass(frozen=True)
 class Ruler:
     """What BIC is counted by. effective: independent residuals; scale: how much larger than noise they are in the best model."""
@@ -104,9 +148,7 @@ class Ruler:
     @classmethod
     def of(cls, best: Refit) -> Ruler:
         """From the best model found, whose residuals are nearest to noise."""
-        rho = min(max(best.correlation, 0.0), 0.999)
-        effective = max(best.rows * (1.0 - rho) / (1.0 + rho), 4.0)
-        return cls(best.rows, effective, max(best.chi2 / best.rows, 1.0))
+        return cls(best.rows, best.effective, max(best.chi2 / best.rows, 1.0))
 
     def gain(self, before: float, after: float, more: int) -> float:
         """The fall of BIC from one chi2 to another with `more` parameters more."""
@@ -115,21 +157,8 @@ class Ruler:
 
 
 def clear(refit: Refit, which: int) -> bool:
-    """Whether some parameter that makes the effect vanish is two standard deviations from doing so, and inside its bounds."""
-    placed = refit.placed[which]
-    entry = effects()[placed.candidate.effect]
-    sizes = refit.sizes(placed)
-    away = clearance(entry, sizes)
-    for n, distance in away.items():
-        name = placed.names.get(n)
-        std = refit.std.get(name) if name else None
-        if name is None or std is None:
-            continue
-        neutral = entry.parameters[n].neutral
-        spread = std / sizes[n] ** 2 if isinstance(neutral, float) and np.isinf(neutral) else std
-        if abs(distance) > 2.0 * spread:
-            return True
-    return False
+    """Whether the parameters of an effect together are clearly off those with which it does nothing."""
+    return refit.apart[which] > CLEAR
 
 
 def at_edge(refit: Refit, which: int) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from hvdc_ident.discrepancy.adequacy import Binned, adequacy
 from hvdc_ident.discrepancy.ambiguity import rivals
 from hvdc_ident.discrepancy.noise import FEWEST
+from hvdc_ident.discrepancy.objections import silent, worst
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Verdict
 from hvdc_ident.discrepancy.rounds import Search
@@ -57,7 +58,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             tests,
         )
     was, now = unseen(first), unseen(last)
-    if was is not None and now is not None and was > (1.0 + options.holdout_share) * np.sqrt(floor):
+    gap_there = was is not None and now is not None and was > (1.0 + options.holdout_share) * np.sqrt(floor)
+    if was is not None and now is not None and gap_there and not silent(first, last):
         told = (was**2 - now**2) / (was**2 - floor)
         if told < DOMINANT:
             return Judgement(
@@ -110,7 +112,7 @@ def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned
     options = search.options
     was = unseen(first)
     gap_there = material_gap(
-        was, 1.0, options.holdout_share, search.material, (_largest(first), dict.fromkeys(search.material, 0.0))
+        was, 1.0, options.holdout_share, search.material, (worst(first), dict.fromkeys(search.material, 0.0))
     )
     refused = any(b.p <= options.significance and b.excess > STRONG * first.rows for b in tests)
     fitted = float(np.sqrt(first.chi2 / first.rows)) > 1.0 + options.holdout_share
@@ -129,12 +131,6 @@ def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned
     if found.significant:
         return Judgement("no-evidence", f"No gap that matters: {found.why}.", tests)
     return Judgement("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)
-
-
-def _largest(refit: Refit) -> dict[str, float]:
-    from hvdc_ident.discrepancy.rounds import _worst
-
-    return _worst(refit)
 
 
 def _signals(last: Refit) -> dict[str, dict[str, Array]]:

@@ -31,11 +31,11 @@ def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
     from hidden.diagnosing import diagnosed
 
     begin = time.perf_counter()
-    case = made(design, seed)
-    if case is None:
-        return {"case": design.name, "part": design.part, "effects": list(design.effects), "unreachable": True}
-    making = time.perf_counter() - begin
     try:
+        case = made(design, seed)
+        if case is None:
+            return {"case": design.name, "part": design.part, "effects": list(design.effects), "unreachable": True}
+        making = time.perf_counter() - begin
         return diagnosed(case, seed=design.number, sindy=sindy) | {"making": making}
     except Exception:  # a mistake in the program: a line of its own, and the others go on
         told: dict[str, Any] = {

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from cases import FREE, experiments, model
 
-from hvdc_ident.discrepancy import race
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.race import raced
+from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
 from hvdc_ident.discrepancy.rounds import Search
 from hvdc_ident.effects import Probe
@@ -34,22 +33,18 @@ def job(before: Refit, effect: str, at: str, size: float, begins: int = 1) -> Jo
 
 
 def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
-    before: Refit, monkeypatch: pytest.MonkeyPatch
+    before: Refit,
 ) -> None:
     jobs = [job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)]
     alone = [run(j) for j in jobs]
-    monkeypatch.setattr(race, "SPRINT", 4)
-    for found, expected in zip(raced(SEARCH, before.chi2, jobs, ["a", "b"]), alone, strict=True):
+    for found, expected in zip(Race(sprint=4).run(SEARCH, before.chi2, jobs, ["a", "b"]), alone, strict=True):
         assert found.ended
         assert found.chi2 == pytest.approx(expected.chi2, rel=1e-5)
         assert found.theta == pytest.approx(expected.theta, rel=1e-2)
 
 
-def test_nothing_goes_on_that_is_out_of_reach_of_what_is_known(
-    before: Refit, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    monkeypatch.setattr(race, "SPRINT", 2)
-    (left,) = raced(SEARCH, before.chi2, [job(before, "lag", "wm", 0.2)], ["a"], best=-1e9)
+def test_nothing_goes_on_that_is_out_of_reach_of_what_is_known(before: Refit) -> None:
+    (left,) = Race(sprint=2).run(SEARCH, before.chi2, [job(before, "lag", "wm", 0.2)], ["a"], best=-1e9)
     assert not left.ended
     assert left.chi2 > run(job(before, "lag", "wm", 0.2)).chi2
 

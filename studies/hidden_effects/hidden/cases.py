@@ -150,7 +150,8 @@ def made(design: Design, seed: int) -> Case | None:
     sigma = design.level * np.maximum(extent, 0.02 * np.abs(base.outputs).max(axis=(0, 1)))
     channels = tuple(range(len(plant.outputs)))
     if design.removed:
-        channels = tuple(k for k in channels if k != int(rng.integers(len(plant.outputs))))
+        lost = int(rng.integers(len(plant.outputs)))
+        channels = tuple(k for k in channels if k != lost)
     kind = design.noise if design.noise in KINDS else "ar" if design.noise == "told-white" else "white"
     drawn = _drawn(design, base, sigma, kind, channels, key, rng)
     if drawn is None:
@@ -223,6 +224,14 @@ def _place(rng: np.random.Generator, base: Nominal, effect: str, taken: list[str
         order = list(plant.slots)
         before = order if at.startswith("outputs.") else order[: order.index(at)]
         open_to = [n for n in {*plant.inputs, *plant.states, *(o for o in plant.outputs if o in before)} if n != at]
-        moving = sorted(n for n in open_to if np.ptp(base.slots[n]) > 1e-6)
+        # The slot's own signal under another name would make of every one of these effects a gain.
+        moving = sorted(
+            n for n in open_to if np.ptp(base.slots[n]) > 1e-6 and not _alike(base.slots[n], base.slots[at])
+        )
         if moving:
             return at, str(rng.choice(moving))
+
+
+def _alike(a: Array, b: Array) -> bool:
+    """Whether one signal is the other times a number."""
+    return abs(float(np.vdot(a, b))) > (1.0 - 1e-9) * float(np.linalg.norm(a) * np.linalg.norm(b))

@@ -189,14 +189,27 @@ class History:
 
 
 class Delay(Operator):
+    """From the values at both ends of every step: a jump between two steps stays one."""
+
     def begin(self, u, other):  # type: ignore[no-untyped-def]
-        self.past = History(u, self.h, self.steps)
+        self.begins, self.ends = np.empty((2, self.steps + 2, u.size))
+        self.begins[0] = self.ends[0] = u
+        self.count, self.ended, self.columns = 0, 0, np.arange(u.size)
         return []
 
     def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
         if share == 0.0:
-            self.past.add(u)
-        return self.past.at(self.p["T"] / self.h - share)[0]
+            self.begins[self.count] = u
+            self.count += 1
+        elif share == 1.0 and self.ended < self.count:
+            self.ended = self.count
+            self.ends[self.count] = u
+        place = np.clip(self.count - 1 + share - self.p["T"] / self.h, 0.0, self.count - 1.0)
+        low = np.minimum(place.astype(int), max(self.count - 2, 0))
+        left, right = self.begins[low, self.columns], self.ends[low + 1, self.columns]
+        at_end = place >= self.count - 1.0
+        last = self.begins[self.count - 1]
+        return np.where(at_end, last, left + (place - low) * (right - left))
 
 
 class WindowMean(Operator):

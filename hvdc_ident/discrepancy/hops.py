@@ -1,0 +1,98 @@
+"""A size that has to be met, looked for again beside the gains that a refit came to.
+
+No slope leads from one period of a sampler to another, and gains that are biased by what is missing point a scan at the
+wrong one. Once they have been refitted they are nearer to the truth: with their answers taken out to first order the
+sizes around are run again, and the refit goes on from the best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.jobs import as_given
+from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run
+from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, scanned
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit import Problem
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.trajectory import Array
+
+HOPS = 3
+"""Times that a better size is looked for."""
+WIDTH = 3.0
+"""Sizes are looked at from this share below to this multiple above."""
+SIZES = 120
+TEETH = 4
+"""Sizes, each the best among its neighbours, from which is refitted: the cost over a period is a saw."""
+BETTER = 0.02
+"""Share by which chi2 has to fall for another hop."""
+
+
+def hop(job: Job) -> Found:
+    """What a refit comes to that looks for its last effect's size again, as long as that helps."""
+    here = run(job)
+    for _ in range(HOPS):
+        ends = [] if here.failure else [run(replace(job, begins=(begin,))) for begin in _begins(here)]
+        there = min((r for r in ends if not r.failure), key=lambda r: r.chi2, default=here)
+        if not there.chi2 < (1.0 - BETTER) * here.chi2:
+            break
+        here = there
+    return found_by(here)
+
+
+def _begins(here: Refit) -> list[Array]:
+    """Unknowns with the best sizes around."""
+    placed = here.placed[-1]
+    name = scanned(placed.candidate)
+    at = here.problem.names.index(placed.names[name])
+    low, high = placed.bounds[name]
+    own = float(here.theta[at])
+    left = _Left.of(here, at)
+    grid = np.geomspace(max(low, own / WIDTH), min(high, own * WIDTH), SIZES)
+    rough = np.array([left(s) for s in grid])
+    padded = np.concatenate([[np.inf], rough, [np.inf]])
+    teeth = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
+    begins, given = [], as_given(here)
+    for k in teeth[:TEETH]:
+        beside = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, SIZES - 1)], 2 * BETWEEN + 1)
+        size = min(beside, key=left)
+        for theta in (here.theta, given):
+            if theta is not None:
+                begins.append(theta.copy())
+                begins[-1][at] = size
+    return begins
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """chi2 by the size of the last effect, with what the other unknowns can make good taken out to first order."""
+
+    refit: Refit
+    at: int
+    problem: Problem
+    others: Array
+
+    @classmethod
+    def of(cls, refit: Refit, at: int) -> _Left:
+        quick = replace(refit.problem, simulator=ModelSimulator(refit.model, QUICK))
+        return cls(refit, at, quick, _others(refit, at))
+
+    def __call__(self, size: float) -> float:
+        """Infinite for a size that could not be run."""
+        theta = self.refit.theta.copy()
+        theta[self.at] = size
+        try:
+            r = np.concatenate([b.residual for b in self.problem.blocks(theta, derivatives=False)])
+        except SimulationError:
+            return np.inf
+        return float(r @ r - np.sum((self.others.T @ r) ** 2))
+
+
+def _others(refit: Refit, at: int) -> Array:
+    """(N, k) orthonormal: what all unknowns but one can make of the residual, to first order."""
+    jacobian = np.delete(np.vstack([b.jacobian for b in refit.problem.blocks(refit.theta)]), at, axis=1)
+    norms = np.linalg.norm(jacobian, axis=0)
+    u, s, _ = np.linalg.svd(jacobian[:, norms > 0] / norms[norms > 0], full_matrices=False)
+    return np.asarray(u[:, s > 1e-7 * s.max(initial=0.0)])

@@ -1,0 +1,54 @@
+"""Refits to be done: a model, and the effects that picked candidates would add to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.refit import Job, Refit, added, moved
+from hvdc_ident.discrepancy.select import Pick
+from hvdc_ident.trajectory import Array
+
+BIASED = 0.4
+"""Share of its start value by which a gain has moved when it may have taken an effect's place."""
+
+
+def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job:
+    """The refit of a model with some more effects, from where their scores put them.
+
+    Gains that have taken an effect's place hold the refit where they are: where one has moved far, or stands on a bound,
+    another start is with the gains as they were given. A single effect, too, begins a second time where the score asks for a
+    size far from the one probed. Raises ModelError where an effect cannot sit there.
+    """
+    model, problem, placed, sizes = before.model, before.problem, list(before.placed), []
+    for p in picks:
+        model, problem, one, start = added(model, problem, found[p.candidate], p.probe, p.factor)
+        placed.append(one)
+        sizes.append(start)
+    asked = np.concatenate(sizes)
+    begins = [_begin(before, before.theta, asked)]
+    if len(picks) == 1 and not 0.5 <= abs(picks[0].factor) <= 2.0:
+        at = moved(found[picks[0].candidate], picks[0].probe, float(np.sign(picks[0].factor)) or 1.0)
+        begins.append(_begin(before, before.theta, np.array([at[n] for n in placed[-1].bounds])))
+    if (given := as_given(before)) is not None:
+        begins.append(_begin(before, given, asked))
+    return Job(model, tuple(placed), problem, tuple(begins), before.noise)
+
+
+def _begin(before: Refit, theta: Array, sizes: Array) -> Array:
+    k = len(before.problem.free)
+    return np.concatenate([theta[:k], sizes, theta[k:]])
+
+
+def as_given(refit: Refit) -> Array | None:
+    """The unknowns with the gains at their start values; None where none of them has moved far."""
+    added_here = {n for p in refit.placed for n in p.names.values()}
+    gains = [k for k, f in enumerate(refit.problem.free) if f.name not in added_here]
+    theta, far = refit.theta.copy(), False
+    for k in gains:
+        f = refit.problem.free[k]
+        far = far or abs(theta[k] - f.start) > BIASED * abs(f.start) or theta[k] in (f.min, f.max)
+        theta[k] = f.start
+    return theta if far else None
