@@ -9,8 +9,8 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-errors files frozen words notebook parameters trajectory experiment waveform phases expression model effects models formats simulate fmu
-linearize sensitivity fit identifiability discrepancy report study cli
+errors files frozen words notebook parameters trajectory axes experiment waveform phases expression model effects models
+formats simulate fmu linearize sensitivity fit identifiability discrepancy report study cli
 """.split()  # noqa: SIM905 - one list of words, read as such
 
 ALLOWED = {

@@ -116,7 +116,7 @@ class IdentifiabilityReport:
         """
         import matplotlib.pyplot as plt
 
-        from hvdc_ident.identifiability.plots import draw_intervals, draw_profile
+        from hvdc_ident.axes import draw_intervals, draw_profile
 
         found = self.to_dict()
         if parameter is not None and parameter not in found["parameters"]:

@@ -14,14 +14,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CHANNELS = 3
-"""Channels that are drawn: those in which the record tells most frequencies."""
-ACROSS = 3
-"""Channels beside each other: more would be too small to read."""
+"""Channels that are drawn, those in which the record tells most frequencies: more would be too small to read."""
 
 
 def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
     """The pooled residual of given gains, refitted and augmented model, on fitted and on held-out data."""
-    fig = figure(7.4, 2.8)
+    fig = figure(7.4, 2.8, {"left": 0.1, "right": 0.99, "bottom": 0.1, "top": 0.97})
     axes = fig.subplots()
     names = [n for n in ("nominal", "refitted", "augmented") if n in pooled]
     for k, (part, label, colour) in enumerate((("fit", "fitted", AFTER), ("holdout", "held out", BEFORE))):
@@ -40,24 +38,21 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
-    """Gain above phase over frequency for each channel, three beside each other: the record, the nominal and the augmented model."""
+    """Gain above phase over frequency for each channel, beside each other: the record, the nominal and the augmented model."""
     most = sorted((c for c in channels if c.get("omega")), key=lambda c: -len(c["omega"]))[:CHANNELS]
     shown = [c for c in channels if c in most]
-    wide, bands = min(max(len(shown), 1), ACROSS), max(-(-len(shown) // ACROSS), 1)
-    fig = figure(3.2 * wide, 4.6 * bands)
-    grid = fig.subplots(2 * bands, wide, squeeze=False)
+    wide = 3.2 * max(len(shown), 1)
+    edges = {"left": 0.62 / wide, "right": 1.0 - 0.1 / wide, "wspace": 0.2, "bottom": 0.11, "top": 0.93, "hspace": 0.08}
+    fig = figure(wide, 4.6, edges)
     for k, c in enumerate(shown):
-        above, below = grid[2 * (k // ACROSS), k % ACROSS], grid[2 * (k // ACROSS) + 1, k % ACROSS]
-        below.sharex(above)
+        above = fig.add_subplot(2, len(shown), k + 1)
+        below = fig.add_subplot(2, len(shown), len(shown) + k + 1, sharex=above)
         _channel(above, below, c)
-        if k % ACROSS == 0:
-            above.set_ylabel("gain, dB")
-            below.set_ylabel("phase, degrees")
-    for k in range(len(shown), wide * bands):
-        for row in (0, 1):
-            grid[2 * (k // wide) + row, k % wide].set_axis_off()
-    if shown:
-        grid[0, 0].legend(fontsize="small")
+        if k == 0:
+            above.legend(fontsize="small")
+            for axes, label in ((above, "gain, dB"), (below, "phase, degrees")):
+                axes.set_ylabel(label)
+                axes.yaxis.set_label_coords(-0.17, 0.5)
     return fig
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +15,7 @@ from hvdc_ident.trajectory import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(\.\d)\d+")  # tenths of a point are seen at most
+_LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(?<=\.\d)\d+")  # tenths of a point are seen at most
 POINTS = 700
 WIDEST = 8.4
 """rem on the page for an inch of a figure: one of 7.4 inches fills it."""
@@ -40,6 +39,7 @@ def figure(width: float, height: float, margins: Mapping[str, float] | None = No
 def svg(fig: Figure, label: str) -> str:
     """The figure as an `<svg>` element, the same bytes each time; text stays text."""
     import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.ticker import LogFormatter
 
     from hvdc_ident.report.html import text
@@ -51,9 +51,9 @@ def svg(fig: Figure, label: str) -> str:
                 axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
     style = {"svg.fonttype": "none", "svg.hashsalt": label, "font.family": "sans-serif", "text.parse_math": False}
     stream = io.StringIO()
-    with matplotlib.rc_context(style):
-        fig.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    drawn = _LINE.sub(lambda line: _DIGITS.sub(r"\1", line[0]), stream.getvalue())
+    with matplotlib.rc_context(style):  # `savefig` would draw everything twice
+        FigureCanvasSVG(fig).print_svg(stream, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    drawn = _LINE.sub(lambda line: _DIGITS.sub("", line[0]), stream.getvalue())
     widest = f"{WIDEST * fig.get_figwidth():.1f}rem"  # a narrow figure is not blown up to the page's width
     opening = f'<svg role="img" aria-label="{text(label)}" style="max-width: {widest}"'
     return drawn[drawn.index("<svg") :].replace("<svg", opening, 1)
@@ -69,9 +69,8 @@ def visible_rows(values: Array, points: int = POINTS) -> NDArray[np.intp]:
     """The rows of these points."""
     if values.size <= points:
         return np.arange(values.size)
-    edges = np.linspace(0, values.size, points // 2 + 1).astype(int)
-    keep = [0, values.size - 1]
-    for start, end in pairwise(edges):
-        part = values[start:end]
-        keep += [start + int(np.argmin(part)), start + int(np.argmax(part))]
-    return np.unique(keep)
+    width = -(-2 * values.size // points)
+    whole = np.append(values, np.full(-values.size % width, values[-1])).reshape(-1, width)
+    begins = np.arange(0, values.size, width)
+    rows = np.concatenate([[0, values.size - 1], begins + whole.argmin(axis=1), begins + whole.argmax(axis=1)])
+    return np.unique(np.minimum(rows, values.size - 1))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.identifiability.plots import draw_intervals, draw_profile
+from hvdc_ident.axes import draw_intervals, draw_profile
 from hvdc_ident.report.drawing import figure
 
 if TYPE_CHECKING:

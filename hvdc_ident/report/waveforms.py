@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,13 +12,49 @@ from hvdc_ident.report.interactive import Curve
 from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 MARGINS = {"left": 0.11, "right": 0.99, "bottom": 0.12, "top": 0.91, "hspace": 0.1}
 
 
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A figure with two axes on which one waveform after the other is drawn: making axes takes longer than filling them."""
+
+    figure: Figure
+    top: Axes
+    strip: Axes
+
+    @classmethod
+    def new(cls) -> Sheet:
+        """An empty sheet."""
+        fig = figure(7.4, 3.5, MARGINS)
+        top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+        strip.set_ylabel("residual")
+        strip.set_xlabel("time, s")
+        for axes in (top, strip):
+            axes.yaxis.set_label_coords(-0.1, 0.5)  # one below the other, however wide the numbers are
+            axes.grid(True, color="#e4e4e4", linewidth=0.6)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.tick_params(labelsize=8)
+        return cls(fig, top, strip)
+
+    def wiped(self) -> tuple[Axes, Axes]:
+        """The axes, with nothing drawn on them and free to find their limits."""
+        for axes in (self.top, self.strip):
+            for drawn in [*axes.lines, *axes.collections, *axes.patches]:
+                drawn.remove()
+            axes.relim()
+            axes.set_autoscale_on(True)
+        for legend in list(self.figure.legends):
+            legend.remove()
+        return self.top, self.strip
+
+
 def waveforms(
+    sheet: Sheet,
     output: str,
     unit: str,
     before: Trajectory | None,
@@ -25,13 +62,12 @@ def waveforms(
     event: float | None = None,
     window: tuple[float, float] | None = None,
 ) -> Figure:
-    """The recorded and simulated output over time, and below it measured minus simulated.
+    """The recorded and simulated output over time, and below it measured minus simulated, on a sheet that is wiped first.
 
     before, after: tables with the columns OUTPUT and OUTPUT.measured, at the start values and at the estimates; with
     OUTPUT.low and OUTPUT.high the band between them is shaded.
     """
-    fig = figure(7.4, 3.5, MARGINS)
-    top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    top, strip = sheet.wiped()
     shown = after if after is not None else before
     if shown is not None:
         top.plot(*visible(shown.time, shown[f"{output}.measured"]), color=MEASURED, linewidth=1.0, label="measured")
@@ -41,29 +77,21 @@ def waveforms(
         dashes = (0, (5, 2)) if table is before else "-"
         top.plot(*visible(table.time, table[output]), color=color, linewidth=1.3, linestyle=dashes, label=label)
         if f"{output}.low" in table:
-            band = [table[f"{output}.{end}"] for end in ("low", "high")]
-            top.fill_between(table.time, *band, color=color, alpha=0.15, linewidth=0, label="95 % band of a sample")
+            low, high = (table[f"{output}.{end}"] for end in ("low", "high"))
+            top.fill_between(table.time, low, high, color=color, alpha=0.15, linewidth=0, label="95 % band of a sample")
         left = table[f"{output}.measured"] - table[output]
         strip.plot(*visible(table.time, left), color=color, linewidth=0.8)
-    unit_text = f", {unit}" if unit else ""
-    top.set_ylabel(f"{output}{unit_text}")
-    strip.set_ylabel("residual")
-    strip.set_xlabel("time, s")
-    for axes in (top, strip):
-        axes.yaxis.set_label_coords(-0.1, 0.5)  # one below the other, however wide the numbers are
+    top.set_ylabel(f"{output}, {unit}" if unit else output)
     strip.axhline(0.0, color=MARK, linewidth=0.6)
     for axes in (top, strip):
-        axes.grid(True, color="#e4e4e4", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
         if event is not None:
             axes.axvline(event, color=MARK, linewidth=0.8, linestyle=":")
         if window is not None:
             axes.axvspan(*window, color="#1f5fa8", alpha=0.05, linewidth=0)
-    fig.legend(*top.get_legend_handles_labels(), fontsize=8, frameon=False, loc="upper right", ncols=4)
+    sheet.figure.legend(*top.get_legend_handles_labels(), fontsize=8, frameon=False, loc="upper right", ncols=4)
     if shown is not None:
         top.set_ylim(*_limits([t for t in (before, after) if t is not None], output))
-    return fig
+    return sheet.figure
 
 
 def curves(

@@ -71,7 +71,7 @@ def _bode(data: dict[str, Any]) -> str:
         return ""
     omega = np.array(response["omega"], dtype=float)
     values = np.array(response["real"], dtype=float) + 1j * np.array(response["imag"], dtype=float)
-    fig = figure(7.5, 4.8)
+    fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
     gain, phase = fig.subplots(2, 1, sharex=True)
     k = 0
     for i, output in enumerate(response["outputs"]):
@@ -93,6 +93,7 @@ def _bode(data: dict[str, Any]) -> str:
     gain.legend(fontsize="small")
     for axes in (gain, phase):
         axes.grid(True, color="#dddddd", linewidth=0.5)
+        axes.yaxis.set_label_coords(-0.08, 0.5)
     return f"<figure>{svg(fig, 'Bode diagram of the linear model')}</figure>"
 
 

@@ -9,7 +9,7 @@ from hvdc_ident.report.html import text
 from hvdc_ident.report.interactive import zoomable
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
-from hvdc_ident.report.waveforms import curves, waveforms
+from hvdc_ident.report.waveforms import Sheet, curves, waveforms
 from hvdc_ident.trajectory import Trajectory
 
 MOST = 60
@@ -18,13 +18,15 @@ MOST = 60
 def _render(results: Results) -> str:
     fit, simulation = results.get("fit"), results.get("simulation")
     experiments = {**(simulation.get("experiments") or {}), **(fit.get("experiments") or {})}
+    if not experiments:
+        return ""
     units = {**(simulation.get("units") or {}), **(fit.get("units") or {})}
     parts: list[str] = []
-    left = MOST
+    left, sheet = MOST, Sheet.new()
     for name, about in experiments.items():
         before, after = results.table(f"simulation.{name}.csv"), results.table(f"fit.{name}.csv")
         outputs = _outputs(after if after is not None else before)
-        drawn = [_figure(name, o, str(units.get(o, "")), before, after, about) for o in outputs[:left]]
+        drawn = [_figure(sheet, name, o, str(units.get(o, "")), before, after, about) for o in outputs[:left]]
         left -= len(drawn)
         if drawn:
             role = " (held out: not used by the fit)" if about.get("role") == "holdout" else ""
@@ -40,11 +42,17 @@ def _outputs(table: Trajectory | None) -> list[str]:
 
 
 def _figure(
-    name: str, output: str, unit: str, before: Trajectory | None, after: Trajectory | None, about: dict[str, Any]
+    sheet: Sheet,
+    name: str,
+    output: str,
+    unit: str,
+    before: Trajectory | None,
+    after: Trajectory | None,
+    about: dict[str, Any],
 ) -> str:
     tables = [t if t is not None and output in t and f"{output}.measured" in t else None for t in (before, after)]
     window = about.get("window")
-    fig = waveforms(output, unit, tables[0], tables[1], about.get("event"), tuple(window) if window else None)
+    fig = waveforms(sheet, output, unit, tables[0], tables[1], about.get("event"), tuple(window) if window else None)
     label = f"{output} in {name}: measured and simulated"
     return zoomable(svg(fig, label), label, *curves(output, unit, tables[0], tables[1]))
 

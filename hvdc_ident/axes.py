@@ -1,4 +1,7 @@
-"""Drawings of a report's own numbers, as its JSON has them, on axes that are given."""
+"""Profiles and intervals as an identifiability report's JSON has them, drawn on axes that are given.
+
+By itself, so that a page is made without importing what computes them.
+"""
 
 from __future__ import annotations
 
