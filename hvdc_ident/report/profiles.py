@@ -19,12 +19,21 @@ COLUMNS = 3
 def profiles(found: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Mapping[str, Any]]) -> Figure:
     """One small plot a parameter: rise over its threshold against the parameter, in its unit; 1 is the 95 % level."""
     rows = -(-len(found) // COLUMNS)
-    fig = figure(7.4, 1.9 * rows)
+    high = 1.9 * rows
+    edges = {
+        "left": 0.085,
+        "right": 0.985,
+        "bottom": 0.42 / high,
+        "top": 1.0 - 0.22 / high,
+        "wspace": 0.25,
+        "hspace": 0.62,
+    }
+    fig = figure(7.4, high, edges)
     for place, (name, p) in enumerate(found.items(), start=1):
         axes = fig.add_subplot(rows, COLUMNS, place)
         draw_profile(axes, name, p, parameters.get(name, {}))
         axes.set_ylabel("")
-    fig.supylabel("rise of the cost / 95 % level", fontsize=8)
+    fig.supylabel("rise of the cost / 95 % level", fontsize=8, x=0.01)
     return fig
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from hvdc_ident.trajectory import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+OTHERS = "#c4c4c4"
 COLORS = (AFTER, BEFORE, MEASURED, "#3a7d44", "#8a3ffc", "#b3261e")
 
 
@@ -25,14 +26,23 @@ def sweep_errors(
     base: float | None,
     curve: bool,
 ) -> Figure:
-    """The RMSE of each series over one parameter: a curve, or a point for each row where others move too."""
-    fig = figure(7.4, 3.2)
+    """The RMSE of each series over one parameter: a curve, or a point for each row where others move too.
+
+    Those that move most have colours and names, the others are grey.
+    """
+    most = sorted(errors, key=lambda n: -float(np.ptp(errors[n])))[: len(COLORS)]
+    color = dict(zip([n for n in errors if n in most], COLORS, strict=False))
+    lines = -(-(len(color) + (len(errors) > len(color))) // 3)
+    high = 3.2 + 0.18 * lines
+    fig = figure(
+        7.4, high, {"left": 0.1, "right": 0.985, "bottom": 0.48 / high, "top": 1.0 - (0.12 + 0.18 * lines) / high}
+    )
     axes = fig.subplots()
-    for (name, series), color in zip(errors.items(), COLORS * (1 + len(errors) // len(COLORS)), strict=False):
-        if curve:
-            axes.plot(values, series, color=color, linewidth=1.3, label=name)
-        else:
-            axes.plot(values, series, ".", color=color, markersize=3, label=name)
+    style: dict[str, Any] = {"linewidth": 1.3} if curve else {"marker": ".", "linestyle": "none", "markersize": 3}
+    for name in [*(n for n in errors if n not in color), *color]:
+        axes.plot(values, errors[name], color=color.get(name, OTHERS), label=name if name in color else "_", **style)
+    if len(errors) > len(color):
+        axes.plot([], [], color=OTHERS, label=f"{len(errors) - len(color)} others that move less", **style)
     if base is not None:
         axes.axvline(base, color=MARK, linewidth=0.8, linestyle=":")
     axes.set_xlabel(f"{parameter}, {unit}" if unit else parameter)
@@ -41,13 +51,13 @@ def sweep_errors(
     axes.grid(True, color="#e4e4e4", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=8)
-    fig.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, loc="outside upper right", ncols=3)
+    fig.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, loc="upper right", ncols=3)
     return fig
 
 
 def sweep_poles(parameter: str, values: Array, poles: np.ndarray) -> Figure:
     """The poles of every row, (n, modes) 1/s, colored by the parameter; those slower than 2000 1/s."""
-    fig = figure(7.4, 3.6)
+    fig = figure(7.4, 3.6, {"left": 0.1, "right": 0.99, "bottom": 0.14, "top": 0.97})
     axes = fig.subplots()
     color = np.repeat(values, poles.shape[1])
     flat = poles.ravel()

@@ -38,7 +38,7 @@ class Sheet:
             axes.yaxis.set_label_coords(-0.1, 0.5)  # one below the other, however wide the numbers are
             axes.grid(True, color="#e4e4e4", linewidth=0.6)
             axes.spines[["top", "right"]].set_visible(False)
-            axes.tick_params(labelsize=8)
+            axes.tick_params(labelsize=8, left=False, bottom=False)  # the grid marks them
         return cls(fig, top, strip)
 
     def wiped(self) -> tuple[Axes, Axes]:
@@ -48,9 +48,16 @@ class Sheet:
                 drawn.remove()
             axes.relim()
             axes.set_autoscale_on(True)
-        for legend in list(self.figure.legends):
-            legend.remove()
         return self.top, self.strip
+
+    def explain(self) -> None:
+        """Nothing; the legend says what is drawn, a new one where that is not what was drawn before."""
+        handles, labels = self.top.get_legend_handles_labels()
+        for legend in list(self.figure.legends):
+            if [t.get_text() for t in legend.texts] == labels:
+                return
+            legend.remove()
+        self.figure.legend(handles, labels, fontsize=8, frameon=False, loc="upper right", ncols=4)
 
 
 def waveforms(
@@ -88,7 +95,7 @@ def waveforms(
             axes.axvline(event, color=MARK, linewidth=0.8, linestyle=":")
         if window is not None:
             axes.axvspan(*window, color="#1f5fa8", alpha=0.05, linewidth=0)
-    sheet.figure.legend(*top.get_legend_handles_labels(), fontsize=8, frameon=False, loc="upper right", ncols=4)
+    sheet.explain()
     if shown is not None:
         top.set_ylim(*_limits([t for t in (before, after) if t is not None], output))
     return sheet.figure
