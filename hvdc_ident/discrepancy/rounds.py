@@ -208,7 +208,7 @@ def _refitted(
         found, scores, extra = _scanned(search, before, nominal, number, paths, found, scores)
         trials += _trials(search, before, found, extra, f"round {number}: refits of the closer look")
     if number == 1 and _far(before, trials):
-        trials = _again(search, before, found, trials, f"round {number}: once more")
+        trials = _again(search, found, trials, f"round {number}: once more")
     return _closed(search, Round(before, paths, found, scores, (), (), same, None, "", True, None), trials, number)
 
 
@@ -264,9 +264,7 @@ def against(search: Search, before: Refit, trial: Trial, scores: Scores, *, firs
     return objections(before, trial, scores.p(score), search.options, search.material, first=first)
 
 
-def _again(
-    search: Search, before: Refit, found: Sequence[Candidate], trials: Sequence[Trial], text: str
-) -> list[Trial]:
+def _again(search: Search, found: Sequence[Candidate], trials: Sequence[Trial], text: str) -> list[Trial]:
     """The trials, with another size where one is found beside the gains that a refit came to."""
     chosen: dict[str, list[Trial]] = {}
     for t in sorted(trials, key=lambda t: t.refit.chi2):
