@@ -47,7 +47,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not isinstance(value, np.generic):
         return value if math.isfinite(value) else {_KIND: "f", "v": repr(value)}
     if isinstance(value, bytes):
-        return {_KIND: "b", "v": base64.b85encode(value).decode()}
+        return {_KIND: "b", "v": base64.b64encode(value).decode()}
     if isinstance(value, complex) and not isinstance(value, np.generic):
         return {_KIND: "c", "v": [_plain(value.real), _plain(value.imag)]}
     if isinstance(value, np.ndarray | np.generic):
@@ -68,7 +68,7 @@ def _plain(value: Any) -> Any:
 def _array(value: np.ndarray[Any, Any], scalar: bool) -> dict[str, Any]:
     if value.dtype.kind not in "biufc":
         raise TypeError(f"an array of {value.dtype} cannot be kept")
-    content = base64.b85encode(np.ascontiguousarray(value).tobytes()).decode()
+    content = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
     return {_KIND: "s" if scalar else "a", "type": value.dtype.str, "shape": list(value.shape), "v": content}
 
 
@@ -81,11 +81,11 @@ def _value(plain: Any) -> Any:
     if kind == "f":
         return float(content)
     if kind == "b":
-        return base64.b85decode(content)
+        return base64.b64decode(content, validate=True)
     if kind == "c":
         return complex(*map(_value, content))
     if kind in "as":
-        array = np.frombuffer(base64.b85decode(content), np.dtype(plain["type"])).reshape(plain["shape"]).copy()
+        array = np.frombuffer(base64.b64decode(content, validate=True), np.dtype(plain["type"])).reshape(plain["shape"]).copy()
         return array[()] if kind == "s" else array
     if kind == "t":
         return tuple(map(_value, content))
