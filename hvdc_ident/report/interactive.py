@@ -64,4 +64,4 @@ def _asset(name: str) -> str:
 def _library() -> str:
     """plotly.js, compressed, as text."""
     code = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
-    return base64.b64encode(gzip.compress(code, 9, mtime=0)).decode()
+    return base64.b64encode(gzip.compress(code, 6, mtime=0)).decode()
