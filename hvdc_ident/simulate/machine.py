@@ -302,10 +302,10 @@ class _LanesEmitter(_Emitter):
         return self._gather([call(op, [self._lane(v, lane) for v in x]) for lane in range(LANES)])
 
 
+_GENERATED = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
+
+
 def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
     """Calls one generated function from Python."""
-    pointer = ctypes.POINTER(ctypes.c_double)
-    kind = ctypes.CFUNCTYPE(None, *[pointer] * 7)
-    zero = np.zeros_like(w)
-    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, zero, p, m)]
-    kind(int(address))(*(a.ctypes.data_as(pointer) for a in arrays), out.ctypes.data_as(pointer))
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, np.zeros_like(w), p, m)]
+    _GENERATED(int(address))(*(a.ctypes.data for a in arrays), out.ctypes.data)

@@ -147,6 +147,7 @@ def test_beside_a_folder_of_no_use_the_users_caches_serve(folder, monkeypatch, t
 
 def test_of_too_much_code_what_was_not_used_for_longest_goes(folder, monkeypatch):
     monkeypatch.setattr(objects, "ROOM", 3500)
+    monkeypatch.setattr(objects, "LOOK", 1)
     for k in range(3):
         objects.kept(f"facts {k}", lambda: bytes(1000))
         for age, path in enumerate(sorted(folder.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)):
@@ -157,6 +158,23 @@ def test_of_too_much_code_what_was_not_used_for_longest_goes(folder, monkeypatch
     assert len(files(folder)) == 1 + 1
     assert "another's" in files(folder)
     objects.kept("facts 3", made_by_nobody)
+
+
+def test_a_folder_is_looked_at_often_enough_to_stay_small(folder, monkeypatch):
+    monkeypatch.setattr(objects, "ROOM", 20_000)
+    most = 0
+    for k in range(1000):
+        objects.kept(f"facts {k}", lambda: bytes(1000))
+        most = max(most, len(list(folder.iterdir())))
+    assert 20 < most < 20 + 8 * objects.LOOK
+
+
+def test_a_full_folder_is_not_listed_for_every_file(folder, monkeypatch):
+    looks, clear = [], objects._clear
+    monkeypatch.setattr(objects, "_clear", lambda at: (looks.append(at), clear(at)))
+    for k in range(640):
+        objects.kept(f"facts {k}", lambda: b"code")
+    assert 1 <= len(looks) <= 30
 
 
 def test_what_numpy_keeps_in_an_array_is_where_the_integrators_look():
