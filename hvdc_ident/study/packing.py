@@ -85,7 +85,11 @@ def _value(plain: Any) -> Any:
     if kind == "c":
         return complex(*map(_value, content))
     if kind in "as":
-        array = np.frombuffer(base64.b64decode(content, validate=True), np.dtype(plain["type"])).reshape(plain["shape"]).copy()
+        array = (
+            np.frombuffer(base64.b64decode(content, validate=True), np.dtype(plain["type"]))
+            .reshape(plain["shape"])
+            .copy()
+        )
         return array[()] if kind == "s" else array
     if kind == "t":
         return tuple(map(_value, content))
