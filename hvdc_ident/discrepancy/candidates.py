@@ -217,7 +217,7 @@ def places_of(
     """The places to try: those given, or every slot and every family of slots that are named alike.
 
     A family: slots of one kind whose names differ in digits, or, those left out, in one letter (Ir1, Ii1, Ir2, Ii2);
-    and the part of it that belongs to one station, with one digit.
+    the part of it that belongs to one station, with one digit; and all names of one ending (Vdc1_m, P2_m, Q1_m).
     """
     if given is not None:
         listed = [(g,) if isinstance(g, str) else tuple(g) for g in given]
@@ -251,7 +251,9 @@ def _families(model: AnyModel, live: Sequence[str], kind: str) -> list[tuple[str
             part = tuple(p for p in ordered if stems[p] == stem)
             if 1 < len(part) < len(ordered):
                 found.append(part)
-    return found
+    endings = {p: p.rpartition("_")[2] for p in names if p.rpartition("_")[0]}
+    alike = [tuple(p for p in endings if endings[p] == end) for end in dict.fromkeys(endings.values())]
+    return found + [f for f in alike if len(f) > 1]
 
 
 def _alike(a: str, b: str) -> bool:

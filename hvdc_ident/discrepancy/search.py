@@ -9,15 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import adequacy
+from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
 from hvdc_ident.discrepancy.rounds import Round, Search, excess, one_round
-from hvdc_ident.discrepancy.select import Trial
+from hvdc_ident.discrepancy.select import Trial, at_edge, clear
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.transform import home
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 OTHERS = 6
@@ -76,55 +78,51 @@ def _settled(search: Search, first: Refit, outcome: Outcome) -> Outcome:
             continue
         ruler = kept[k].ruler
         assert ruler is not None
-        if ruler.gain(without.chi2, here.chi2, here.count - without.count) <= search.options.named_bic:
+        gain = ruler.gain(without.chi2, here.chi2, here.count - without.count)
+        # What was clearly there before the others came may be nothing beside them.
+        if gain <= search.options.named_bic or at_edge(here, k) or not clear(here, k):
             here = without
             del kept[k]
             continue
-        trials = _beside(search, first, here, kept[k], k, without)
-        best = max(trials, key=lambda t: t.gain)
-        here = best.refit
-        kept[k] = replace(kept[k], trials=tuple(sorted(trials, key=lambda t: -t.gain)), winner=best)
+        trials = sorted(_beside(search, first, here, kept[k], k, without), key=lambda t: -t.gain)
+        here = trials[0].refit
+        told = tuple(replace(t, refit=_last(t.refit, k)) for t in trials)
+        kept[k] = replace(kept[k], trials=told, winner=told[0])
         k += 1
     return Outcome(here, outcome.rounds, tuple(kept))
 
 
 def _beside(search: Search, first: Refit, here: Refit, found: Round, k: int, without: Refit) -> list[Trial]:
-    """The effect in place k and its rivals, each refitted with the other effects; gains over doing without."""
+    """The effect in place k and its rivals there, each refitted with the other effects; gains over doing without."""
     assert found.ruler is not None and found.winner is not None
-    own = here.placed[k]
     refits: list[tuple[Trial, Refit]] = []
     others: list[tuple[Trial, Job]] = []
     for trial in found.trials[: OTHERS + 1]:
         placed = trial.refit.placed[-1]
-        if (placed.candidate.effect, placed.candidate.at, placed.candidate.source) == (
-            own.candidate.effect, own.candidate.at, own.candidate.source,
-        ):  # fmt: skip
-            refits.append((trial, here))
-            continue
         among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
         with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival
-            others.append((trial, job_of(first, here, among, {k: trial.refit.sizes(placed)})))
+            job = job_of(first, here, among, {k: trial.refit.sizes(placed)})
+            if _same(job.placed[k].candidate, here.placed[k].candidate):
+                refits.append((trial, here))
+            else:
+                others.append((trial, job))
     texts = [f"again with the others: {t.refit.placed[-1].candidate.label}" for t, _ in others]
     found_again = done(search, [j for _, j in others], texts)
-    refits += [(t, r) for (t, _), r in zip(others, found_again, strict=True)]
-    trials = [
-        # The rivals' own effect stands last in their list, as elsewhere.
-        Trial(t.pick, _last(r, k), found.ruler.gain(without.chi2, r.chi2, r.count - without.count))
-        for t, r in refits
-        if not r.failure
-    ]
-    if not any(t.refit.placed[-1].candidate == own.candidate for t in trials):
-        trials.append(
-            Trial(
-                found.winner.pick, _last(here, k), found.ruler.gain(without.chi2, here.chi2, here.count - without.count)
-            )
-        )
-    return trials
+    refits += [(t, r) for (t, _), r in zip(others, found_again, strict=True) if not r.failure]
+    if not any(r is here for _, r in refits):
+        refits.append((found.winner, here))
+    gain = found.ruler.gain
+    return [Trial(t.pick, r, gain(without.chi2, r.chi2, r.count - without.count)) for t, r in refits]
+
+
+def _same(a: Candidate, b: Candidate) -> bool:
+    return (a.effect, a.at, a.source) == (b.effect, b.at, b.source)
 
 
 def _last(refit: Refit, k: int) -> Refit:
-    order = [*(p for j, p in enumerate(refit.placed) if j != k), refit.placed[k]]
-    return replace(refit, placed=tuple(order))
+    """The refit with the effect in place k told last, as that of a round is."""
+    order = [*(j for j in range(len(refit.placed)) if j != k), k]
+    return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))
 
 
 def _again(
@@ -146,13 +144,17 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
         named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
         parameters: dict[str, float | str] = {**values, **named}
-        use = EffectUse(p.use.effect, p.use.at, FrozenMap(parameters), source=p.use.source, expression=p.use.expression)
+        # What sat behind an effect that is left out sits where that one did.
+        at_slots = tuple(home(model.slots, place) for place in p.use.at)
+        source = home(model.slots, p.use.source) if p.use.source else ""
+        use = EffectUse(p.use.effect, at_slots, FrozenMap(parameters), source=source, expression=p.use.expression)
         before = set(model.parameters)
         model = model.with_effects([use])
         new = [n for n in model.parameters if n not in before]
         names = dict(zip(p.names, new, strict=True))
         free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
-        again.append(replace(p, use=use, names=FrozenMap(names), start=FrozenMap(values)))
+        moved = replace(p.candidate, at=at_slots, source=source)
+        again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
     unsettled = any(effects()[p.use.effect].restless for p in placed)
     problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
     nuisance = here.theta[len(here.problem.free) :]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -94,6 +94,17 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
     )
     model, y = rewrite(model, symbol(before))
     return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)})
+
+
+def home(slots: Collection[str], name: str) -> str:
+    """The slot among these that a name of `rewritten` was made at, where the name itself is none of them; else the name."""
+    found = name
+    while found not in slots:
+        base = max(found.rpartition("_before_")[0], found.rpartition("_after_")[0], key=len)
+        if not base:
+            return name
+        found = base
+    return found
 
 
 def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal) -> FrozenMap[Signal]:
