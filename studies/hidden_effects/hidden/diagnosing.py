@@ -11,8 +11,9 @@ import numpy as np
 
 from hidden.campaigns import summary
 from hidden.cases import Case
+from hidden.noise import whitened
 from hidden.plants import PLANTS
-from hidden.sizes import WIDTH
+from hidden.sizes import UNIT, WIDTH
 from hvdc_ident import simulate
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse, effects
@@ -101,6 +102,8 @@ def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
         else _misfit(found.augmented, experiments, case, found.parameters_after),
         "oracle": _oracle(model, experiments, case, free),
     }
+    if found.augmented is not None:
+        line["apart"] = _apart(found.augmented, experiments, case, found.parameters_after)
     if sindy:
         line["sindy"] = _sindy(model, experiments, case, found.parameters_refitted)
     return line
@@ -135,6 +138,18 @@ def _misfit(model: Any, experiments: Sequence[Experiment], case: Case, values: M
         return None
     sigma = case.sigma[list(case.channels)]
     return float(np.sqrt(np.mean(((run.trajectory.values - held.measured.values) / sigma) ** 2)))
+
+
+def _apart(model: Any, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
+    """How far the model's answer to the three records lies from the hidden one without noise, in units; None where it cannot run."""
+    off = np.zeros_like(case.clean)
+    for k, e in enumerate(experiments):
+        try:
+            run = simulate(model, e, values, outputs=e.outputs)
+        except HvdcIdentError:
+            return None
+        off[:, k, list(case.channels)] = run.trajectory.values - case.clean[:, k, list(case.channels)]
+    return float(np.linalg.norm(whitened(off, case.sigma, case.design.noise)) / UNIT)
 
 
 def _sindy(

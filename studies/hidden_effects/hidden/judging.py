@@ -194,15 +194,21 @@ def _clean(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _strangers(lines: Sequence[Line]) -> dict[str, Any]:
-    """Cases whose effect the search did not have: a name is wrong unless it is the same equation."""
+    """Cases whose effect the search did not have: a name is wrong unless it is the same equation.
+
+    alike: of the wrong names those whose model, as fitted, answers all three records within a unit of what is hidden, so
+    that no record there is could tell them apart.
+    """
     ran = [x for x in lines if "failed" not in x]
     named = [x for x in ran if x["verdict"] == "named" and not any(_is(x, x["truth"][0], f) for f in x["found"])]
+    alike = [x for x in named if x.get("apart") is not None and x["apart"] < 1.0]
     return {
         "cases": len(ran),
         "failed": len(lines) - len(ran),
         "confident_wrong_names": len(named),
         "share": len(named) / len(ran) if ran else None,
         "limit": limit_above(len(named), len(ran)) if ran else None,
+        "alike": len(alike),
         "verdicts": dict(Counter(x["verdict"] for x in ran)),
         "named_as": {
             e: dict(Counter(x["found"][0]["effect"] for x in named if x["effects"][0] == e))
