@@ -30,7 +30,7 @@ class Options:
     refits: int = 24
     most: int = 3
     holdout_share: float = 0.1
-    refuted: float = 0.02
+    refuted: float = 0.1
     starts: int = 2
     fallback: bool = True
 

@@ -209,7 +209,7 @@ def _refitted(
         trials += _trials(search, before, found, extra, f"round {number}: refits of the closer look")
     if number == 1 and _far(before, trials):
         trials = _again(search, found, trials, f"round {number}: once more")
-    return _closed(search, Round(before, paths, found, scores, (), (), same, None, "", True, None), trials, number)
+    return closed(search, Round(before, paths, found, scores, (), (), same, None, "", True, None), trials, number)
 
 
 def _far(before: Refit, trials: Sequence[Trial]) -> bool:
@@ -231,7 +231,7 @@ def _left(refit: Refit) -> float:
     return max(refit.chi2 / refit.rows, (unseen(refit) or 0.0) ** 2) - 1.0
 
 
-def _closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> Round:
+def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> Round:
     """The round with its refits ranked and its winner, or what speaks against the best.
 
     Of those that explain the fitted data equally well the winner is the one that with the held-out data explains most.

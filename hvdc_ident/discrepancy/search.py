@@ -13,8 +13,8 @@ from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
-from hvdc_ident.discrepancy.rounds import Round, Search, excess, one_round
-from hvdc_ident.discrepancy.select import Trial, at_edge, clear
+from hvdc_ident.discrepancy.rounds import Round, Search, closed, excess, one_round
+from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free
@@ -84,44 +84,71 @@ def _settled(search: Search, first: Refit, outcome: Outcome) -> Outcome:
             here = without
             del kept[k]
             continue
-        trials = sorted(_beside(search, first, here, kept[k], k, without), key=lambda t: -t.gain)
-        here = trials[0].refit
-        told = tuple(replace(t, refit=_last(t.refit, k)) for t in trials)
-        kept[k] = replace(kept[k], trials=told, winner=told[0])
+        kept[k], winner = _looked_again(search, first, here, kept[k], k, without, len(outcome.rounds) + k + 1)
+        here = _in_place(winner.refit, k)
         k += 1
     return Outcome(here, outcome.rounds, tuple(kept))
 
 
-def _beside(search: Search, first: Refit, here: Refit, found: Round, k: int, without: Refit) -> list[Trial]:
-    """The effect in place k and its rivals there, each refitted with the other effects; gains over doing without."""
-    assert found.ruler is not None and found.winner is not None
-    refits: list[tuple[Trial, Refit]] = []
-    others: list[tuple[Trial, Job]] = []
+def _looked_again(
+    search: Search, first: Refit, here: Refit, found: Round, k: int, without: Refit, number: int
+) -> tuple[Round, Trial]:
+    """The round that looks for the effect in place k beside the others, and its winner: one that was not best alone may be.
+
+    Those that came near it in its own round are tried too. The effect itself stays where nothing better may be named.
+    """
+    again = one_round(search, without, number)
+    own = here.placed[k].candidate
+    again, mine = _with(again, own)
+    sound = [t for t in again.trials if t.pick.candidate != mine]
+    tried = {again.candidates[t.pick.candidate].label for t in sound}
+    refits: list[tuple[Pick, Job]] = []
     for trial in found.trials[: OTHERS + 1]:
         placed = trial.refit.placed[-1]
         among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
         with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival
             job = job_of(first, here, among, {k: trial.refit.sizes(placed)})
-            if _same(job.placed[k].candidate, here.placed[k].candidate):
-                refits.append((trial, here))
-            else:
-                others.append((trial, job))
-    texts = [f"again with the others: {t.refit.placed[-1].candidate.label}" for t, _ in others]
-    found_again = done(search, [j for _, j in others], texts)
-    refits += [(t, r) for (t, _), r in zip(others, found_again, strict=True) if not r.failure]
-    if not any(r is here for _, r in refits):
-        refits.append((found.winner, here))
-    gain = found.ruler.gain
-    return [Trial(t.pick, r, gain(without.chi2, r.chi2, r.count - without.count)) for t, r in refits]
+            candidate = job.placed[k].candidate
+            if candidate.label not in (*tried, own.label):
+                again, number_of = _with(again, candidate)
+                refits.append((Pick(number_of, 0, 1.0, 0.0), job))
+    texts = [f"again with the others: {again.candidates[p.candidate].label}" for p, _ in refits]
+    ended = done(search, [j for _, j in refits], texts)
+    sound += [Trial(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
+    mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
+    sound.append(mine_again[0] if mine_again else Trial(_pick(again, mine), _last(here, k), 0.0))
+    ranked = closed(search, replace(again, winner=None, why="", significant=True), sound, number)
+    winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
+    return replace(ranked, winner=winner), winner
 
 
-def _same(a: Candidate, b: Candidate) -> bool:
-    return (a.effect, a.at, a.source) == (b.effect, b.at, b.source)
+def _with(found: Round, candidate: Candidate) -> tuple[Round, int]:
+    """The round with the candidate among its own, and where it stands there."""
+    for k, c in enumerate(found.candidates):
+        if c.label == candidate.label:
+            return found, k
+    return replace(found, candidates=(*found.candidates, candidate)), len(found.candidates)
+
+
+def _pick(found: Round, candidate: int) -> Pick:
+    """The size of a candidate that the scores like best, or its first."""
+    score, _, column = found.score_p(candidate)
+    return Pick(candidate, found.scores.columns[column].probe if column >= 0 else 0, 1.0, score)
 
 
 def _last(refit: Refit, k: int) -> Refit:
     """The refit with the effect in place k told last, as that of a round is."""
-    order = [*(j for j in range(len(refit.placed)) if j != k), k]
+    return _ordered(refit, [*(j for j in range(len(refit.placed)) if j != k), k])
+
+
+def _in_place(refit: Refit, k: int) -> Refit:
+    """The refit with the effect that is told last back in place k."""
+    order = list(range(len(refit.placed) - 1))
+    order.insert(k, len(refit.placed) - 1)
+    return _ordered(refit, order)
+
+
+def _ordered(refit: Refit, order: Sequence[int]) -> Refit:
     return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))
 
 
