@@ -13,8 +13,8 @@ from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
 from hvdc_ident.discrepancy.rounds import Search, one_round
-from hvdc_ident.discrepancy.search import Outcome, _last, _settled, job_of
 from hvdc_ident.discrepancy.select import Trial, clear
+from hvdc_ident.discrepancy.settle import _last, job_of, settled
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.transform import home
@@ -70,9 +70,9 @@ def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit
     search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
     begun = one_round(search, first, 1)
     rounds = tuple(replace(begun, winner=Trial(begun.trials[0].pick, r, 100.0), trials=()) for r in (one, both))
-    settled = _settled(search, first, Outcome(both, rounds, rounds))
-    assert [p.candidate.label for p in settled.refit.placed] == ["lag at wm"]
-    assert [k.winner.refit.placed[-1].candidate.label for k in settled.kept if k.winner] == ["lag at wm"]
+    here, kept = settled(search, first, both, rounds, 2)
+    assert [p.candidate.label for p in here.placed] == ["lag at wm"]
+    assert [k.winner.refit.placed[-1].candidate.label for k in kept if k.winner] == ["lag at wm"]
 
 
 @pytest.mark.parametrize(

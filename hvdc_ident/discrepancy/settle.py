@@ -1,0 +1,154 @@
+"""Several effects beside each other: each looked for again, over the whole catalogue, and tried without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.race import done
+from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
+from hvdc_ident.discrepancy.rounds import Round, Search, closed, one_round
+from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
+from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.fit import Free
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.transform import home
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+
+OTHERS = 6
+"""Rivals of each effect in its own round that are tried again once the other effects are in."""
+
+
+def settled(
+    search: Search, first: Refit, here: Refit, kept: Sequence[Round], number: int
+) -> tuple[Refit, list[Round]]:
+    """The refit, and by effect the round that judges its rivals, after looking for each again and doing without it.
+
+    here: the refit of the model `first` with several effects; kept: the rounds that brought them; number: rounds so far.
+    """
+    kept = list(kept)
+    k = 0
+    while k < len(kept):
+        search.tell(k, len(kept), f"again with the others: {here.placed[k].candidate.label}")
+        others = tuple(p for j, p in enumerate(here.placed) if j != k)
+        without = _again(first, here, others)
+        if without.failure:
+            k += 1
+            continue
+        ruler = kept[k].ruler
+        assert ruler is not None
+        gain = ruler.gain(without.chi2, here.chi2, here.count - without.count)
+        # What was clearly there before the others came may be nothing beside them.
+        if gain <= search.options.named_bic or at_edge(here, k) or not clear(here, k):
+            here = without
+            del kept[k]
+            continue
+        kept[k], winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
+        here = _in_place(winner.refit, k)
+        k += 1
+    return here, kept
+
+
+def _looked_again(
+    search: Search, first: Refit, here: Refit, found: Round, k: int, without: Refit, number: int
+) -> tuple[Round, Trial]:
+    """The round that looks for the effect in place k beside the others, and its winner: one that was not best alone may be.
+
+    Those that came near it in its own round are tried too. The effect itself stays where nothing better may be named.
+    """
+    again = one_round(search, without, number)
+    own = here.placed[k].candidate
+    again, mine = _with(again, own)
+    sound = [t for t in again.trials if t.pick.candidate != mine]
+    tried = {again.candidates[t.pick.candidate].label for t in sound}
+    refits: list[tuple[Pick, Job]] = []
+    for trial in found.trials[: OTHERS + 1]:
+        placed = trial.refit.placed[-1]
+        among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
+        with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival
+            job = job_of(first, here, among, {k: trial.refit.sizes(placed)})
+            candidate = job.placed[k].candidate
+            if candidate.label not in (*tried, own.label):
+                again, number_of = _with(again, candidate)
+                refits.append((Pick(number_of, 0, 1.0, 0.0), job))
+    texts = [f"again with the others: {again.candidates[p.candidate].label}" for p, _ in refits]
+    ended = done(search, [j for _, j in refits], texts)
+    sound += [Trial(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
+    mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
+    sound.append(mine_again[0] if mine_again else Trial(_pick(again, mine), _last(here, k), 0.0))
+    ranked = closed(search, replace(again, winner=None, why="", significant=True), sound, number)
+    winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
+    return replace(ranked, winner=winner), winner
+
+
+def _with(found: Round, candidate: Candidate) -> tuple[Round, int]:
+    """The round with the candidate among its own, and where it stands there."""
+    for k, c in enumerate(found.candidates):
+        if c.label == candidate.label:
+            return found, k
+    return replace(found, candidates=(*found.candidates, candidate)), len(found.candidates)
+
+
+def _pick(found: Round, candidate: int) -> Pick:
+    """The size of a candidate that the scores like best, or its first."""
+    score, _, column = found.score_p(candidate)
+    return Pick(candidate, found.scores.columns[column].probe if column >= 0 else 0, 1.0, score)
+
+
+def _last(refit: Refit, k: int) -> Refit:
+    """The refit with the effect in place k told last, as that of a round is."""
+    return _ordered(refit, [*(j for j in range(len(refit.placed)) if j != k), k])
+
+
+def _in_place(refit: Refit, k: int) -> Refit:
+    """The refit with the effect that is told last back in place k."""
+    order = list(range(len(refit.placed) - 1))
+    order.insert(k, len(refit.placed) - 1)
+    return _ordered(refit, order)
+
+
+def _ordered(refit: Refit, order: Sequence[int]) -> Refit:
+    return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))
+
+
+def _again(
+    first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]] | None = None
+) -> Refit:
+    """The nominal model with these effects, refitted from where they stand."""
+    try:
+        return run(job_of(first, here, placed, sizes or {}))
+    except HvdcIdentError as error:
+        return replace(here, failure=str(error))
+
+
+def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> Job:
+    """The refit of the nominal model with these effects; sizes: of some, by their place, instead of where they stand."""
+    model, free, again = first.model, list(first.problem.free), []
+    at = here.values
+    for k, p in enumerate(placed):
+        own = sizes.get(k) or {n: at.get(name, p.start[n]) for n, name in p.names.items()}
+        values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
+        named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
+        parameters: dict[str, float | str] = {**values, **named}
+        # What sat behind an effect that is left out sits where that one did.
+        at_slots = tuple(home(model.slots, place) for place in p.use.at)
+        source = home(model.slots, p.use.source) if p.use.source else ""
+        use = EffectUse(p.use.effect, at_slots, FrozenMap(parameters), source=source, expression=p.use.expression)
+        before = set(model.parameters)
+        model = model.with_effects([use])
+        new = [n for n in model.parameters if n not in before]
+        names = dict(zip(p.names, new, strict=True))
+        free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
+        moved = replace(p.candidate, at=at_slots, source=source)
+        again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
+    unsettled = any(effects()[p.use.effect].restless for p in placed)
+    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
+    nuisance = here.theta[len(here.problem.free) :]
+    gains = [at[f.name] for f in first.problem.free]
+    begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])
+    return Job(model, tuple(again), problem, (begin,), here.noise)
