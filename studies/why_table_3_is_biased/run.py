@@ -88,14 +88,20 @@ def causes(names: Sequence[str] = (), count: int = hypotheses.RUNS, executor: An
 
 
 def told_nothing(executor: Any = None) -> dict[str, Any]:
-    """The diagnoses by what was recorded, and Fig. 8 with what was named."""
+    """The diagnoses by what was recorded, with more noise too, and Fig. 8 with what was named."""
     found = {signals: diagnosed.diagnosis(signals, executor=executor) for signals in diagnosed.RECORDED}
-    return {"told nothing": found} | after(found)
+    louder = {
+        signals: {
+            f"{noise:g}": diagnosed.diagnosis(signals, noise=noise, executor=executor) for noise in diagnosed.LOUDER
+        }
+        for signals in diagnosed.RECORDED
+    }
+    return {"told nothing": found, "louder": louder} | after(found)
 
 
 def after(found: Mapping[str, Any]) -> dict[str, Any]:
-    """What the best of the first round does to the gains and to Fig. 8, by what was recorded."""
-    put_in = {signals: diagnosed.leading(told, signals) for signals, told in found.items()}
+    """What is said to be missing, or the best of the first round, does to the gains and to Fig. 8, by what was recorded."""
+    put_in = {signals: diagnosed.put_in(told, signals) for signals, told in found.items()}
     return {"put in": put_in, "figure 8": {s: diagnosed.figure_8(told) for s, told in put_in.items()}}
 
 

@@ -16,7 +16,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
     """The README's tables by name."""
     told = values["told nothing"]
     return {
-        "verdicts": _verdicts(told),
+        "verdicts": _verdicts(told, values["louder"]),
         "places": "\n\n".join(f"{signals}:\n\n{_places(t)}" for signals, t in told.items()),
         "gains": _gains(values["put in"]),
         "figure-8": _figure_8(values["figure 8"]),
@@ -25,20 +25,38 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _verdicts(told: Mapping[str, Any]) -> str:
-    head = ["recorded", "verdict", "put in", "as good", "gap held out: given, refitted, with it", "shrinks by, %"]
-    rows = [
-        [
-            signals,
-            t["verdict"],
-            diagnosing.effects_of(t),
-            str(sum(len(g) - 1 for g in t["ambiguity"])),
-            ", ".join(number(t["pooled"][m]["holdout"], 3) for m in ("nominal", "refitted", "augmented")),
-            number(None if t["shrink_holdout"] is None else 100 * t["shrink_holdout"], 3),
-        ]
-        for signals, t in told.items()
+def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
+    head = [
+        "recorded",
+        "noise, pu",
+        "verdict",
+        "said to be missing",
+        "delay of these, ms",
+        "as good",
+        "gap held out: given, refitted, with it",
+        "shrinks by, %",
     ]
+    rows = []
+    for signals, t in told.items():
+        for noise, found in {f"{diagnosed.NOISE:g}": t, **louder[signals]}.items():
+            delay = diagnosed.delay([_plain(e) for e in found["effects"]])
+            rows.append(
+                [
+                    signals,
+                    noise,
+                    found["verdict"],
+                    diagnosing.effects_of(found),
+                    number(1e3 * delay, 3) if found["effects"] else "-",
+                    str(sum(len(g) - 1 for g in found["ambiguity"])),
+                    ", ".join(number(found["pooled"][m]["holdout"], 3) for m in ("nominal", "refitted", "augmented")),
+                    number(None if found["shrink_holdout"] is None else 100 * found["shrink_holdout"], 3),
+                ]
+            )
     return markdown(head, rows)
+
+
+def _plain(effect: Mapping[str, Any]) -> dict[str, Any]:
+    return {**effect, "parameters": {n: s["value"] for n, s in effect["parameters"].items()}}
 
 
 def _places(t: Mapping[str, Any]) -> str:
