@@ -60,7 +60,9 @@ def recentred(experiment: Experiment, blocks: Sequence[Block], states: Sequence[
     size = np.where(at != 0.0, np.abs(at), 1.0)
     columns = np.vstack([b.jacobian[:, : len(states)] for b in blocks]) * size
     residual = np.concatenate([b.residual for b in blocks])
-    step = np.linalg.solve(columns.T @ columns + np.eye(len(states)), -columns.T @ residual)
+    # Stacked, not squared: of columns that are alike and large, the prior would be lost in rounding.
+    whole, wanted = np.vstack([columns, np.eye(len(states))]), np.append(-residual, np.zeros(len(states)))
+    step = np.linalg.lstsq(whole, wanted)[0]
     moved = {n: float(v) for n, v in zip(states, at + size * step, strict=True)}
     return experiment.with_(starts=experiment.starts | moved)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -9,6 +11,7 @@ from scipy.optimize import least_squares
 from hvdc_ident import Model, simulate
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit.unsettled import recentred
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import trajectory
@@ -77,3 +80,13 @@ def test_a_start_that_is_given_or_estimated_is_not_eliminated():
     np.testing.assert_array_equal(base.with_(experiments=known).residual(theta)[0], plain.residual(theta)[0])
     half = base.with_(experiments=[e.with_(nuisance=("v",)) for e in base.experiments])
     assert [b.taken for b in half.blocks(np.array([4.1, 0.9, 0.0, 0.0]))] == [1, 0, 1, 0]
+
+
+def test_starts_that_the_records_show_alike_and_strongly_are_shared_between_them():
+    column = 1e12 * np.linspace(1.0, 2.0, 20)
+    jacobian = np.column_stack([column, column])
+    block = SimpleNamespace(jacobian=jacobian, residual=-jacobian @ [0.5, 0.5])
+    e = experiment("e", np.array([0.0, 1.0])).with_(starts=FrozenMap({"a": 1.0, "b": 1.0}))
+    moved = recentred(e, [block], ("a", "b"))
+    assert moved.starts["a"] == pytest.approx(1.5)
+    assert moved.starts["b"] == pytest.approx(1.5)
