@@ -14,8 +14,10 @@ import numpy as np
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run
 from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, scanned
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
+from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
@@ -26,37 +28,77 @@ WIDTH = 3.0
 SIZES = 120
 TEETH = 4
 """Sizes, each the best among its neighbours, from which is refitted: the cost over a period is a saw."""
+CLOSE = 1.3
+"""The same as WIDTH for the closest look."""
+PHASE = 0.2
+"""Of a step or period: by how much the last one of a record moves from one size of the closest look to the next."""
+MOST = 1500
+PATIENT = replace(QUICK, max_steps=5000)
+"""A record that never rests crosses hundreds of levels."""
 BETTER = 0.02
 """Share by which chi2 has to fall for another hop."""
 
 
 def hop(job: Job) -> Found:
-    """What a refit comes to that looks for its last effect's size again, as long as that helps."""
+    """What a refit comes to that looks for its last effect's size again, as long as that helps, and once very closely."""
     here = run(job)
+    if here.failure:
+        return found_by(here)
     for _ in range(HOPS):
-        ends = [] if here.failure else [run(replace(job, begins=(begin,))) for begin in _begins(here)]
-        there = min((r for r in ends if not r.failure), key=lambda r: r.chi2, default=here)
+        there = _from(job, here, _around(here))
         if not there.chi2 < (1.0 - BETTER) * here.chi2:
             break
         here = there
-    return found_by(here)
+    return found_by(_from(job, here, _closely(here)))
 
 
-def _begins(here: Refit) -> list[Array]:
-    """Unknowns with the best sizes around."""
+def _from(job: Job, here: Refit, grid: Array) -> Refit:
+    """The best refit from the best sizes of a grid, or the one there is."""
+    ends = [run(replace(job, begins=(begin,))) for begin in _begins(here, grid)]
+    return min((r for r in [here, *ends] if not r.failure), key=lambda r: r.chi2)
+
+
+def _around(here: Refit) -> Array:
+    _, own, low, high = _size(here)
+    return np.geomspace(max(low, own / WIDTH), min(high, own * WIDTH), SIZES)
+
+
+def _closely(here: Refit) -> Array:
+    """Sizes around the one there is, so close that no tooth lies between: a record holds many steps or periods."""
+    _, own, low, high = _size(here)
+    count = int(np.clip((CLOSE - 1.0 / CLOSE) * _held(here) / own / PHASE, SIZES, MOST))
+    return 1.0 / np.linspace(1.0 / min(high, own * CLOSE), 1.0 / max(low, own / CLOSE), count)
+
+
+def _size(here: Refit) -> tuple[int, float, float, float]:
+    """Of the size that has to be met: its place among the unknowns, its value, its bounds."""
     placed = here.placed[-1]
     name = scanned(placed.candidate)
     at = here.problem.names.index(placed.names[name])
-    low, high = placed.bounds[name]
-    own = float(here.theta[at])
+    return at, float(here.theta[at]), *placed.bounds[name]
+
+
+def _held(here: Refit) -> float:
+    """What is counted in sizes: the time a record takes where they are periods, else how far the slot's signal reaches."""
+    placed = here.placed[-1]
+    fitted = here.problem.fitted_experiments
+    if effects()[placed.candidate.effect].parameters[scanned(placed.candidate)].unit == "s":
+        return max(float(e.time[-1] - e.time[0]) for e in fitted)
+    place = placed.use.at[0].removeprefix("outputs.")
+    runs = [simulate(here.model, e.with_(measured=None), here.values, outputs=[place]) for e in fitted]
+    return max(float(np.abs(r[place]).max()) for r in runs)
+
+
+def _begins(here: Refit, grid: Array) -> list[Array]:
+    """Unknowns with the best sizes of a grid, those the refit has and those that were given."""
+    at = _size(here)[0]
     left = _Left.of(here, at)
-    grid = np.geomspace(max(low, own / WIDTH), min(high, own * WIDTH), SIZES)
     rough = np.array([left(s) for s in grid])
     padded = np.concatenate([[np.inf], rough, [np.inf]])
     teeth = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
     begins, given = [], as_given(here)
     for k in teeth[:TEETH]:
-        beside = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, SIZES - 1)], 2 * BETWEEN + 1)
+        beside = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)], 2 * BETWEEN + 1)
         size = min(beside, key=left)
         for theta in (here.theta, given):
             if theta is not None:
@@ -76,7 +118,7 @@ class _Left:
 
     @classmethod
     def of(cls, refit: Refit, at: int) -> _Left:
-        quick = replace(refit.problem, simulator=ModelSimulator(refit.model, QUICK))
+        quick = replace(refit.problem, simulator=ModelSimulator(refit.model, PATIENT))
         return cls(refit, at, quick, _others(refit, at))
 
     def __call__(self, size: float) -> float:

@@ -24,9 +24,7 @@ OTHERS = 6
 """Rivals of each effect in its own round that are tried again once the other effects are in."""
 
 
-def settled(
-    search: Search, first: Refit, here: Refit, kept: Sequence[Round], number: int
-) -> tuple[Refit, list[Round]]:
+def settled(search: Search, first: Refit, here: Refit, kept: Sequence[Round], number: int) -> tuple[Refit, list[Round]]:
     """The refit, and by effect the round that judges its rivals, after looking for each again and doing without it.
 
     here: the refit of the model `first` with several effects; kept: the rounds that brought them; number: rounds so far.
