@@ -55,9 +55,11 @@ def _main(module: str, path: str) -> None:
         said = {"what": error.what, "expected": error.expected, "got": error.got, "hint": error.hint}
         out.write(json.dumps(said).encode() + b"\n")
         return
-    out.write(json.dumps({"names": found.names, "units": found.units}).encode() + b"\n")
-    np.save(out, found.time, allow_pickle=False)
-    np.save(out, found.values, allow_pickle=False)
+    told = io.BytesIO()  # numpy writes to a buffered file by its position, and a pipe has none
+    told.write(json.dumps({"names": found.names, "units": found.units}).encode() + b"\n")
+    np.save(told, found.time, allow_pickle=False)
+    np.save(told, found.values, allow_pickle=False)
+    out.write(told.getbuffer())
 
 
 if __name__ == "__main__":
