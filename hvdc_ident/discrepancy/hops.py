@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.discrepancy.jobs import as_given
-from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run
+from hvdc_ident.discrepancy.nominal import orthonormal
+from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run, signal
 from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, scanned
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
-from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
@@ -49,7 +49,10 @@ def hop(job: Job) -> Found:
         if not there.chi2 < (1.0 - BETTER) * here.chi2:
             break
         here = there
-    return found_by(_from(job, here, _closely(here)))
+    try:
+        return found_by(_from(job, here, _closely(here)))
+    except SimulationError:  # the refit runs, the slot's signal by itself does not: how close is close is not known
+        return found_by(here)
 
 
 def _from(job: Job, here: Refit, grid: Array) -> Refit:
@@ -79,14 +82,14 @@ def _size(here: Refit) -> tuple[int, float, float, float]:
 
 
 def _held(here: Refit) -> float:
-    """What is counted in sizes: the time a record takes where they are periods, else how far the slot's signal reaches."""
+    """What is counted in sizes: the time a record takes where they are periods, else how far the slot's signal reaches.
+
+    Raises SimulationError where that signal cannot be had.
+    """
     placed = here.placed[-1]
-    fitted = here.problem.fitted_experiments
     if effects()[placed.candidate.effect].parameters[scanned(placed.candidate)].unit == "s":
-        return max(float(e.time[-1] - e.time[0]) for e in fitted)
-    place = placed.use.at[0].removeprefix("outputs.")
-    runs = [simulate(here.model, e.with_(measured=None), here.values, outputs=[place]) for e in fitted]
-    return max(float(np.abs(r[place]).max()) for r in runs)
+        return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
+    return max(float(np.abs(u).max()) for u in signal(here, placed.use.at[0]).values())
 
 
 def _begins(here: Refit, grid: Array) -> list[Array]:
@@ -109,7 +112,10 @@ def _begins(here: Refit, grid: Array) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Left:
-    """chi2 by the size of the last effect, with what the other unknowns can make good taken out to first order."""
+    """chi2 by the size of the last effect, with what the other unknowns can make good taken out to first order.
+
+    others: (N, k) orthonormal, what they can.
+    """
 
     refit: Refit
     at: int
@@ -119,7 +125,8 @@ class _Left:
     @classmethod
     def of(cls, refit: Refit, at: int) -> _Left:
         quick = replace(refit.problem, simulator=ModelSimulator(refit.model, PATIENT))
-        return cls(refit, at, quick, _others(refit, at))
+        jacobian = np.vstack([b.jacobian for b in refit.problem.blocks(refit.theta)])
+        return cls(refit, at, quick, orthonormal(np.delete(jacobian, at, axis=1)))
 
     def __call__(self, size: float) -> float:
         """Infinite for a size that could not be run."""
@@ -130,11 +137,3 @@ class _Left:
         except SimulationError:
             return np.inf
         return float(r @ r - np.sum((self.others.T @ r) ** 2))
-
-
-def _others(refit: Refit, at: int) -> Array:
-    """(N, k) orthonormal: what all unknowns but one can make of the residual, to first order."""
-    jacobian = np.delete(np.vstack([b.jacobian for b in refit.problem.blocks(refit.theta)]), at, axis=1)
-    norms = np.linalg.norm(jacobian, axis=0)
-    u, s, _ = np.linalg.svd(jacobian[:, norms > 0] / norms[norms > 0], full_matrices=False)
-    return np.asarray(u[:, s > 1e-7 * s.max(initial=0.0)])

@@ -61,7 +61,7 @@ class Nominal:
             columns = np.hstack([columns, self.extra])
         if self.problem.unsettled:
             columns = np.hstack([columns, self.problem.starts(self.theta)])
-        return _orthonormal(columns)
+        return orthonormal(columns)
 
     @cached_property
     def starts(self) -> Array:
@@ -69,7 +69,7 @@ class Nominal:
         if self.problem.unsettled:
             return np.zeros((self.residual.size, 0))
         left = self.projected(_unit(self.problem.starts(self.theta)))
-        return _orthonormal(left[:, np.linalg.norm(left, axis=0) > 1e-6])
+        return orthonormal(left[:, np.linalg.norm(left, axis=0) > 1e-6])
 
     @property
     def values(self) -> dict[str, float]:
@@ -97,7 +97,8 @@ def _unit(columns: Array) -> Array:
     return np.asarray(columns[:, norms > 0] / norms[norms > 0])
 
 
-def _orthonormal(columns: Array) -> Array:
+def orthonormal(columns: Array) -> Array:
+    """(N, k) an orthonormal basis of what the columns, each as long as the others, span beyond rounding."""
     unit = _unit(columns)
     if not unit.shape[1]:
         return unit

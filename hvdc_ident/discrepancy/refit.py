@@ -20,6 +20,7 @@ from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
+from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
@@ -349,6 +350,13 @@ def press(blocks: Sequence[Block], parts: int = 4) -> float | None:
         total, rows = total + float(predicted @ predicted), rows + r.size
     spare = sum(b.spare * b.residual.size for b in blocks)
     return float(np.sqrt((total + spare) / rows)) if rows else None
+
+
+def signal(refit: Refit, place: str) -> dict[str, Array]:
+    """The signal at a place of the model as refitted, by fitted experiment. Raises SimulationError where it cannot be run."""
+    name = place.removeprefix("outputs.")
+    runs = {e.name: e.with_(measured=None) for e in refit.problem.fitted_experiments}
+    return {n: np.asarray(simulate(refit.model, e, refit.values, outputs=[name])[name]) for n, e in runs.items()}
 
 
 def unseen(refit: Refit) -> float | None:

@@ -31,6 +31,7 @@ LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
 WIDER = 80
 """Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
+RACE = Race()
 HEAT = Race(sprint=5, reach=0.4)
 """Of those many a short sprint."""
 REFIT_SCORE = 0.5
@@ -118,17 +119,14 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         nominal, found, paths, bootstraps=options.bootstraps, seed=search.seed + number,
         executor=search.executor,
     )  # fmt: skip
+    opened = Round(before, paths, found, scores, (), (), {}, None, "", False, None)
     picks = best_of(scores, found)
-
-    def nothing(why: str, significant: bool = False) -> Round:
-        return Round(before, paths, found, scores, (), (), {}, None, why, significant, None)
-
     if not picks:
-        return nothing("no candidate leaves a trace in these data")
+        return replace(opened, why="no candidate leaves a trace in these data")
     p = scores.p(picks[0].score)
     if p > options.significance:
-        return nothing(f"the best score of all is what noise gives (p = {p:.2g})")
-    return _refitted(search, before, nominal, number, paths, found, scores, picks)
+        return replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
+    return _refitted(search, replace(opened, significant=True), nominal, number, picks)
 
 
 def excess(refit: Refit) -> bool:
@@ -136,20 +134,13 @@ def excess(refit: Refit) -> bool:
     return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))
 
 
-def _scanned(
-    search: Search,
-    before: Refit,
-    nominal: Nominal,
-    number: int,
-    paths: Mapping[str, Path],
-    found: tuple[Candidate, ...],
-    scores: Scores,
-) -> tuple[tuple[Candidate, ...], Scores, tuple[Pick, ...]]:
-    """Candidates and scores with the sizes that a closer look found, and the picks to refit for them."""
+def _scanned(search: Search, opened: Round, nominal: Nominal, number: int) -> tuple[Round, tuple[Pick, ...]]:
+    """The round with the sizes that a closer look found, and the picks to refit for them."""
+    before, found, options = opened.before, opened.candidates, search.options
     dense = candidates(
         before.model,
-        slot_signals(paths),
-        [a.time for a in paths.values()],
+        slot_signals(opened.paths),
+        [a.time for a in opened.paths.values()],
         search.effects,
         search.places,
         closer=True,
@@ -157,17 +148,17 @@ def _scanned(
     known = {(c.effect, c.at): k for k, c in enumerate(found)}
     dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(before, c))
     if not dense:
-        return found, scores, ()
+        return opened, ()
     text = f"round {number}: a closer look at {', '.join(dict.fromkeys(c.effect for c in dense))}"
     seen = scan(
-        before, nominal, dense, search.options.bootstraps, search.seed + number, search.executor, search.progress, text
+        before, nominal, dense, options.bootstraps, search.seed + number, search.executor, search.progress, text
     )
     found = joined(found, [s.candidate for s in seen.spots])
     at = [known[s.candidate.effect, s.candidate.at] for s in seen.spots]
     columns = tuple(Column(k, len(found[k].probes) - 1) for k in at)
-    scores = scores.joined(replace(seen.scores, columns=columns, beside=seen.largest))
+    scores = opened.scores.joined(replace(seen.scores, columns=columns, beside=seen.largest))
     picks = [Pick(c.candidate, c.probe, 1.0, s.score) for c, s in zip(columns, seen.spots, strict=True)]
-    return found, scores, tuple(picks)
+    return replace(opened, candidates=found, scores=scores), tuple(picks)
 
 
 def _worth_a_scan(before: Refit, candidate: Candidate) -> bool:
@@ -178,38 +169,30 @@ def _worth_a_scan(before: Refit, candidate: Candidate) -> bool:
     return memory or kind_of(before.model, candidate.at[0]) != "state"
 
 
-def _refitted(
-    search: Search,
-    before: Refit,
-    nominal: Nominal,
-    number: int,
-    paths: Mapping[str, Path],
-    found: tuple[Candidate, ...],
-    scores: Scores,
-    picks: tuple[Pick, ...],
-) -> Round:
-    options = search.options
+def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, picks: tuple[Pick, ...]) -> Round:
+    options, before, found, scores = search.options, opened.before, opened.candidates, opened.scores
     threshold = scores.threshold(0.5)  # what noise reaches every other time is not worth a look
     looked = [p for p in picks[:LOOKED_AT] if p.score > threshold]
-    rows = signature_rows(nominal, found, paths, [Column(p.candidate, p.probe) for p in looked])
+    rows = signature_rows(nominal, found, opened.paths, [Column(p.candidate, p.probe) for p in looked])
     chosen, same = shortlist(looked, found, rows, options)
-    trials = _trials(search, before, found, chosen, f"round {number}: refits")
+    opened = replace(opened, same=same)
+    trials = _trials(search, opened, chosen, f"round {number}: refits")
     tried = [t.pick.candidate for t in trials] + [p.candidate for twins in same.values() for p in twins]
     sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2 + 8.0 * t.refit.count)
     best = [found[t.pick.candidate] for t in sound[:2]]
     more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
-    trials += _trials(search, before, found, more, f"round {number}: refits beside the best", trials)
+    trials += _trials(search, opened, more, f"round {number}: refits beside the best", trials)
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1 and _far(before, trials):
         tried += [t.pick.candidate for t in trials]
         wide = others(picks, scores, found, tried, WIDER)
-        trials += _trials(search, before, found, wide, f"round {number}: the other candidates", trials, HEAT)
+        trials += _trials(search, opened, wide, f"round {number}: the other candidates", trials, HEAT)
     if number == 1 and _far(before, trials):
-        found, scores, extra = _scanned(search, before, nominal, number, paths, found, scores)
-        trials += _trials(search, before, found, extra, f"round {number}: refits of the closer look")
+        opened, extra = _scanned(search, opened, nominal, number)
+        trials += _trials(search, opened, extra, f"round {number}: refits of the closer look")
     if number == 1 and _far(before, trials):
-        trials = _again(search, found, trials, f"round {number}: once more")
-    return closed(search, Round(before, paths, found, scores, (), (), same, None, "", True, None), trials, number)
+        trials = _again(search, opened.candidates, trials, f"round {number}: once more")
+    return closed(search, opened, trials, number)
 
 
 def _far(before: Refit, trials: Sequence[Trial]) -> bool:
@@ -279,15 +262,10 @@ def _again(search: Search, found: Sequence[Candidate], trials: Sequence[Trial], 
 
 
 def _trials(
-    search: Search,
-    before: Refit,
-    found: Sequence[Candidate],
-    picks: Sequence[Pick],
-    text: str,
-    earlier: Sequence[Trial] = (),
-    race: Race = Race(),  # noqa: B008 - frozen
+    search: Search, opened: Round, picks: Sequence[Pick], text: str, earlier: Sequence[Trial] = (), race: Race = RACE
 ) -> list[Trial]:
     """The picks refitted, in a race with each other and with those refitted earlier."""
+    before, found = opened.before, opened.candidates
     jobs, of, trials = [], [], []
     for p in picks:
         try:

@@ -79,7 +79,7 @@ def _looked_again(
     sound += [Trial(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
     mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
     sound.append(mine_again[0] if mine_again else Trial(_pick(again, mine), _last(here, k), 0.0))
-    ranked = closed(search, replace(again, winner=None, why="", significant=True), sound, number)
+    ranked = closed(search, again, sound, number)
     winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
     return replace(ranked, winner=winner), winner
 
@@ -114,12 +114,10 @@ def _ordered(refit: Refit, order: Sequence[int]) -> Refit:
     return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))
 
 
-def _again(
-    first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]] | None = None
-) -> Refit:
+def _again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
     """The nominal model with these effects, refitted from where they stand."""
     try:
-        return run(job_of(first, here, placed, sizes or {}))
+        return run(job_of(first, here, placed, {}))
     except HvdcIdentError as error:
         return replace(here, failure=str(error))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,14 +13,13 @@ from hvdc_ident.discrepancy.adequacy import Binned, adequacy
 from hvdc_ident.discrepancy.ambiguity import rivals
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.objections import silent, worst
-from hvdc_ident.discrepancy.refit import Refit, unseen
+from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.result import Verdict
 from hvdc_ident.discrepancy.rounds import Search
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import material_gap
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.simulate import simulate
 from hvdc_ident.trajectory import Array
 from hvdc_ident.waveform import event_time
 
@@ -58,8 +58,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             tests,
         )
     was, now = unseen(first), unseen(last)
-    gap_there = was is not None and now is not None and was > (1.0 + options.holdout_share) * np.sqrt(floor)
-    if was is not None and now is not None and gap_there and not silent(first, last):
+    least = (1.0 + options.holdout_share) * np.sqrt(floor)
+    if was is not None and now is not None and was > least and not silent(first, last):
         told = (was**2 - now**2) / (was**2 - floor)
         if told < DOMINANT:
             return Judgement(
@@ -135,17 +135,8 @@ def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned
 
 def _signals(last: Refit) -> dict[str, dict[str, Array]]:
     """The signal at the slots of each effect that was put in, at the rows of every fitted experiment."""
-    places = list(dict.fromkeys(p for placed in last.placed for p in placed.candidate.at))
     found: dict[str, dict[str, Array]] = {}
-    for place in places:
-        name = place.removeprefix("outputs.")
-        by_experiment = {}
-        for e in last.problem.fitted_experiments:
-            try:
-                run = simulate(last.model, e.with_(measured=None), last.values, outputs=[name])
-            except SimulationError:
-                break
-            by_experiment[e.name] = np.asarray(run[name])
-        else:
-            found[place] = by_experiment
+    for place in dict.fromkeys(p for placed in last.placed for p in placed.candidate.at):
+        with suppress(SimulationError):  # a place whose signal cannot be had bounds no region
+            found[place] = signal(last, place)
     return found

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from cases import FREE, experiments, model
+from cases import experiments
+from refits import beside, plain
 
-from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
+from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import Search
-from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
@@ -22,14 +22,12 @@ SEARCH = Search("all", None, FrozenMap(), Options(), 0)
 @pytest.fixture(scope="module")
 def before() -> Refit:
     """The drive without the lag of 30 ms that its records have."""
-    start, _ = nominal(ModelSimulator(model()), experiments(lag=0.03), FREE, {}, None, starts=1, seed=0, executor=None)
-    return judged(Refit(model(), (), start.problem, start.noise, start.theta))
+    return plain(experiments(lag=0.03))
 
 
 def job(before: Refit, effect: str, at: str, size: float, begins: int = 1) -> Job:
-    probe = Probe(effect, FrozenMap({"T": size}), FrozenMap({"T": (1e-4, 1.0)}))
-    larger, problem, placed, start = added(before.model, before.problem, Candidate(effect, (at,), (probe,)), 0, 1.0)
-    return Job(larger, (placed,), problem, (np.concatenate([before.theta, start]),) * begins, before.noise)
+    one = beside(before, effect, at, {"T": size}, {"T": (1e-4, 1.0)})
+    return replace(one, begins=one.begins * begins)
 
 
 def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(

@@ -4,45 +4,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from cases import FREE, experiments, model
+from cases import experiments
+from refits import beside, plain
 
-from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
+from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.rounds import Search, one_round
 from hvdc_ident.discrepancy.select import Trial, clear
 from hvdc_ident.discrepancy.settle import _last, job_of, settled
-from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.transform import home
-from hvdc_ident.simulate.model_simulator import ModelSimulator
-
-
-def beside(
-    before: Refit, effect: str, at: str, values: dict[str, float], bounds: dict[str, tuple[float, float]]
-) -> Refit:
-    """The refit with one more effect."""
-    probe = Probe(effect, FrozenMap(values), FrozenMap(bounds))
-    larger, problem, placed, start = added(before.model, before.problem, Candidate(effect, (at,), (probe,)), 0, 1.0)
-    job = Job(larger, (*before.placed, placed), problem, (np.concatenate([before.theta, start]),), before.noise)
-    return run(job)
 
 
 @pytest.fixture(scope="module")
 def first() -> Refit:
     """The drive, refitted to records of a drive whose controller sees a lagged speed."""
-    start, _ = nominal(ModelSimulator(model()), experiments(lag=0.03), FREE, {}, None, starts=1, seed=0, executor=None)
-    return judged(Refit(model(), (), start.problem, start.noise, start.theta))
+    return plain(experiments(lag=0.03))
 
 
 @pytest.fixture(scope="module")
 def both(first: Refit) -> Refit:
     """A gain of the set-point, which is not there, and behind it a lag."""
-    one = beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)})
-    two = beside(one, "lag", "ref_after_gain", {"T": 0.02}, {"T": (1e-4, 0.3)})
+    one = run(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
+    two = run(beside(one, "lag", "ref_after_gain", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     assert not two.failure
     return two
 
@@ -51,13 +36,13 @@ def test_an_effect_that_sits_behind_another_stays_where_that_was_when_it_goes(fi
     alone = run(job_of(first, both, both.placed[1:], {}))
     assert not alone.failure
     assert alone.placed[0].candidate.at == ("ref",)
-    direct = beside(first, "lag", "ref", {"T": 0.02}, {"T": (1e-4, 0.3)})
+    direct = run(beside(first, "lag", "ref", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     assert alone.chi2 == pytest.approx(direct.chi2, rel=1e-6)
 
 
 def test_what_is_not_there_is_not_clear_and_what_is_told_last_takes_its_evidence_along(first: Refit) -> None:
-    one = beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)})
-    both = beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)})
+    one = run(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
+    both = run(beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     assert [clear(both, k) for k in range(2)] == [False, True]
     turned = _last(both, 0)
     assert [p.candidate.effect for p in turned.placed] == ["lag", "gain"]
@@ -65,8 +50,8 @@ def test_what_is_not_there_is_not_clear_and_what_is_told_last_takes_its_evidence
 
 
 def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit) -> None:
-    one = beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)})
-    both = beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)})
+    one = run(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
+    both = run(beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
     begun = one_round(search, first, 1)
     rounds = tuple(replace(begun, winner=Trial(begun.trials[0].pick, r, 100.0), trials=()) for r in (one, both))

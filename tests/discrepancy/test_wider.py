@@ -2,47 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, experiments, model
+from refits import beside, plain
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import as_given
-from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
+from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.select import clear
-from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
 PERIOD = 0.033
 WINDOW = 0.05
 
 
-def plain(records: tuple[Experiment, ...]) -> Refit:
-    """The drive without any effect, refitted to the records."""
-    start, _ = nominal(ModelSimulator(model()), records, FREE, {}, None, starts=1, seed=0, executor=None)
-    return judged(Refit(model(), (), start.problem, start.noise, start.theta))
-
-
 def beginning(before: Refit, effect: str, at: str, values: dict[str, float]) -> Job:
     """The refit of the drive with one effect, from a size."""
-    probe = Probe(
-        effect, FrozenMap(values), FrozenMap(dict.fromkeys((n for n in values if n != "compute"), (1e-3, 0.3)))
-    )
-    larger, problem, placed, start = added(before.model, before.problem, Candidate(effect, (at,), (probe,)), 0, 1.0)
-    return Job(larger, (placed,), problem, (np.concatenate([before.theta, start]),), before.noise)
+    return beside(before, effect, at, values, dict.fromkeys((n for n in values if n != "compute"), (1e-3, 0.3)))
 
 
-def records(course: object) -> tuple[Experiment, ...]:
+def records(course: Callable[[dict[str, InputSignal]], Array]) -> tuple[Experiment, ...]:
     """What `course` (inputs to (n, 2) speed and torque) makes of the three runs, with white noise."""
     random = np.random.default_rng(0)
     found = []
@@ -55,12 +43,17 @@ def records(course: object) -> tuple[Experiment, ...]:
                 points += [(t, level), (t, level + change)]
                 level += change
             inputs[n] = InputSignal.corners(points)
-        y = course(inputs) + random.standard_normal((TIME.size, 2)) * list(SIGMA.values())  # type: ignore[operator]
-        measured = Trajectory(TIME, y, tuple(SIGMA), ("", ""))
+        measured = noisy(course(inputs), random)
         found.append(
             Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
         )
     return tuple(found)
+
+
+def noisy(y: Array, random: np.random.Generator) -> Trajectory:
+    """The course of speed and torque as it is recorded."""
+    seen = y + random.standard_normal(y.shape) * list(SIGMA.values())
+    return Trajectory(TIME, seen, tuple(SIGMA), ("", ""))
 
 
 def sampled(inputs: dict[str, InputSignal]) -> Array:
@@ -146,16 +139,10 @@ def test_of_two_that_explain_the_fitted_steps_alike_the_held_out_one_decides() -
     """Behind one step a moving mean and a rate limit are the same ramp; behind a step of another size they are not."""
     few = tuple(e for e in records(ramped) if e.name != "fit-2")
     short = few[0].with_(inputs=FrozenMap({"ref": InputSignal.step(EVENT, 1.0, 1.6)}))
-    few = (short.with_(measured=_again(short)), few[1])
+    few = (short.with_(measured=noisy(ramped(dict(short.inputs)), np.random.default_rng(1))), few[1])
     found = diagnose(model(), few, FREE, effects=["rate-limit", "window-mean"], places=["ref"], seed=0,
                      options=Options(fallback=False))  # fmt: skip
     assert found.verdict in ("named", "ambiguous")
     best = found.effects[0]
     assert best.effect == "window-mean"
     assert best.parameters["T"].value == pytest.approx(WINDOW, rel=0.03)
-
-
-def _again(e: Experiment) -> Trajectory:
-    random = np.random.default_rng(1)
-    y = ramped(dict(e.inputs)) + random.standard_normal((TIME.size, 2)) * list(SIGMA.values())
-    return Trajectory(TIME, y, tuple(SIGMA), ("", ""))

@@ -77,8 +77,7 @@ def diagnosis(signals: str, *, noise: float = NOISE, executor: Any = None) -> di
 def put_in(told: Mapping[str, Any], signals: str) -> dict[str, Any]:
     """What is said to be missing, or else the best of the first round: its sizes, and the gains refitted with it."""
     if told["effects"]:
-        effects = [{**e, "parameters": {n: s["value"] for n, s in e["parameters"].items()}} for e in told["effects"]]
-        return {"effects": effects} | {k: dict(told[k]) for k in ("refitted", "augmented")}
+        return {"effects": sized(told)} | {k: dict(told[k]) for k in ("refitted", "augmented")}
     best, plain = told["first round"][0], link()
     brought = {"from": best["from"]} if best["from"] else {}
     model = plain.with_effects(
@@ -95,6 +94,11 @@ def put_in(told: Mapping[str, Any], signals: str) -> dict[str, Any]:
         "refitted": dict(told["refitted"]),
         "augmented": {n: result.values[n] for n in FREE},
     }
+
+
+def sized(told: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The effects that are said to be missing, of their parameters the values alone."""
+    return [{**e, "parameters": {n: s["value"] for n, s in e["parameters"].items()}} for e in told["effects"]]
 
 
 def delay(effects: Sequence[Mapping[str, Any]]) -> float:

@@ -39,7 +39,7 @@ def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
     rows = []
     for signals, t in told.items():
         for noise, found in {f"{diagnosed.NOISE:g}": t, **louder[signals]}.items():
-            delay = diagnosed.delay([_plain(e) for e in found["effects"]])
+            delay = diagnosed.delay(diagnosed.sized(found))
             rows.append(
                 [
                     signals,
@@ -53,10 +53,6 @@ def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
                 ]
             )
     return markdown(head, rows)
-
-
-def _plain(effect: Mapping[str, Any]) -> dict[str, Any]:
-    return {**effect, "parameters": {n: s["value"] for n, s in effect["parameters"].items()}}
 
 
 def _places(t: Mapping[str, Any]) -> str:

@@ -1,0 +1,32 @@
+"""Refits of the small drive of `cases`, to begin tests of the search from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from cases import FREE, model
+
+from hvdc_ident import Experiment
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.nominal import nominal
+from hvdc_ident.discrepancy.refit import Job, Refit, added, judged
+from hvdc_ident.effects import Probe
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+
+
+def plain(records: Sequence[Experiment]) -> Refit:
+    """The drive without any effect, refitted to the records."""
+    start, _ = nominal(ModelSimulator(model()), records, FREE, {}, None, starts=1, seed=0, executor=None)
+    return judged(Refit(model(), (), start.problem, start.noise, start.theta))
+
+
+def beside(
+    before: Refit, effect: str, at: str, values: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> Job:
+    """The refit of a model with one more effect, from a size; what has no bounds stays."""
+    probe = Probe(effect, FrozenMap(values), FrozenMap(bounds))
+    larger, problem, placed, start = added(before.model, before.problem, Candidate(effect, (at,), (probe,)), 0, 1.0)
+    begin = np.concatenate([before.theta, start])
+    return Job(larger, (*before.placed, placed), problem, (begin,), before.noise)
