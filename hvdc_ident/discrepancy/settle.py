@@ -79,7 +79,7 @@ def _looked_again(
     sound += [Trial(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
     mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
     sound.append(mine_again[0] if mine_again else Trial(_pick(again, mine), _last(here, k), 0.0))
-    ranked = closed(search, again, sound, number)
+    ranked = closed(search, again, [*sound, *again.failed], number)
     winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
     return replace(ranked, winner=winner), winner
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from cases import experiments
 from refits import beside, plain
 
+from hvdc_ident.discrepancy import settle
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.rounds import Search, one_round
@@ -58,6 +60,16 @@ def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit
     here, kept = settled(search, first, both, rounds, 2)
     assert [p.candidate.label for p in here.placed] == ["lag at wm"]
     assert [k.winner.refit.placed[-1].candidate.label for k in kept if k.winner] == ["lag at wm"]
+
+
+def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
+    lagged = run(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
+    search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
+    begun = one_round(search, first, 1)
+    lost = Trial(begun.trials[-1].pick, replace(begun.trials[-1].refit, failure="it does not run"), -np.inf)
+    monkeypatch.setattr(settle, "one_round", lambda *_: replace(begun, trials=begun.trials[:-1], failed=(lost,)))
+    _, kept = settled(search, first, lagged, [replace(begun, winner=begun.trials[0], trials=())], 1)
+    assert kept[0].failed == (lost,)
 
 
 @pytest.mark.parametrize(
