@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import csv_text, dymola_mat, list_signals, read_waveforms
+from tests.effort import calls
 
 CSV = "time,a,b\n" + "".join(f"{i / 1000!r},{i % 7},{i * 0.5!r}\n" for i in range(1000))
 LINES = CSV.splitlines()
@@ -173,11 +173,13 @@ def test_every_cut_of_a_result_file_is_refused(tmp_path: Path) -> None:
 
 
 def refused(path: Path) -> None:
-    start = time.perf_counter()
-    with pytest.raises(WaveformError) as caught:
-        read_waveforms(path)
-    assert time.perf_counter() - start < 5
-    message = str(caught.value)
+    def said() -> str:
+        with pytest.raises(WaveformError) as caught:
+            read_waveforms(path)
+        return str(caught.value)
+
+    assert calls(said) < 1_000_000
+    message = said()
     assert str(path) in message
     assert len(message) < 2000
     assert message.isprintable()

@@ -13,6 +13,7 @@ from hvdc_ident.linearize.system import system
 from hvdc_ident.model.definition import Algebraic, Model, Output, Signal, State
 from hvdc_ident.models import load_model, shipped_models
 from hvdc_ident.parameters import Input, Parameter
+from tests.effort import calls
 
 DELAYED = [
     {"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}},
@@ -103,19 +104,12 @@ def test_total_derivatives_by_parameters(effects):
             assert np.abs(got - want).max() < 1e-9 * size + 1e-7 * np.abs(want).max(), (name, key)
 
 
-def test_speed_of_linearising_again():
-    """The link in under 2 ms after compilation (here a generous multiple of it, for a busy machine)."""
-    from time import perf_counter
-
+def test_linearising_again_is_arithmetic():
+    """Nothing is derived or compiled again: what is left is numbers (under 2 ms for the link, `benchmarks/linearize.py`)."""
     model = load_model("vsc-hvdc-link")
     point = find_operating_point(model)
     linearize(model, point)
-    times = []
-    for _ in range(50):
-        start = perf_counter()
-        linearize(model, point)
-        times.append(perf_counter() - start)
-    assert min(times) < 2e-3
+    assert calls(lambda: linearize(model, point)) < 2000
 
 
 def circle(gain):

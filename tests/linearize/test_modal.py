@@ -13,6 +13,7 @@ from hvdc_ident.linearize.modal import gradient_of
 from hvdc_ident.model.definition import Model, Output, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
+from tests.effort import calls
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +95,11 @@ def test_a_derivative_that_was_not_asked_for(link):
 # --- loci ---
 
 
-def test_locus_of_the_link_in_under_a_second(link):
-    from time import perf_counter
-
+def test_locus_of_the_link(link):
     values = np.linspace(250, 1500, 500)
     root_locus(link, "KIVDC", values[:2])
-    start = perf_counter()
+    assert calls(lambda: root_locus(link, "KIVDC", values)) < 2000 * len(values)  # 0.4 s, `benchmarks/linearize.py`
     found = root_locus(link, "KIVDC", values)
-    assert perf_counter() - start < 3.0  # 0.4 s on an idle machine; the benchmark holds the figure
     assert found.eigenvalues.shape == (500, 6) and found.stable.all() and found.limits == ()
     for k in (0, 250, 499):
         own = linearize(link.with_values({"KIVDC": values[k]})).poles()

@@ -7,7 +7,6 @@ import random
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -43,26 +42,24 @@ event = 0.5
 """
 GRID = '[[sweep]]\nparameter = "k"\nmin = 0\nmax = 4\npoints = {points}\n'
 WORKER = """
-import sys, threading
+import os, signal, sys, threading
 from pathlib import Path
 import hvdc_ident.sensitivity.point as point
 from hvdc_ident.study.pipeline import run_stage
 from hvdc_ident.study.stage import Options
 from hvdc_ident.study.study import load_study
-study = load_study(sys.argv[1])
-run, pause = point.PointTask.__call__, threading.Event()
+study, points, delay = load_study(sys.argv[1]), int(sys.argv[3]), float(sys.argv[4])
+run, done = point.PointTask.__call__, []
 
 
-def slowed(self, p):
-    pause.wait(0.001)
-    if not told:
-        print("ready", flush=True)
-        told.append(True)
+def counted(self, p):
+    done.append(p)
+    if len(done) == points:  # and any instant of the next points
+        threading.Timer(delay, os.kill, (os.getpid(), signal.SIGKILL)).start()
     return run(self, p)
 
 
-told = []
-point.PointTask.__call__ = slowed
+point.PointTask.__call__ = counted
 run_stage(study, "sweep", Path(sys.argv[2]), Options())
 """
 HOLD = "import sys; from pathlib import Path; from hvdc_ident.study.store import exclusive\n"
@@ -89,18 +86,12 @@ def sweep(*arguments: object) -> str:
 def test_killed_at_random_instants_the_table_is_the_same(tmp_path):
     path = study(tmp_path, GRID.format(points=4000))
     sweep(path, "--out", tmp_path / "whole")
-    delays = random.Random(5)
+    draws = random.Random(5)
     for _ in range(4):
-        process = subprocess.Popen(
-            [sys.executable, "-c", WORKER, str(path), str(tmp_path / "killed")], stdout=subprocess.PIPE, text=True
-        )
-        with process:
-            assert process.stdout is not None and process.stdout.readline() == "ready\n"
-            deadline = time.monotonic() + delays.uniform(0.1, 0.8)
-            while process.poll() is None and time.monotonic() < deadline:
-                pass
-            assert process.poll() is None, "the sweep ended before it was killed"
-            process.send_signal(signal.SIGKILL)
+        # A point takes well over 10 us, so that the points left outlast the delay on any machine.
+        points, delay = draws.randint(1, 600), draws.uniform(0.0, 0.01)
+        arguments = [sys.executable, "-c", WORKER, *map(str, (path, tmp_path / "killed", points, delay))]
+        assert subprocess.run(arguments).returncode == -signal.SIGKILL, "the sweep ended before it was killed"
     with Store(tmp_path / "killed") as store:
         assert store._base is not None
         kept = store._base.execute("SELECT count(*) FROM kept").fetchone()[0]
