@@ -10,6 +10,9 @@ from hvdc_ident.effects import effects
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.words import listed, quantity
 
+MOST_PLACES = 4
+"""Signals at most that are asked for."""
+
 
 def found_of(refit: Refit, placed: Placed, chosen_from: int) -> Found:
     """An effect of the refitted model with its sizes, their 95 % intervals, and its sentence."""
@@ -53,10 +56,14 @@ def advice(
     for name in dict.fromkeys(n for n, _ in others if n != first):
         told = entry.confusable.get(name) or effects()[name].confusable.get(first)
         parts.append(f"{first} or {name}: {told or f'{entry.excited_by}; {effects()[name].excited_by}'}")
-    elsewhere = dict.fromkeys(p for n, a in others if n == first and a != at for p in a if p not in at)
-    if elsewhere:
-        wanted = dict.fromkeys(p.removeprefix("outputs.") for p in (*at, *list(elsewhere)[:6]))
+    wanted = [at[0]]  # a signal of each place that is not of the others
+    for name, place in others:
+        own = [p for p in place if p not in at] or [p for p in at if p not in place]
+        if name == first and own and own[0] not in wanted and len(wanted) < MOST_PLACES:
+            wanted.append(own[0])
+    if len(wanted) > 1:
+        wanted = list(dict.fromkeys(p.removeprefix("outputs.") for p in wanted))
         missing = [p for p in wanted if p not in recorded]
         record = f"record {listed(missing)} as well, and " if missing else ""
-        parts.append(f"{record}move the inputs on either side of {listed(wanted)}")
+        parts.append(f"{record}step what acts on one side of {listed(wanted)} and not on the other")
     return "; ".join(parts)

@@ -34,6 +34,8 @@ WIDER = 80
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4)
 """Of those many a short sprint."""
+ELSEWHERE = 40
+"""Other places at most at which the best effect is refitted."""
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
 NEAR = 0.05
@@ -182,6 +184,7 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     best = [found[t.pick.candidate] for t in sound[:2]]
     more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
     trials += _trials(search, opened, more, f"round {number}: refits beside the best", trials)
+    trials += _elsewhere(search, opened, picks, trials, number)
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1 and _far(before, trials):
         tried += [t.pick.candidate for t in trials]
@@ -193,6 +196,24 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     if number == 1 and _far(before, trials):
         trials = _again(search, opened.candidates, trials, f"round {number}: once more")
     return closed(search, opened, trials, number)
+
+
+def _elsewhere(
+    search: Search, opened: Round, picks: Sequence[Pick], trials: Sequence[Trial], number: int
+) -> list[Trial]:
+    """Refits of the best effect at every other place where it scores more than noise: the places that cannot be told from
+    its own are to be had by no other way, for a score is that of one size and of gains that are biased."""
+    found = opened.candidates
+    sound = [t for t in trials if not t.refit.failure]
+    if not sound:
+        return []
+    effect = found[min(sound, key=lambda t: t.refit.chi2).pick.candidate].effect
+    tried = {t.pick.candidate for t in trials} | {p.candidate for twins in opened.same.values() for p in twins}
+    threshold = opened.scores.threshold(search.options.significance)
+    left = [
+        p for p in picks if found[p.candidate].effect == effect and p.candidate not in tried and p.score > threshold
+    ]
+    return _trials(search, opened, left[:ELSEWHERE], f"round {number}: {effect} elsewhere", trials, HEAT)
 
 
 def _far(before: Refit, trials: Sequence[Trial]) -> bool:

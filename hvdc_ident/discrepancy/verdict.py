@@ -68,21 +68,21 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
                 f"{max(told, 0.0):.0%}: the form is not the right one.",
                 tests,
             )
-    against = [b for b in tests if b.p <= REFUTED_P and b.excess > options.refuted * explained]
-    if against:
-        worst = max(against, key=lambda b: b.excess)
-        return Judgement(
-            "unnameable",
-            f"Something is missing, and no form of the catalogue has its shape: with {labels} the residuals over the "
-            f"{worst.name} are still not noise (p = {worst.p:.2g}).",
-            tests,
-        )
-    sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
-    if any(len(g) > 1 for g in sets):
-        others = max(len(g) for g in sets) - 1
-        rest = f"one of {others} others" if others > 1 else "another one"
-        return Judgement("ambiguous", f"Missing: {labels}, or {rest} that these data cannot tell from it.", tests)
-    return Judgement("named", f"Missing: {labels}.", tests)
+    others = max(len(rivals(r, options, search.tries("droop"))) for r in outcome.kept) - 1
+    rest = f"one of {others} others" if others > 1 else "another one"
+    like = f"{labels}, or {rest} that these data cannot tell from it" if others else labels
+    kind: Verdict = "ambiguous" if others else "named"
+    worst = max((b for b in tests if b.p <= REFUTED_P), key=lambda b: b.excess, default=None)
+    if worst is None:
+        return Judgement(kind, f"Missing: {like}.", tests)
+    left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
+    if worst.excess <= options.refuted * explained:
+        return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests)
+    # Forms that explain most of it and are alike tell what kind of thing it is, and none of them is to be believed.
+    if others and worst.excess < (1.0 - DOMINANT) * explained:
+        return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests)
+    text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
+    return Judgement("unnameable", text, tests)
 
 
 def noise_left(last: Refit) -> float:

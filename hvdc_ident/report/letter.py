@@ -107,12 +107,23 @@ def _consistent(found: dict[str, Any]) -> str:
         return str(found.get("text", ""))
     told = [" ".join([e["text"].rstrip("."), _interval(e)]).strip() for e in effects]
     first = f"The difference is consistent with this: {'; and '.join(told)}."
-    rivals = [r for group in found.get("ambiguity") or [] for r in group[1:]]
-    if not rivals:
-        return first + " No other effect of the catalogue, and no other place, explains the recordings as well."
-    names = list(dict.fromkeys(f"{r['effect']} at {listed(r['at'])}" for r in rivals))
-    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}."
+    own = [(e["effect"], e["at"], e.get("from", "")) for e in effects]
+    rivals = [r for group in found.get("ambiguity") or [] for r in group]
+    names = list(
+        dict.fromkeys(
+            f"{r['effect']} at {listed(r['at'])}"
+            for r in rivals
+            if (r["effect"], r["at"], r.get("from", "")) not in own
+        )
+    )
+    if names:
+        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+        first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}."
+    else:
+        first += " No other effect of the catalogue, and no other place, explains the recordings as well."
+    if not (found.get("remaining") or {}).get("adequate", True):
+        first += " It is not all that is missing: with it the residuals are still not noise."
+    return first
 
 
 def _interval(effect: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ want = ["rmse", "poles"]
 # What the phasor link lacks beside these recordings. Three effects and one at most, to be quick: without these two lines
 # the whole catalogue is tried, and up to three effects beside each other.
 [diagnose]
-effects = ["lag", "delay", "limit"]
+effects = ["lag", "delay", "second-order"]
 most = 1
 """
 

@@ -105,6 +105,31 @@ def test_a_form_outside_the_catalogue_is_not_given_a_name() -> None:
     assert found.fallback is not None and found.fallback["text"]
 
 
+def test_forms_that_are_alike_and_not_all_of_it_are_a_set_that_says_so() -> None:
+    """A lag, where delays alone are looked for and the place of one in the loop does not show."""
+    found = diagnose(
+        model(),
+        [only(e, "w") for e in experiments(lag=0.05)[1:]],
+        FREE,
+        effects=["delay"],
+        places=["wm", "err", "torque"],
+    )
+    assert found.verdict == "ambiguous" and "None is all of it" in found.text
+    assert {at for _, at in _members(found)} == {("wm",), ("err",), ("torque",)}
+    assert not found.remaining["adequate"]
+    assert 0.02 < found.effects[0].parameters["T"].value < 0.06
+    both = diagnose(model(), experiments(lag=0.05), FREE, effects=["delay"], places=["wm", "err", "torque"])
+    assert both.verdict == "named" and "It is not all of it" in both.text
+
+
+def only(e: Experiment, *names: str) -> Experiment:
+    """The experiment with some of its records."""
+    assert e.measured is not None
+    values = np.column_stack([e.measured[n] for n in names])
+    kept = Trajectory(e.measured.time, values, names, tuple("" for _ in names))
+    return e.with_(measured=kept, noise=FrozenMap({n: e.noise[n] for n in names}))
+
+
 def test_a_limit_that_is_never_reached_is_not_excited() -> None:
     found = diagnose(
         model(), experiments(), FREE, effects=["rate-limit"], places=["outputs.w"], options=Options(fallback=False)

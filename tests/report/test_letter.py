@@ -92,6 +92,16 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
     assert letter.attached == ("augmented-model.toml",)
 
 
+def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp_path: Path) -> None:
+    rivals = [{"effect": n, "at": ["P2_m"], "delta_bic": d} for n, d in (("delay", 0.0), ("lag", 2.0))]
+    found = diagnosis(ambiguity=[rivals], remaining={"adequate": False})
+    _, consistent, *_ = letter_of(Results(folder_with(tmp_path, found))).sentences
+    assert "cannot tell it from: delay at P2_m. It is not all that is missing" in consistent
+    alone = diagnosis(ambiguity=[rivals[1:]], remaining={"adequate": True})
+    _, consistent, *_ = letter_of(Results(folder_with(tmp_path, alone))).sentences
+    assert "No other effect of the catalogue" in consistent and "not all" not in consistent
+
+
 def test_without_evidence_nothing_is_named_and_the_gains_are_judged(tmp_path: Path) -> None:
     found = diagnosis(verdict="no-evidence", effects=[], ambiguity=[], text="Nothing stands out.", sizes=None)
     letter = letter_of(Results(folder_with(tmp_path, found)))
