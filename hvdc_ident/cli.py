@@ -334,6 +334,13 @@ def report(
 
     if source.is_dir():
         folder = source
+    elif not source.exists():
+        raise InputError(
+            "no such study, and no such folder",
+            where=str(source),
+            expected="a study file, or a folder that a run wrote its results into",
+            hint="`hvdc-ident run STUDY` writes such a folder, STUDY-results",
+        )
     else:
         from hvdc_ident.study.study import load_study
 

@@ -108,6 +108,12 @@ def test_run_then_report_from_the_folder_alone(study: Path, tmp_path: Path) -> N
     assert (tmp_path / "r" / "report.html").read_text() == page
 
 
+def test_a_report_of_nothing_says_what_it_takes(tmp_path: Path) -> None:
+    result = call("report", tmp_path / "nowhere")
+    assert result.exit_code == 2
+    assert "no such study, and no such folder" in said(result) and "hvdc-ident run STUDY" in said(result)
+
+
 def test_a_second_run_keeps_what_stands_and_a_change_is_done_again(study: Path) -> None:
     def states() -> dict[str, str]:
         lines = [line.split(": ") for line in call("run", study).stdout.splitlines()]

@@ -26,7 +26,7 @@ from hvdc_ident.discrepancy.verdict import Judgement, judge
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator
-from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel

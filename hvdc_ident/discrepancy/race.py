@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.discrepancy.refit import Found, Job, Refit, find
+from hvdc_ident.fit.executor import mapped
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy.rounds import Search
@@ -51,7 +52,7 @@ def done(search: Search, jobs: Sequence[Job], texts: Sequence[str], how: Callabl
     """The jobs' refits, in their order, wherever they are done."""
     if jobs:
         search.tell(0, len(jobs), texts[0])
-    outcomes = search.executor.map(how, jobs) if search.executor is not None else map(how, jobs)
+    outcomes = mapped(search.executor, how, jobs)
     refits = []
     for k, (job, outcome) in enumerate(zip(jobs, outcomes, strict=True)):
         search.tell(k + 1, len(jobs), texts[k])

@@ -23,7 +23,7 @@ from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.tones import tones
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.scores import Scores, two_sided
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.effects import Probe, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
@@ -137,7 +137,7 @@ def _looked(
 ) -> Scores:
     """The scores of every size of some candidates, by running the model."""
     jobs = [Job(before, nominal.residual, c, right) for c in found]
-    outcomes = executor.map(_traces, jobs) if executor is not None else map(_traces, jobs)
+    outcomes = mapped(executor, _traces, jobs)
     products, squares = [np.zeros((0, right.shape[1]))], [np.zeros(0)]
     for k, (p, s) in enumerate(outcomes):
         products.append(p)

@@ -22,7 +22,7 @@ from hvdc_ident.discrepancy.response import Along, along
 from hvdc_ident.discrepancy.signatures import LOOSE, Column, Task, columns_of, signatures, tasks
 from hvdc_ident.effects import effects
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.fit.estimate import Executor
+from hvdc_ident.fit.executor import Executor, mapped
 from hvdc_ident.fit.residual import Block, Treatment
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
@@ -164,7 +164,7 @@ def scored(
             )
         )
         at += width
-    outcomes = list(executor.map(_products, jobs)) if executor is not None else [_products(j) for j in jobs]
+    outcomes = list(mapped(executor, _products, jobs))
     products = np.sum([o[0] for o in outcomes], axis=0)
     squares = np.sum([o[1] for o in outcomes], axis=0)
     change = np.max([o[2] for o in outcomes], axis=0)

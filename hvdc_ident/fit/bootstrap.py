@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import SimulationError, StudyError
-from hvdc_ident.fit.estimate import Executor
+from hvdc_ident.fit.executor import Executor, mapped
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
@@ -61,7 +61,7 @@ def bootstrap(
     counts = np.array([np.bincount(d, minlength=len(units)) for d in drawn])
     theta = np.asarray(theta, dtype=float)
     refit = partial(_refit, problem, theta, problem.blocks(theta))
-    rows = list((executor.map if executor else map)(refit, counts))
+    rows = list(mapped(executor, refit, counts))
     good = [row for row in rows if row is not None]
     if not good:
         raise SimulationError("no sample of the bootstrap could be fitted", got=f"{len(rows)} failures")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
 
 import numpy as np
 
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.clock import has_clocks, searched
+from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.fit.intervals import estimates_of
 from hvdc_ident.fit.noise import GIVEN, floor_of, source_of
 from hvdc_ident.fit.nuisance import unknown_of
@@ -34,15 +34,6 @@ STARTS = 8
 """Runs of a multistart, where nothing else is said."""
 SETTLED = 1e-3
 """A Gauss-Newton step that lowers the cost by less moves no estimate by a twentieth of its standard deviation."""
-Progress = Callable[[int, int, str], None]
-"""Called with runs done, runs in all, and a line of text."""
-
-
-class Executor(Protocol):
-    """Anything with the `map` of concurrent.futures."""
-
-    def map(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Any]:
-        """The function's results in the items' order."""
 
 
 def fit(
@@ -131,7 +122,7 @@ def _run_all(
     problem: Problem, begins: Sequence[Array], method: Optimiser, executor: Executor | None, progress: Progress | None
 ) -> list[OptimiserResult]:
     """The optimiser's outcome from each start, in the starts' order, whatever runs them."""
-    jobs: Iterator[OptimiserResult] = (executor.map if executor else map)(partial(method.run, problem), begins)
+    jobs: Iterator[OptimiserResult] = mapped(executor, partial(method.run, problem), begins)
     runs = []
     for run in jobs:
         runs.append(run)

@@ -10,7 +10,8 @@ import numpy as np
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.assessment import assessed
-from hvdc_ident.fit.estimate import Executor, Progress, fit
+from hvdc_ident.fit.estimate import fit
+from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual_tests import residual_tests

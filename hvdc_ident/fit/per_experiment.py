@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import StudyError, unknown_name
-from hvdc_ident.fit.estimate import Executor, Progress, fit
+from hvdc_ident.fit.estimate import fit
+from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import FitResult
@@ -39,7 +40,7 @@ def fit_each(
     """
     parts = _parts(problem, runs)
     one = partial(_alone, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten)
-    outcomes: Iterator[FitResult] = (executor.map if executor else map)(one, list(parts.values()))
+    outcomes: Iterator[FitResult] = mapped(executor, one, list(parts.values()))
     results: dict[str, FitResult] = {}
     for name, result in zip(parts, outcomes, strict=True):
         results[name] = result

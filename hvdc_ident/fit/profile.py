@@ -6,13 +6,13 @@ round: a step is a piece of work of its own, wherever it is done, and an executo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.fit.objective import Objective, Reached, descend
 from hvdc_ident.fit.profile_walk import (
     ONE_SIDED,
@@ -29,14 +29,10 @@ from hvdc_ident.fit.profile_walk import (
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
-if TYPE_CHECKING:
-    from hvdc_ident.fit.estimate import Executor
-
 __all__ = ["ONE_SIDED", "TWO_SIDED", "Physical", "Profile", "Profiles", "Side", "SideStatus", "Walk", "profiles"]
 
 Asked = tuple[str, float]
 """A side: the unknown and the direction, -1.0 or 1.0."""
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +154,7 @@ class _Taken:
     executor: Executor | None
 
     def __call__(self, steps: list[Descent]) -> Iterator[Reached | Failed]:
-        return iter((self.executor.map if self.executor else map)(_Descend(self.objective), steps))
+        return mapped(self.executor, _Descend(self.objective), steps)
 
 
 def _certain(end: Reached | Failed) -> Reached:

@@ -231,7 +231,9 @@ def _usable_file(path: str | os.PathLike[str]) -> Path:
     except (OSError, ValueError) as error:
         missing = isinstance(error, FileNotFoundError)
         what = "no such file" if missing else f"cannot open the file: {getattr(error, 'strerror', None) or error}"
-        raise WaveformError(what, where=str(file), hint="check the path, which is relative to the study") from None
+        raise WaveformError(
+            what, where=str(file), hint="check the path; a study's are relative to the study file"
+        ) from None
     if not stat.S_ISREG(status.st_mode):
         got = "a folder" if stat.S_ISDIR(status.st_mode) else "something else"
         raise WaveformError("not a file of waveforms", where=str(file), expected="a regular file", got=got)

@@ -11,7 +11,7 @@ from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
-from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.frozen import FrozenMap

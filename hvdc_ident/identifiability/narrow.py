@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.fit.estimate import Executor
+from hvdc_ident.fit.executor import Executor
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import Profile, profiles
 from hvdc_ident.identifiability import verdicts

@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.fit import Problem, fit
-from hvdc_ident.fit.estimate import Executor, Progress
+from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.noise import GIVEN, MISFIT, source_of
 from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend

@@ -20,7 +20,7 @@ from hvdc_ident.study.schema import Fit
 from hvdc_ident.study.unknowns import priors
 
 if TYPE_CHECKING:
-    from hvdc_ident.fit.estimate import Executor, Progress
+    from hvdc_ident.fit.executor import Executor, Progress
     from hvdc_ident.study.study import Study
 
 

@@ -62,9 +62,15 @@ def lines(path: Path, crashes: bool = False) -> dict[str, dict[str, Any]]:
     return found
 
 
-def pending(parts: list[str], seed: int, limit: int | None, done: set[str], full: bool = False) -> Iterator[Design]:
-    """The cases still to be done, the parts in turn so that an early stop has something of each."""
-    tables = [factorial(seed)[:limit]] if full else [designs(p, seed)[:limit] for p in parts]
+def pending(
+    parts: list[str], seed: int, limit: int | None, done: set[str], full: bool = False, least: float = 0.0
+) -> Iterator[Design]:
+    """The cases still to be done, the parts in turn so that an early stop has something of each.
+
+    limit: of each part; least: size of a hidden effect.
+    """
+    every = [factorial(seed)] if full else [designs(p, seed) for p in parts]
+    tables = [[d for d in table if d.size >= least or not d.effects or d.part == "clean"][:limit] for table in every]
     shares = [(k / len(t), n, d) for n, t in enumerate(tables) for k, d in enumerate(t)]
     for _, _, design in sorted(shares, key=lambda s: s[:2]):
         if design.name not in done:
@@ -76,6 +82,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--limit", type=int, help="cases of each part at most")
+    parser.add_argument("--least", type=float, default=0.0, help="leave out smaller effects, by their size in units")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--out", type=Path, help="folder of the results (default: seed-SEED-results beside this file)")
@@ -88,7 +95,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     path = out / "cases.jsonl"
     done = lines(path)
     if not asked.judge_only:
-        todo = list(pending(asked.parts, asked.seed, asked.limit, set(done), asked.full))
+        todo = list(pending(asked.parts, asked.seed, asked.limit, set(done), asked.full, asked.least))
         _work(todo, asked, path, len(done))
     done = lines(path, crashes=True)
     found = summary(list(done.values()))
