@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from hvdc_ident.effects import effects
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
 
@@ -44,6 +45,11 @@ class Found:
     chosen_from: int
     source: str = ""
 
+    @property
+    def late(self) -> float | None:
+        """By how long it delays a slow signal, s; None for what is no delay of any kind."""
+        return _late(self.effect, {n: size.value for n, size in self.parameters.items()})
+
 
 @dataclass(frozen=True)
 class Rival:
@@ -58,6 +64,11 @@ class Rival:
     parameters: FrozenMap[float] = field(default_factory=FrozenMap)
     source: str = ""
     refitted: bool = True
+
+    @property
+    def late(self) -> float | None:
+        """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
+        return _late(self.effect, self.parameters) if self.parameters else None
 
 
 @dataclass(frozen=True)
@@ -143,8 +154,8 @@ class Diagnosis:
             for name in self.__dataclass_fields__
             if name not in ("augmented", "candidates", "effects", "ambiguity")
         }
-        out["effects"] = [_effect(e) for e in self.effects]
-        out["ambiguity"] = [[_named(r) for r in group] for group in self.ambiguity]
+        out["effects"] = [_member(e) for e in self.effects]
+        out["ambiguity"] = [[_member(r) for r in group] for group in self.ambiguity]
         out["candidates"] = [_named(line) for line in self.candidates]
         out["augmented_model"] = next(iter(self.files), None)
         return out
@@ -163,12 +174,17 @@ class Diagnosis:
         return overview(self)
 
 
-def _named(value: Rival | Line) -> dict[str, Any]:
+def _named(value: Found | Rival | Line) -> dict[str, Any]:
     """A line with `from` only where a signal is brought in."""
     out = {k: plain(getattr(value, k)) for k in value.__dataclass_fields__ if k != "source"}
     return out | ({"from": value.source} if value.source else {})
 
 
-def _effect(found: Found) -> dict[str, Any]:
-    out: dict[str, Any] = {k: plain(getattr(found, k)) for k in found.__dataclass_fields__ if k != "source"}
-    return out | ({"from": found.source} if found.source else {})
+def _member(value: Found | Rival) -> dict[str, Any]:
+    """The same, with `late` only where it is one kind of delay or another."""
+    return _named(value) | ({} if value.late is None else {"late": value.late})
+
+
+def _late(effect: str, values: Mapping[str, float]) -> float | None:
+    found = effects()[effect].late
+    return None if found is None else float(found(values))

@@ -146,12 +146,13 @@ class Effect:
     """One entry of the catalogue.
 
     places: kinds of slot where it may sit. states: those it adds, a sentence's part for people. sentence: for the
-    report, with {at}, {from} and the parameters by name. excited_by: the experiment that makes it visible.
+    report, with {at}, {from}, {late} and the parameters by name. excited_by: the experiment that makes it visible.
     example: values that show on a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: whether it brings another signal in (`from`). needs_expression: whether its form is given with it,
     with coefficients of the user's own names. resistance: the parameter for which a resistance of the model stands in.
-    restless: whether it moves the model by itself, so that a record of it does not begin at rest.
+    restless: whether it moves the model by itself, so that a record of it does not begin at rest. late: by how long, s, it
+    delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common.
     """
 
     name: str
@@ -168,6 +169,7 @@ class Effect:
     needs_expression: bool = False
     resistance: str = ""
     restless: bool = False
+    late: Callable[[Mapping[str, float]], float] | None = None
 
     @property
     def scanned(self) -> bool:

@@ -24,6 +24,7 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
+    late=lambda p: p["T"],
     sentence="{at} arrives {T} late",
     excited_by="a step through the slot, recorded at several samples per delay",
     example=FrozenMap({"T": 0.002}),

@@ -24,6 +24,7 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
+    late=lambda p: p["T"],
     sentence="{at} follows its order with a first-order lag of {T}",
     excited_by="a step or fast ramp through the slot, recorded at several samples per time constant",
     example=FrozenMap({"T": 0.002}),

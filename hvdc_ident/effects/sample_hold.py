@@ -34,6 +34,7 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
+    late=lambda p: p["Ts"] / 2 + p["compute"],
     sentence="{at} is sampled every {Ts} and published {compute} later",
     excited_by="a step or ramp through the slot, recorded several times per sampling period",
     example=FrozenMap({"Ts": 0.0013, "compute": 0.0003}),

@@ -34,7 +34,8 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}",
+    late=lambda p: 2 * p["zeta"] / p["wn"],
+    sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}, {late} late",
     excited_by="a step through the slot, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.5}),
     states="y and its rate v = y'/wn, one pair a slot",

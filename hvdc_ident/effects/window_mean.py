@@ -25,6 +25,7 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
+    late=lambda p: p["T"] / 2,
     sentence="{at} is the mean over the last {T}",
     excited_by="a step through the slot, recorded at several samples per window",
     example=FrozenMap({"T": 0.01}),

@@ -118,12 +118,21 @@ def _consistent(found: dict[str, Any]) -> str:
     )
     if names:
         more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-        first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}."
+        first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}.{_in_common(found)}"
     else:
         first += " No other effect of the catalogue, and no other place, explains the recordings as well."
     if not (found.get("remaining") or {}).get("adequate", True):
         first += " It is not all that is missing: with it the residuals are still not noise."
     return first
+
+
+def _in_common(found: dict[str, Any]) -> str:
+    """That the one set there is delays a slow signal by so much, whichever of it is the right one."""
+    groups = found.get("ambiguity") or []
+    late = [r.get("late") for group in groups for r in group if r.get("refitted", True)]
+    if len(groups) != 1 or len(late) < 2 or any(v is None or v <= 0.0 for v in late):
+        return ""
+    return f" Whichever it is, a slow signal is late by between {span(min(late), max(late), 's', 3)}."
 
 
 def _interval(effect: dict[str, Any]) -> str:

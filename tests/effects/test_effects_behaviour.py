@@ -291,3 +291,26 @@ def test_a_disturbance_is_at_rest_in_the_value_it_has_at_the_start():
     sine = np.sin(2 * np.pi * 0.2 * 2.0 + 0.3)
     assert run["x"][0] == pytest.approx(0.5 + 0.1 * sine)
     assert run.gradient("x")[0, 0] == pytest.approx(sine)
+
+
+LATE = {
+    "lag": {"T": 0.02},
+    "delay": {"T": 0.02},
+    "window-mean": {"T": 0.02},
+    "sample-hold": {"Ts": 0.02, "compute": 0.005},
+    "second-order": {"wn": 80.0, "zeta": 0.6},
+    "lead-lag": {"T1": 0.01, "T2": 0.03},
+}
+
+
+@pytest.mark.parametrize("name", [n for n, e in effects().items() if e.late])
+def test_how_late_a_slow_signal_comes(name: str) -> None:
+    """Behind a ramp of slope 1 the effect's output lags by as much, on average over a sampling period."""
+    late = effects()[name].late
+    assert late is not None
+    values = LATE[name]
+    time = np.linspace(0.0, 1.0, 2001)
+    ramp = experiment("ramp", time, {"u": InputSignal.ramp(0.0, 0.0, 1.0, 1.0)})
+    y = simulate(alone(EffectUse(name, ("u",), FrozenMap(values))), ramp)["y"]
+    settled = (time > 0.6) & (time <= 0.8)  # ten sampling periods
+    assert np.mean((time - y)[settled]) == pytest.approx(late(values), abs=3e-4)

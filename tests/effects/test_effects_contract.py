@@ -169,7 +169,11 @@ def test_it_changes_what_it_sits_on_and_survives_a_card(name):
 def test_it_describes_itself(name):
     effect = effects()[name]
     assert effect.name == name and effect.summary and effect.excited_by and effect.states
-    words = dict.fromkeys(effect.parameters, "1") | {"from": "Vdc2", "expression": "w**2"}
+    words = (
+        dict.fromkeys(effect.parameters, "1")
+        | {"from": "Vdc2", "expression": "w**2"}
+        | ({"late": "1 s"} if effect.late else {})
+    )
     text = effect.sentence.format(at="P2_m", **words)
     assert "P2_m" in text and "{" not in text
     assert ("Vdc2" in text) == effect.needs_source

@@ -102,6 +102,18 @@ def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp
     assert "No other effect of the catalogue" in consistent and "not all" not in consistent
 
 
+def test_what_the_members_of_a_set_have_in_common_is_said(tmp_path: Path) -> None:
+    rivals = [
+        {"effect": n, "at": ["P2_m"], "delta_bic": 0.0, "late": late}
+        for n, late in (("lag", 0.0016), ("delay", 0.0014))
+    ]
+    _, consistent, *_ = letter_of(Results(folder_with(tmp_path, diagnosis(ambiguity=[rivals])))).sentences
+    assert "Whichever it is, a slow signal is late by between 1.4 and 1.6 ms." in consistent
+    other = {"effect": "gain", "at": ["P2_m"], "delta_bic": 1.0}
+    _, consistent, *_ = letter_of(Results(folder_with(tmp_path, diagnosis(ambiguity=[[*rivals, other]])))).sentences
+    assert "Whichever" not in consistent
+
+
 def test_without_evidence_nothing_is_named_and_the_gains_are_judged(tmp_path: Path) -> None:
     found = diagnosis(verdict="no-evidence", effects=[], ambiguity=[], text="Nothing stands out.", sizes=None)
     letter = letter_of(Results(folder_with(tmp_path, found)))

@@ -57,13 +57,19 @@ def _sets(found: dict[str, Any]) -> str:
     parts = []
     for group in found.get("ambiguity") or []:
         rows = [
-            [text(r["effect"]), text(", ".join(r["at"])), text(r.get("from", "")), number(r["delta_bic"], 3)]
+            [
+                text(r["effect"]),
+                text(", ".join(r["at"])),
+                text(r.get("from", "")),
+                "" if r.get("late") is None else number(1e3 * r["late"], 3),
+                number(r["delta_bic"], 3),
+            ]
             for r in group[:MOST]
         ]
         more = f"<p class='small'>and {len(group) - MOST} more</p>" if len(group) > MOST else ""
         parts.append(
             "<h3>As good as what was put in</h3>"
-            + table(["effect", "at", "from", "behind the best, BIC"], rows, words=(0, 1, 2))
+            + table(["effect", "at", "from", "late, ms", "behind the best, BIC"], rows, words=(0, 1, 2))
             + more
         )
     advice = (found.get("separating_experiment") or {}).get("text")

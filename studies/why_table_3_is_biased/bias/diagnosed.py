@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from common import diagnosing, paper
 
 from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.effects import effects as catalogue
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import Free, Problem, fit
@@ -103,15 +104,7 @@ def sized(told: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def delay(effects: Sequence[Mapping[str, Any]]) -> float:
     """The delay that effects of one loop add together at low frequencies, s: what their transfer functions begin with."""
-    parts: dict[str, Callable[[Mapping[str, float]], float]] = {
-        "delay": lambda p: p["T"],
-        "lag": lambda p: p["T"],
-        "window-mean": lambda p: p["T"] / 2,
-        "sample-hold": lambda p: p["Ts"] / 2 + p.get("compute", 0.0),
-        "second-order": lambda p: 2 * p["zeta"] / p["wn"],
-        "lead-lag": lambda p: p["T2"] - p["T1"],
-    }
-    return sum(parts[e["effect"]](e["parameters"]) for e in effects if e["effect"] in parts)
+    return sum(late(e["parameters"]) for e in effects if (late := catalogue()[e["effect"]].late))
 
 
 def augmented(told: Mapping[str, Any]) -> Model:
