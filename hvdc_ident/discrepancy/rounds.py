@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.race import Race, done
-from hvdc_ident.discrepancy.refit import Job, Refit, unseen
+from hvdc_ident.discrepancy.refit import Job, Placed, Refit, unseen
 from hvdc_ident.discrepancy.scan import joined, scan
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, best_of, neighbours, others, shortlist
@@ -95,10 +95,14 @@ class Round:
         return float(t[k]), self.scores.p(float(t[k])), k
 
 
-def slot_signals(paths: Mapping[str, Path]) -> dict[str, tuple[Array, ...]]:
-    """The signal at every slot that all experiments have, one array an experiment."""
+def slot_signals(paths: Mapping[str, Path], placed: Sequence[Placed] = ()) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot that all experiments have, one array an experiment.
+
+    placed: effects that are in the model already; nothing is looked for inside them.
+    """
     common = [p for p in next(iter(paths.values())).slots if all(p in a.slots for a in paths.values())]
-    return {p: tuple(a.signal(p) for a in paths.values()) for p in common}
+    outer = [p for p in common if not any(one.use.made(p) for one in placed)]
+    return {p: tuple(a.signal(p) for a in paths.values()) for p in outer}
 
 
 def one_round(search: Search, before: Refit, number: int) -> Round:
@@ -108,7 +112,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     paths = runs(before.model, nominal)
     found = candidates(
         before.model,
-        slot_signals(paths),
+        slot_signals(paths, before.placed),
         [a.time for a in paths.values()],
         search.effects,
         search.places,
@@ -141,7 +145,7 @@ def _scanned(search: Search, opened: Round, nominal: Nominal, number: int) -> tu
     before, found, options = opened.before, opened.candidates, search.options
     dense = candidates(
         before.model,
-        slot_signals(opened.paths),
+        slot_signals(opened.paths, before.placed),
         [a.time for a in opened.paths.values()],
         search.effects,
         search.places,

@@ -75,8 +75,16 @@ class EffectUse:
 
     def parameter_name(self, name: str) -> str:
         """What a parameter of the effect is called in the model."""
-        prefix = self.prefix or f"{self.label}_{self.at[0].replace('.', '_')}"
+        prefix = self.prefix or self.prefix_at(self.at[0])
         return f"{prefix}_{name}"
+
+    def made(self, name: str) -> bool:
+        """Whether a state or signal of the model is part of this effect, not a slot that it sits at."""
+        return any(name.startswith(f"{self.prefix_at(place)}_") for place in self.at)
+
+    def prefix_at(self, place: str) -> str:
+        """What the names begin with of all that the effect adds at a place."""
+        return f"{self.label}_{place.replace('.', '_')}"
 
 
 def apply(model: Model, use: EffectUse, effect: Effect) -> Model:
@@ -133,7 +141,7 @@ def _at_one(
             p["from"] = _source(m, use.source, where).xreplace(own)
         if effect.needs_expression:
             p["expression"] = _term(use, symbols, where).xreplace(own)
-        add = Additions(m, f"{use.label}_{place.replace('.', '_')}", kind, circular)
+        add = Additions(m, use.prefix_at(place), kind, circular)
         y = effect.rewrite(u, p, add)
         return add.model, y
 

@@ -86,3 +86,16 @@ def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest
 )
 def test_the_slot_that_a_name_was_made_at(slots: str, name: str, found: str) -> None:
     assert home(slots.split(), name) == found
+
+
+def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Refit) -> None:
+    """The velocity of a second-order lag, or a bit of a quantiser, is no place of the plant."""
+    one = run(beside(first, "second-order", "wm", {"wn": 60.0, "zeta": 1.0}, {"wn": (5.0, 500.0), "zeta": (0.1, 2.0)}))
+    two = run(beside(one, "quantisation", "outputs.w", {"step": 0.05}, {"step": (0.02, 0.1)}))
+    inner = [s for s in two.model.slots if any(p.use.made(s) for p in two.placed)]
+    assert {"second_order_wm_y", "second_order_wm_v"} <= set(inner) and len(inner) > 40
+    assert "wm" not in inner and "wm_before_second_order" not in inner
+    search = Search(("gain", "coupling"), None, FrozenMap(), Options(bootstraps=100), seed=0)
+    found = one_round(search, two, 2)
+    assert {c.at[0] for c in found.candidates} >= {"wm", "wm_before_second_order", "torque"}
+    assert not {*inner} & {p for c in found.candidates for p in (*c.at, c.source)}
