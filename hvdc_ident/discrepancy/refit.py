@@ -10,14 +10,14 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.noise import Noise
-from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.nominal import Nominal, orthonormal
 from hvdc_ident.effects import EffectUse, clearance, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
-from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
+from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate import simulate
@@ -255,17 +255,17 @@ def judged(refit: Refit) -> Refit:
     wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
     own = [n for p in refit.placed for n in p.names.values() if n in names]
     std = {n: None if (s := known.std(n)) is None else wider * s for n in own}
-    apart = tuple(_apart_from_nothing(refit, p, known) / wider for p in refit.placed)
+    apart = tuple(_apart_from_nothing(refit, p, known, blocks) / wider for p in refit.placed)
     return replace(
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
         press=press(blocks), std=FrozenMap(std), apart=apart,
     )  # fmt: skip
 
 
-def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty) -> float:
+def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks: Sequence[Block]) -> float:
     """How many standard deviations an effect's parameters together are from doing nothing; 0 where that is not known."""
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
-    fitted = [n for n, name in placed.names.items() if name in known.names and name not in known.reasons]
+    fitted = [n for n, name in placed.names.items() if name in known.names]
     here = clearance(entry, sizes)
     if not fitted or not here:
         return 0.0
@@ -275,7 +275,7 @@ def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty) -> flo
         there = clearance(entry, {**sizes, n: sizes[n] + h})
         slopes[:, k] = np.array([there.get(m, v) - v for m, v in here.items()]) / h
     at = [known.names.index(placed.names[n]) for n in fitted]
-    spread = slopes @ known.corrected[np.ix_(at, at)] @ slopes.T
+    spread = slopes @ _covariance(known, at, blocks) @ slopes.T
     distance = np.array(list(here.values()))
     scale = np.sqrt(np.diag(spread))
     seen = scale > 0
@@ -284,6 +284,22 @@ def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty) -> flo
     d, unit = distance[seen] / scale[seen], spread[np.ix_(seen, seen)] / np.outer(scale[seen], scale[seen])
     square = float(d @ np.linalg.pinv(unit, rcond=1e-9, hermitian=True) @ d)
     return math.sqrt(max(square, 0.0))
+
+
+def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[Block]) -> Array:
+    """The covariance of some unknowns; where only combinations of them are told, of those, and 0 along the others.
+
+    The constant and the linear part of a loss are one where a signal has two levels, and are there all the same.
+    """
+    if not any(known.names[k] in known.reasons for k in at):
+        return known.corrected[np.ix_(at, at)]
+    jacobian = np.vstack([b.jacobian for b in blocks])
+    scale = np.linalg.norm(jacobian[:, at], axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    own, others = jacobian[:, at] / scale, orthonormal(np.delete(jacobian, at, axis=1))
+    _, s, directions = np.linalg.svd(own - others @ (others.T @ own), full_matrices=False)
+    told = directions[s > SINGULAR] / s[s > SINGULAR, None]
+    return np.asarray(told.T @ told / np.outer(scale, scale))
 
 
 def _correlation(blocks: Sequence[Block]) -> float:

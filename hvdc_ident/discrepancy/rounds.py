@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -36,6 +37,12 @@ HEAT = Race(sprint=5, reach=0.4)
 """Of those many a short sprint."""
 ELSEWHERE = 40
 """Other places at most at which the best effect is refitted."""
+LEADERS = 4
+"""Of the refits the best, whose places other kinds of delay are tried at."""
+STARTS = 2
+"""Sizes that another kind of delay is begun at."""
+LIKE = 0.3
+"""Of a logarithm: up to where two delays are alike."""
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
 NEAR = 0.05
@@ -189,11 +196,13 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
     trials += _trials(search, opened, more, f"round {number}: refits beside the best", trials)
     trials += _elsewhere(search, opened, picks, trials, number)
+    trials = _best_each([*trials, *_as_late(search, opened, trials, number)])
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1 and _far(before, trials):
         tried += [t.pick.candidate for t in trials]
         wide = others(picks, scores, found, tried, WIDER)
         trials += _trials(search, opened, wide, f"round {number}: the other candidates", trials, HEAT)
+        trials = _best_each([*trials, *_as_late(search, opened, trials, number)])
     if number == 1 and _far(before, trials):
         opened, extra = _scanned(search, opened, nominal, number)
         trials += _trials(search, opened, extra, f"round {number}: refits of the closer look")
@@ -202,22 +211,75 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     return closed(search, opened, trials, number)
 
 
+def _as_late(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> list[Trial]:
+    """Refits of the other kinds of delay at the best places of one, begun where they delay a slow signal by as much.
+
+    A score is had at few sizes, and from a wrong one no slope leads to the right one: a window to another of its zeros.
+    """
+    found = opened.candidates
+    sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2)
+    goals: dict[tuple[str, ...], float] = {}
+    for t in sound[:LEADERS]:
+        late = _late(t)
+        if late and late > 0.0:
+            goals.setdefault(found[t.pick.candidate].at, late)
+    done_here = {t.pick.candidate: late for t in sound if (late := _late(t)) and late > 0.0}
+    picks = []
+    for k, c in enumerate(found):
+        late_of, goal = effects()[c.effect].late, goals.get(c.at)
+        if late_of is None or goal is None or (k in done_here and _apart(done_here[k], goal) < LIKE):
+            continue
+        lates = {n: late_of(p.values) for n, p in enumerate(c.probes)}
+        nearest = sorted((n for n in lates if lates[n] > 0.0), key=lambda n: _apart(lates[n], goal))
+        picks += [Pick(k, n, goal / lates[n], opened.score_p(k)[0]) for n in nearest[:STARTS]]
+    text = f"round {number}: as late as the best"
+    begun = _trials(search, opened, picks, text, trials)
+    # A period that has to be met is looked for where there is something left for it to explain.
+    left = bool(sound) and (excess(sound[0].refit) or _misses(sound[0].refit))
+    return _again(search, found, begun, text, most=1) if left else begun
+
+
+def _apart(a: float, b: float) -> float:
+    """How far two times are from each other, as a logarithm."""
+    return abs(math.log(a / b))
+
+
+def _late(trial: Trial) -> float | None:
+    """By how long the effect that a trial added delays a slow signal, s; None for what is no kind of delay."""
+    placed = trial.refit.placed[-1]
+    late = effects()[placed.candidate.effect].late
+    return None if late is None else late(trial.refit.sizes(placed))
+
+
+def _best_each(trials: Sequence[Trial]) -> list[Trial]:
+    """Of the trials of each candidate the best, in their order."""
+    kept: dict[int, Trial] = {}
+    for t in trials:
+        had = kept.get(t.pick.candidate)
+        if had is None or had.refit.failure or (not t.refit.failure and t.refit.chi2 < had.refit.chi2):
+            kept[t.pick.candidate] = t
+    return list(kept.values())
+
+
 def _elsewhere(
     search: Search, opened: Round, picks: Sequence[Pick], trials: Sequence[Trial], number: int
 ) -> list[Trial]:
-    """Refits of the best effect at every other place where it scores more than noise: the places that cannot be told from
-    its own are to be had by no other way, for a score is that of one size and of gains that are biased."""
+    """Refits of the best effects at every other place where they score more than noise: the places that cannot be told from
+    theirs are to be had by no other way, for a score is that of one size and of gains that are biased."""
     found = opened.candidates
     sound = [t for t in trials if not t.refit.failure]
     if not sound:
         return []
-    effect = found[min(sound, key=lambda t: t.refit.chi2).pick.candidate].effect
+    best = min(t.refit.chi2 for t in sound)
+    leading = {found[t.pick.candidate].effect for t in sound if t.refit.chi2 - best < 2.0 * search.options.set_bic}
     tried = {t.pick.candidate for t in trials} | {p.candidate for twins in opened.same.values() for p in twins}
     threshold = opened.scores.threshold(search.options.significance)
     left = [
-        p for p in picks if found[p.candidate].effect == effect and p.candidate not in tried and p.score > threshold
+        p for p in picks if found[p.candidate].effect in leading and p.candidate not in tried and p.score > threshold
     ]
-    return _trials(search, opened, left[:ELSEWHERE], f"round {number}: {effect} elsewhere", trials, HEAT)
+    return _trials(
+        search, opened, left[:ELSEWHERE], f"round {number}: {', '.join(sorted(leading))} elsewhere", trials, HEAT
+    )
 
 
 def _far(before: Refit, trials: Sequence[Trial]) -> bool:
@@ -272,12 +334,14 @@ def against(search: Search, before: Refit, trial: Trial, scores: Scores, *, firs
     return objections(before, trial, scores.p(score), search.options, search.material, first=first)
 
 
-def _again(search: Search, found: Sequence[Candidate], trials: Sequence[Trial], text: str) -> list[Trial]:
+def _again(
+    search: Search, found: Sequence[Candidate], trials: Sequence[Trial], text: str, most: int = AGAIN
+) -> list[Trial]:
     """The trials, with another size where one is found beside the gains that a refit came to."""
     chosen: dict[str, list[Trial]] = {}
     for t in sorted(trials, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
-        if effects()[effect].scanned and not t.refit.failure and len(chosen.setdefault(effect, [])) < AGAIN:
+        if effects()[effect].scanned and not t.refit.failure and len(chosen.setdefault(effect, [])) < most:
             chosen[effect].append(t)
     again = [t for group in chosen.values() for t in group]
     jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]

@@ -59,7 +59,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
         )
     was, now = unseen(first), unseen(last)
     least = (1.0 + options.holdout_share) * np.sqrt(floor)
-    if was is not None and now is not None and was > least and not silent(first, last):
+    # What is left may be of no interest, and told from the noise it is no more then.
+    if was is not None and now is not None and min(was, now) > least and not silent(first, last):
         told = (was**2 - now**2) / (was**2 - floor)
         if told < DOMINANT:
             return Judgement(

@@ -17,7 +17,8 @@ from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.refit import Job, Refit, run
-from hvdc_ident.discrepancy.select import clear
+from hvdc_ident.discrepancy.rounds import Search, _as_late, one_round
+from hvdc_ident.discrepancy.select import Pick, Trial, clear
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -146,3 +147,20 @@ def test_of_two_that_explain_the_fitted_steps_alike_the_held_out_one_decides() -
     best = found.effects[0]
     assert best.effect == "window-mean"
     assert best.parameters["T"].value == pytest.approx(WINDOW, rel=0.03)
+
+
+def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
+    """A window, whose scores at the sizes probed lead nowhere near, beside a delay that is right to first order."""
+    records_of = records(ramped)
+    first = plain(records_of)
+    search = Search(("delay", "window-mean", "lag"), ("ref",), FrozenMap(), Options(bootstraps=100), seed=0)
+    opened = replace(one_round(search, first, 1), trials=())
+    names = {c.effect: k for k, c in enumerate(opened.candidates)}
+    late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
+    trial = Trial(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
+    begun = _as_late(search, opened, [trial], 1)
+    assert {opened.candidates[t.pick.candidate].effect for t in begun} == {"window-mean", "lag"}
+    best = min(begun, key=lambda t: t.refit.chi2)
+    assert opened.candidates[best.pick.candidate].effect == "window-mean"
+    assert best.refit.values["window_mean_ref_T"] == pytest.approx(WINDOW, rel=0.02)
+    assert best.refit.chi2 < late.chi2
