@@ -23,10 +23,16 @@ def plain(records: Sequence[Experiment]) -> Refit:
 
 
 def beside(
-    before: Refit, effect: str, at: str, values: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+    before: Refit,
+    effect: str,
+    at: str,
+    values: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]],
+    source: str = "",
 ) -> Job:
     """The refit of a model with one more effect, from a size; what has no bounds stays."""
     probe = Probe(effect, FrozenMap(values), FrozenMap(bounds))
-    larger, problem, placed, start = added(before.model, before.problem, Candidate(effect, (at,), (probe,)), 0, 1.0)
+    candidate = Candidate(effect, (at,), (probe,), source=source)
+    larger, problem, placed, start = added(before.model, before.problem, candidate, 0, 1.0)
     begin = np.concatenate([before.theta, start])
     return Job(larger, (*before.placed, placed), problem, (begin,), before.noise)

@@ -164,3 +164,17 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     assert opened.candidates[best.pick.candidate].effect == "window-mean"
     assert best.refit.values["window_mean_ref_T"] == pytest.approx(WINDOW, rel=0.02)
     assert best.refit.chi2 < late.chi2
+
+
+def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> None:
+    """Where what a loss is of has one level, its three parts are one offset: as clear as an offset is, and no less."""
+    loaded = experiments()[1]
+    assert loaded.measured is not None
+    shifted = replace(loaded.measured, values=np.add(loaded.measured.values, [0.02, 0.0]))
+    first = plain([loaded.with_(measured=shifted)])
+    one = run(beside(first, "offset", "outputs.w", {"c": 0.01}, {"c": (-0.1, 0.1)}))
+    parts = dict.fromkeys("abc", 0.005)
+    three = run(beside(first, "loss", "outputs.w", parts, dict.fromkeys("abc", (-0.1, 0.1)), source="ref"))
+    assert sum(three.sizes(three.placed[0]).values()) == pytest.approx(-one.sizes(one.placed[0])["c"], rel=1e-3)
+    assert clear(one, 0) and one.apart[0] > 20
+    assert three.apart[0] == pytest.approx(one.apart[0], rel=0.05)
