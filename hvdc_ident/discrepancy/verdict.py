@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.ambiguity import rivals
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.objections import silent, worst
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
-from hvdc_ident.discrepancy.result import Verdict
+from hvdc_ident.discrepancy.result import Rival, Verdict
 from hvdc_ident.discrepancy.rounds import Search
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import material_gap
@@ -69,7 +69,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
                 f"{max(told, 0.0):.0%}: the form is not the right one.",
                 tests,
             )
-    others = max(len(rivals(r, options, search.tries("droop"))) for r in outcome.kept) - 1
+    sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
+    others = max(len(g) for g in sets) - 1
     rest = f"one of {others} others" if others > 1 else "another one"
     like = f"{labels}, or {rest} that these data cannot tell from it" if others else labels
     kind: Verdict = "ambiguous" if others else "named"
@@ -79,11 +80,16 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
     if worst.excess <= options.refuted * explained:
         return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests)
-    # Forms that explain most of it and are alike tell what kind of thing it is, and none of them is to be believed.
-    if others and worst.excess < (1.0 - DOMINANT) * explained:
+    # Where all that explain most of it are of one kind, that kind is told, and none of them is to be believed.
+    if others and all(_one_kind(g) for g in sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
+
+
+def _one_kind(group: Sequence[Rival]) -> bool:
+    """Whether the members of a set are one effect at several places, or delays of one kind or another."""
+    return len({r.effect for r in group}) == 1 or all(effects()[r.effect].late is not None for r in group)
 
 
 def noise_left(last: Refit) -> float:
