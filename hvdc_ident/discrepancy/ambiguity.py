@@ -37,7 +37,10 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
             same = Rival(other.effect, other.at, behind, FrozenMap(), other.source, refitted=False)
             group += [same, *_as_droop(same, signed, droop)]
     group += _unfitted(found, best, options, droop)
-    return tuple(sorted(group, key=lambda r: r.delta_bic))
+    each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
+    for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
+        each.setdefault((r.effect, r.at, r.source), r)
+    return tuple(each.values())
 
 
 def _unfitted(found: Round, best: float, options: Options, droop: bool) -> list[Rival]:
