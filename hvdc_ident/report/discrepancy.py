@@ -76,3 +76,4 @@ def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
     for axes in (above, below):
         axes.grid(True, color=MARK, alpha=0.3)
         axes.tick_params(labelsize=7)
+        axes.minorticks_off()  # over three decades nobody reads them, and they take half of the time to draw
