@@ -41,8 +41,8 @@ def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
     words = {n: quantity(v, units.get(n, "")) for n, v in sizes.items()}
     at = placed.candidate.at
     words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": placed.candidate.source}
-    if entry.late is not None:
-        words["late"] = quantity(entry.late(sizes), "s")
+    if (late := entry.late_by(sizes)) is not None:
+        words["late"] = quantity(late, "s")
     text = entry.sentence
     for name, value in words.items():
         text = text.replace("{" + name + "}", value)

@@ -48,7 +48,7 @@ class Found:
     @property
     def late(self) -> float | None:
         """By how long it delays a slow signal, s; None for what is no delay of any kind."""
-        return _late(self.effect, {n: size.value for n, size in self.parameters.items()})
+        return effects()[self.effect].late_by({n: size.value for n, size in self.parameters.items()})
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Rival:
     @property
     def late(self) -> float | None:
         """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
-        return _late(self.effect, self.parameters) if self.parameters else None
+        return effects()[self.effect].late_by(self.parameters) if self.parameters else None
 
 
 @dataclass(frozen=True)
@@ -183,8 +183,3 @@ def _named(value: Found | Rival | Line) -> dict[str, Any]:
 def _member(value: Found | Rival) -> dict[str, Any]:
     """The same, with `late` only where it is one kind of delay or another."""
     return _named(value) | ({} if value.late is None else {"late": value.late})
-
-
-def _late(effect: str, values: Mapping[str, float]) -> float | None:
-    found = effects()[effect].late
-    return None if found is None else float(found(values))

@@ -36,7 +36,7 @@ RACE = Race()
 HEAT = Race(sprint=5, reach=0.4)
 """Of those many a short sprint."""
 ELSEWHERE = 40
-"""Other places at most at which the best effect is refitted."""
+"""Other places at most at which the best effects are refitted."""
 LEADERS = 4
 """Of the refits the best, whose places other kinds of delay are tried at."""
 STARTS = 2
@@ -196,13 +196,14 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
     trials += _trials(search, opened, more, f"round {number}: refits beside the best", trials)
     trials += _elsewhere(search, opened, picks, trials, number)
-    trials = _best_each([*trials, *_as_late(search, opened, trials, number)])
+    kin = _as_late(opened, trials)
+    trials = _begun(search, opened, trials, kin, number)
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1 and _far(before, trials):
         tried += [t.pick.candidate for t in trials]
         wide = others(picks, scores, found, tried, WIDER)
         trials += _trials(search, opened, wide, f"round {number}: the other candidates", trials, HEAT)
-        trials = _best_each([*trials, *_as_late(search, opened, trials, number)])
+        trials = _begun(search, opened, trials, [p for p in _as_late(opened, trials) if p not in kin], number)
     if number == 1 and _far(before, trials):
         opened, extra = _scanned(search, opened, nominal, number)
         trials += _trials(search, opened, extra, f"round {number}: refits of the closer look")
@@ -211,13 +212,13 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     return closed(search, opened, trials, number)
 
 
-def _as_late(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> list[Trial]:
-    """Refits of the other kinds of delay at the best places of one, begun where they delay a slow signal by as much.
+def _as_late(opened: Round, trials: Sequence[Trial]) -> list[Pick]:
+    """The other kinds of delay at the best places of one, to be begun where they delay a slow signal by as much.
 
     A score is had at few sizes, and from a wrong one no slope leads to the right one: a window to another of its zeros.
     """
     found = opened.candidates
-    sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2)
+    sound = _sound(trials)
     goals: dict[tuple[str, ...], float] = {}
     for t in sound[:LEADERS]:
         late = _late(t)
@@ -232,11 +233,25 @@ def _as_late(search: Search, opened: Round, trials: Sequence[Trial], number: int
         lates = {n: late_of(p.values) for n, p in enumerate(c.probes)}
         nearest = sorted((n for n in lates if lates[n] > 0.0), key=lambda n: _apart(lates[n], goal))
         picks += [Pick(k, n, goal / lates[n], opened.score_p(k)[0]) for n in nearest[:STARTS]]
+    return picks
+
+
+def _begun(search: Search, opened: Round, trials: Sequence[Trial], picks: Sequence[Pick], number: int) -> list[Trial]:
+    """The trials with those picks, of each candidate the best.
+
+    A period that has to be met is looked for where there is something left for it to explain.
+    """
     text = f"round {number}: as late as the best"
     begun = _trials(search, opened, picks, text, trials)
-    # A period that has to be met is looked for where there is something left for it to explain.
-    left = bool(sound) and (excess(sound[0].refit) or _misses(sound[0].refit))
-    return _again(search, found, begun, text, most=1) if left else begun
+    sound = _sound(trials)
+    if sound and (excess(sound[0].refit) or _misses(sound[0].refit)):
+        begun = _again(search, opened.candidates, begun, text, most=1)
+    return _best_each([*trials, *begun])
+
+
+def _sound(trials: Sequence[Trial]) -> list[Trial]:
+    """Those that came to a result, the least chi2 first."""
+    return sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2)
 
 
 def _apart(a: float, b: float) -> float:
@@ -247,8 +262,7 @@ def _apart(a: float, b: float) -> float:
 def _late(trial: Trial) -> float | None:
     """By how long the effect that a trial added delays a slow signal, s; None for what is no kind of delay."""
     placed = trial.refit.placed[-1]
-    late = effects()[placed.candidate.effect].late
-    return None if late is None else late(trial.refit.sizes(placed))
+    return effects()[placed.candidate.effect].late_by(trial.refit.sizes(placed))
 
 
 def _best_each(trials: Sequence[Trial]) -> list[Trial]:
@@ -267,11 +281,11 @@ def _elsewhere(
     """Refits of the best effects at every other place where they score more than noise: the places that cannot be told from
     theirs are to be had by no other way, for a score is that of one size and of gains that are biased."""
     found = opened.candidates
-    sound = [t for t in trials if not t.refit.failure]
+    sound = _sound(trials)
     if not sound:
         return []
-    best = min(t.refit.chi2 for t in sound)
-    leading = {found[t.pick.candidate].effect for t in sound if t.refit.chi2 - best < 2.0 * search.options.set_bic}
+    least = sound[0].refit.chi2 + 2.0 * search.options.set_bic
+    leading = {found[t.pick.candidate].effect for t in sound if t.refit.chi2 < least}
     tried = {t.pick.candidate for t in trials} | {p.candidate for twins in opened.same.values() for p in twins}
     threshold = opened.scores.threshold(search.options.significance)
     left = [

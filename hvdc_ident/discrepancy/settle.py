@@ -63,7 +63,7 @@ def _looked_again(
     own = here.placed[k].candidate
     again, mine = _with(again, own)
     sound = [t for t in again.trials if t.pick.candidate != mine]
-    tried = {again.candidates[t.pick.candidate].label for t in sound}
+    tried = {own.label, *(again.candidates[t.pick.candidate].label for t in sound)}
     refits: list[tuple[Pick, Job]] = []
     for trial in found.trials[: OTHERS + 1]:
         placed = trial.refit.placed[-1]
@@ -71,7 +71,9 @@ def _looked_again(
         with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival
             job = job_of(first, here, among, {k: trial.refit.sizes(placed)})
             candidate = job.placed[k].candidate
-            if candidate.label not in (*tried, own.label):
+            # Places behind an effect that is left out are one place without it.
+            if candidate.label not in tried:
+                tried.add(candidate.label)
                 again, number_of = _with(again, candidate)
                 refits.append((Pick(number_of, 0, 1.0, 0.0), job))
     texts = [f"again with the others: {again.candidates[p.candidate].label}" for p, _ in refits]

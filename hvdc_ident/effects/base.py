@@ -171,6 +171,10 @@ class Effect:
     restless: bool = False
     late: Callable[[Mapping[str, float]], float] | None = None
 
+    def late_by(self, values: Mapping[str, float]) -> float | None:
+        """By how long it delays a slow signal with these values, s; None for what is no delay of any kind."""
+        return None if self.late is None else float(self.late(values))
+
     @property
     def scanned(self) -> bool:
         """Whether looking for it takes a closer look at many sizes."""

@@ -70,7 +70,7 @@ def pending(
     limit: of each part; least: size of a hidden effect.
     """
     every = [factorial(seed)] if full else [designs(p, seed) for p in parts]
-    tables = [[d for d in table if d.size >= least or not d.effects or d.part == "clean"][:limit] for table in every]
+    tables = [[d for d in table if d.size >= least or d.part == "clean"][:limit] for table in every]
     shares = [(k / len(t), n, d) for n, t in enumerate(tables) for k, d in enumerate(t)]
     for _, _, design in sorted(shares, key=lambda s: s[:2]):
         if design.name not in done:
