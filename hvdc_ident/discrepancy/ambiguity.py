@@ -10,7 +10,7 @@ from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.rounds import Round
-from hvdc_ident.discrepancy.select import Trial, at_edge, best_of, clear
+from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_of, clear
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.frozen import FrozenMap
 
@@ -23,8 +23,7 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     assert found.winner is not None
     best = max(t.gain for t in found.trials)
     group: list[Rival] = []
-    for trial in found.trials:
-        behind = best - trial.gain
+    for trial, behind in zip(found.trials, behinds(found.trials), strict=True):
         if behind > options.set_bic or (trial is not found.winner and _is_nothing(trial)):
             continue
         c = found.candidates[trial.pick.candidate]

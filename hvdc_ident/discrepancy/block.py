@@ -6,7 +6,7 @@ a linear effect of a signal of straight pieces. What the steps cannot take (a de
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.march import march
-from hvdc_ident.effects import EffectUse, alone
+from hvdc_ident.effects import Effect, EffectUse, alone
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
@@ -37,11 +37,15 @@ _NUMPY: dict[str, Any] = {
 }  # fmt: skip
 
 
+Quick = Callable[[Array, Mapping[str, Array]], Array]
+"""Y, (K, nc), of u, (K, nc), and parameters, (1, nc) each."""
+
+
 class Block:
     """One effect's equations, from the signals u and source (K, nc) to y (K, nc)."""
 
-    def __init__(self, model: Model) -> None:
-        self.model = model
+    def __init__(self, model: Model, quick: Quick | None = None) -> None:
+        self.model, self.quick = model, quick
         g = self.graph = Graph()
         self._orders: dict[tuple[int, ...], list[int]] = {}
         self.states = tuple(model.states)
@@ -105,6 +109,8 @@ class Block:
 
     def run(self, parameters: Mapping[str, Array], time: Array, u: Array, source: Array | None) -> Array:
         """Y, (K, nc), of u and source, (K, nc), at instants (K,), with each parameter (nc,)."""
+        if self.quick is not None:
+            return self.quick(u, {n: v[None] for n, v in parameters.items()})
         if not self.steps:
             return self._simulated(parameters, time, u, source)
         with np.errstate(all="ignore"):
@@ -129,11 +135,10 @@ class Block:
         for q, signal in enumerate(signals):
             if q < len(self.times):
                 when = time[:, None] - self.value([self.times[q]], whole)[0]
+                found.append(_at(signal, time, np.broadcast_to(when, u.shape)))
             else:
                 period, compute = self.value(list(self.periods[q - len(self.times)]), whole)
-                since = time[:, None] - time[0] - compute
-                when = time[0] + np.floor(since / period + 1e-9) * period
-            found.append(_at(signal, time, np.broadcast_to(when, u.shape)))
+                found.append(_held(signal, time, period, compute))
         return found
 
     def _states(self, whole: list[Any], time: Array, own: list[Array]) -> list[Array]:
@@ -217,6 +222,18 @@ def _at(signal: Array, time: Array, when: Array) -> Array:
     return np.asarray(below + share * (signal[low + 1, columns] - below))
 
 
+def _held(signal: Array, time: Array, period: Any, compute: Any) -> Array:
+    """The signal (K, nc) as it was sampled, `compute` earlier at least; before the first sample its first value."""
+    since = time - time[0]
+    y = np.empty_like(signal)
+    each = zip(np.broadcast_to(period, signal.shape[1:]), np.broadcast_to(compute, signal.shape[1:]), strict=True)
+    for c, (apart, late) in enumerate(each):
+        number = np.floor((since - late) / apart + 1e-9).astype(np.intp)
+        samples = time[0] + np.arange(number[0], number[-1] + 1) * apart
+        y[:, c] = _at(signal[:, c : c + 1], time, samples[:, None])[number - number[0], 0]
+    return y
+
+
 def _order(graph: Graph, roots: list[int]) -> list[int]:
     """Every node the roots depend on, those behind switches too, arguments first."""
     seen: set[int] = set()
@@ -260,7 +277,13 @@ def _made(effect: str, present: tuple[str, ...], source: bool) -> Block:
     # Any value away from neutral gives the structure; the run takes its own values.
     values = {n: _away(q) if n in present else q.value for n, q in entry.parameters.items()}
     use = EffectUse(effect, ("u",), FrozenMap(values), prefix="own", source="source" if source else "")
-    return Block(alone(use, source))
+    return Block(alone(use, source), _quick(entry))
+
+
+def _quick(entry: Effect) -> Quick | None:
+    """The effect's own short cut, of a block's parameters."""
+    short = entry.quick
+    return short and (lambda u, p: short(u, {n: p[parameter(n)] for n in entry.parameters}))
 
 
 def _away(q: Any) -> float:

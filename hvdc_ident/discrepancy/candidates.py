@@ -20,8 +20,8 @@ from hvdc_ident.trajectory import Array
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""
 
-SAME = 0.99999
-"""Correlation from which two signals are one, as a source."""
+SAME = 1e-9
+"""Of their size: by how much two signals may differ that are one, as a source."""
 STILL = 1e-9
 
 
@@ -204,10 +204,11 @@ def source_signals(model: AnyModel, signals: Signals) -> tuple[str, ...]:
         size = float(np.linalg.norm(whole))
         if size <= STILL * max(1.0, float(np.abs(np.concatenate(signals[p])).max())):
             continue
-        if any(abs(float(whole @ s)) / size > SAME for s in shapes):
+        shape = whole / size
+        if any(np.linalg.norm(shape - np.sign(shape @ s) * s) < SAME for s in shapes):
             continue
         kept.append(p)
-        shapes.append(whole / size)
+        shapes.append(shape)
     return tuple(kept)
 
 

@@ -87,7 +87,7 @@ def diagnose(
     )
     if not inside:
         notes = (*notes, CLOSED)
-    return _assembled(search, model, first, outcome, judgement, other, free, notes)
+    return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
 
 
 def _model_of(subject: AnyModel | Simulator) -> AnyModel:

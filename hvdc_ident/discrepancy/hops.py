@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run, signal
-from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, scanned
+from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, sized
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
@@ -76,7 +76,7 @@ def _closely(here: Refit) -> Array:
 def _size(here: Refit) -> tuple[int, float, float, float]:
     """Of the size that has to be met: its place among the unknowns, its value, its bounds."""
     placed = here.placed[-1]
-    name = scanned(placed.candidate)
+    name = sized(placed.candidate)
     at = here.problem.names.index(placed.names[name])
     return at, float(here.theta[at]), *placed.bounds[name]
 
@@ -87,7 +87,7 @@ def _held(here: Refit) -> float:
     Raises SimulationError where that signal cannot be had.
     """
     placed = here.placed[-1]
-    if effects()[placed.candidate.effect].parameters[scanned(placed.candidate)].unit == "s":
+    if effects()[placed.candidate.effect].parameters[sized(placed.candidate)].unit == "s":
         return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
     return max(float(np.abs(u).max()) for u in signal(here, placed.use.at[0]).values())
 

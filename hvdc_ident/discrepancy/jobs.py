@@ -28,7 +28,8 @@ def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job
         placed.append(one)
         sizes.append(start)
     asked = np.concatenate(sizes)
-    begins = [_begin(before, before.theta, asked)]
+    begins = [_begin(before, np.array(p.gains), asked) for p in picks[:1] if p.gains]
+    begins.append(_begin(before, before.theta, asked))
     if len(picks) == 1 and not 0.5 <= abs(picks[0].factor) <= 2.0:
         at = moved(found[picks[0].candidate], picks[0].probe, float(np.sign(picks[0].factor)) or 1.0)
         begins.append(_begin(before, before.theta, np.array([at[n] for n in placed[-1].bounds])))

@@ -44,7 +44,7 @@ def objections(
         shown = not material and material_gap(*fitted, options.holdout_share, None, None)
         # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
         # nothing to say, and the fitted ones show the size.
-        if not (shown and ((was**2 - now**2) * _unseen_rows(refit) > AGREED or silent(before, refit))):
+        if not (shown and ((was**2 - now**2) * unseen_rows(refit) > AGREED or silent(before, refit))):
             return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
     if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
         return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
@@ -56,10 +56,10 @@ def evidence(before: Refit, trial: Trial, share: float) -> float:
     was, now = unseen(before), unseen(trial.refit)
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
         return trial.gain
-    return trial.gain + share * (was**2 - now**2) * _unseen_rows(trial.refit)
+    return trial.gain + share * (was**2 - now**2) * unseen_rows(trial.refit)
 
 
-def _unseen_rows(refit: Refit) -> int:
+def unseen_rows(refit: Refit) -> int:
     """Rows of the data that judge: the held-out ones, or all of the fitted ones, each left out in turn."""
     held = [e for e in refit.problem.experiments if e.role == "holdout" and e.outputs]
     return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows

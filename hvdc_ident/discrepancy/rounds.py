@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,21 +12,23 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate, candidates, kind_of
 from hvdc_ident.discrepancy.hops import hop
-from hvdc_ident.discrepancy.jobs import job
+from hvdc_ident.discrepancy.jobs import as_given, job
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.objections import evidence, objections
+from hvdc_ident.discrepancy.objections import evidence, objections, unseen_rows
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.race import Race, done
 from hvdc_ident.discrepancy.refit import Job, Placed, Refit, unseen
-from hvdc_ident.discrepancy.scan import joined, scan
+from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.scan import View, bent, joined, scan, widened
 from hvdc_ident.discrepancy.scores import Path, Scores, runs, scored, signature_rows
-from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, best_of, neighbours, others, shortlist
+from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, behinds, best_of, neighbours, others, shortlist
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.tones import tones
 from hvdc_ident.effects import effects
-from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
 from hvdc_ident.trajectory import Array
 
 LOOKED_AT = 80
@@ -37,16 +40,24 @@ HEAT = Race(sprint=5, reach=0.4)
 """Of those many a short sprint."""
 ELSEWHERE = 40
 """Other places at most at which the best effects are refitted."""
+ALIKE = 0.9
+"""Share of the best fall of chi2 from which a refit is tried in the effect's other forms."""
+FORMS = 16
+"""Of these refits at most."""
 LEADERS = 4
 """Of the refits the best, whose places other kinds of delay are tried at."""
 STARTS = 2
 """Sizes that another kind of delay is begun at."""
+PRICE = 8.0
+"""Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
 LIKE = 0.3
 """Of a logarithm: up to where two delays are alike."""
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
 NEAR = 0.05
 """Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
+CLOSE = 0.01
+"""The same where a closer look is to be saved."""
 AGAIN = 4
 """Refits of one effect at most whose size is looked for again beside the gains they came to."""
 
@@ -138,8 +149,21 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         return replace(opened, why="no candidate leaves a trace in these data")
     p = scores.p(picks[0].score)
     if p > options.significance:
-        return replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
+        nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
+        return _met(search, nothing, nominal) if number == 1 and excess(before) else nothing
     return _refitted(search, replace(opened, significant=True), nominal, number, picks)
+
+
+def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
+    """The round after a closer look alone, where nothing else has a score though more than noise is left."""
+    text = "round 1: refits of the closer look"
+    seen, picks = _scanned(search, opened, nominal, 1)
+    if not picks or seen.scores.p(max(p.score for p in picks)) > search.options.significance:
+        return opened
+    trials = _trials(search, seen, picks, text)
+    if _far(opened.before, trials):
+        trials = _again(search, seen.candidates, trials, "round 1: once more")
+    return closed(search, replace(seen, significant=True, why=""), trials, 1)
 
 
 def excess(refit: Refit) -> bool:
@@ -147,8 +171,10 @@ def excess(refit: Refit) -> bool:
     return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))
 
 
-def _scanned(search: Search, opened: Round, nominal: Nominal, number: int) -> tuple[Round, tuple[Pick, ...]]:
-    """The round with the sizes that a closer look found, and the picks to refit for them."""
+def _scanned(
+    search: Search, opened: Round, nominal: Nominal, number: int, wanted: Callable[[Candidate], bool] = lambda _: True
+) -> tuple[Round, tuple[Pick, ...]]:
+    """The round with the sizes that a closer look found, and the picks to refit for them. wanted: what is looked at."""
     before, found, options = opened.before, opened.candidates, search.options
     dense = candidates(
         before.model,
@@ -160,18 +186,42 @@ def _scanned(search: Search, opened: Round, nominal: Nominal, number: int) -> tu
     )
     known = {(c.effect, c.at): k for k, c in enumerate(found)}
     dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(before, c))
+    if all(isinstance(p, Along) for p in opened.paths.values()):
+        dense += tuple(widened(c) for c in found if not c.still and bent(c))
+    dense = tuple(c for c in dense if wanted(c))
     if not dense:
         return opened, ()
     text = f"round {number}: a closer look at {', '.join(dict.fromkeys(c.effect for c in dense))}"
     seen = scan(
-        before, nominal, dense, options.bootstraps, search.seed + number, search.executor, search.progress, text
+        before,
+        _views(before, nominal, opened.paths),
+        dense,
+        options.bootstraps,
+        search.seed + number,
+        search.executor,
+        search.progress,
+        text,
     )
     found = joined(found, [s.candidate for s in seen.spots])
     at = [known[s.candidate.effect, s.candidate.at] for s in seen.spots]
     columns = tuple(Column(k, len(found[k].probes) - 1) for k in at)
     scores = opened.scores.joined(replace(seen.scores, columns=columns, beside=seen.largest))
-    picks = [Pick(c.candidate, c.probe, 1.0, s.score) for c, s in zip(columns, seen.spots, strict=True)]
+    picks = [
+        Pick(c.candidate, c.probe, 1.0, s.score, tuple(s.theta.tolist()))
+        for c, s in zip(columns, seen.spots, strict=True)
+    ]
     return replace(opened, candidates=found, scores=scores), tuple(picks)
+
+
+def _views(before: Refit, nominal: Nominal, paths: Mapping[str, Path]) -> list[View]:
+    """The model at its optimum, and with the gains as they were given, where one has moved so far that it may stand for what
+    is missing: a loop with such gains answers otherwise."""
+    views, given = [View(nominal, paths)], as_given(before)
+    if given is not None and isinstance(before.model, Model):
+        there = replace(nominal, theta=given)
+        with suppress(SimulationError):  # with the gains as given it need not run
+            views.append(View(there, runs(before.model, there)))
+    return views
 
 
 def _worth_a_scan(before: Refit, candidate: Candidate) -> bool:
@@ -191,25 +241,60 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     opened = replace(opened, same=same)
     trials = _trials(search, opened, chosen, f"round {number}: refits")
     tried = [t.pick.candidate for t in trials] + [p.candidate for twins in same.values() for p in twins]
-    sound = sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2 + 8.0 * t.refit.count)
+    sound = _sound(trials)
     best = [found[t.pick.candidate] for t in sound[:2]]
     more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
     trials += _trials(search, opened, more, f"round {number}: refits beside the best", trials)
     trials += _elsewhere(search, opened, picks, trials, number)
+    forms = _other_forms(opened, trials, before.chi2)
+    trials = _best_each([*trials, *_trials(search, opened, forms, f"round {number}: in another form", trials, HEAT)])
     kin = _as_late(opened, trials)
     trials = _begun(search, opened, trials, kin, number)
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
+    if number == 1:
+        far = _far(before, trials, CLOSE)
+        opened, extra = _scanned(search, opened, nominal, number, lambda c: far or _akin(c, opened, trials))
+        closer = _trials(search, opened, extra, f"round {number}: refits of the closer look", trials)
+        trials = _best_each([*trials, *closer])
+    if number == 1 and _far(before, trials):
+        trials = _again(search, opened.candidates, trials, f"round {number}: once more")
     if number == 1 and _far(before, trials):
         tried += [t.pick.candidate for t in trials]
         wide = others(picks, scores, found, tried, WIDER)
         trials += _trials(search, opened, wide, f"round {number}: the other candidates", trials, HEAT)
         trials = _begun(search, opened, trials, [p for p in _as_late(opened, trials) if p not in kin], number)
-    if number == 1 and _far(before, trials):
-        opened, extra = _scanned(search, opened, nominal, number)
-        trials += _trials(search, opened, extra, f"round {number}: refits of the closer look")
-    if number == 1 and _far(before, trials):
-        trials = _again(search, opened.candidates, trials, f"round {number}: once more")
     return closed(search, opened, trials, number)
+
+
+def _other_forms(opened: Round, trials: Sequence[Trial], was: float) -> list[Pick]:
+    """The best candidates with other parts of the effect, where it is made of optional ones: a score is that of one of them.
+
+    was: chi2 of the model before. A loss in proportion to a current is no better told from its square by the gains as they
+    are than other sizes are.
+    """
+    found, scores = opened.candidates, opened.scores
+    sound = _sound(trials)
+    most = was - min((t.refit.chi2 for t in sound), default=was)
+    good = [t for t in sound if was - t.refit.chi2 > ALIKE * most]
+    picks: list[Pick] = []
+    for k in dict.fromkeys(t.pick.candidate for t in good):
+        done_here = {frozenset(found[k].probes[t.pick.probe].free) for t in trials if t.pick.candidate == k}
+        columns = [(float(scores.t[n]), n, c.probe) for n, c in enumerate(scores.columns) if c.candidate == k]
+        for score, n, probe in sorted(columns, reverse=True):
+            form = frozenset(found[k].probes[probe].free)
+            if score > 0 and form not in done_here:
+                done_here.add(form)
+                picks.append(Pick(k, probe, float(scores.expected[n]), score))
+    return picks[:FORMS]
+
+
+def _akin(candidate: Candidate, opened: Round, trials: Sequence[Trial]) -> bool:
+    """Whether a candidate is worth a closer look because of what is best so far: a bend where something bends its signal, at
+    any place, and a sampler where something delays it."""
+    leading = [opened.candidates[t.pick.candidate] for t in _sound(trials)[:LEADERS]]
+    if effects()[candidate.effect].late is not None:
+        return any(effects()[c.effect].late is not None and c.at == candidate.at for c in leading)
+    return any(bent(c) for c in leading) and not effects()[candidate.effect].scanned
 
 
 def _as_late(opened: Round, trials: Sequence[Trial]) -> list[Pick]:
@@ -250,8 +335,8 @@ def _begun(search: Search, opened: Round, trials: Sequence[Trial], picks: Sequen
 
 
 def _sound(trials: Sequence[Trial]) -> list[Trial]:
-    """Those that came to a result, the least chi2 first."""
-    return sorted((t for t in trials if not t.refit.failure), key=lambda t: t.refit.chi2)
+    """Those that came to a result, the best first."""
+    return sorted((t for t in trials if not t.refit.failure), key=_cost)
 
 
 def _apart(a: float, b: float) -> float:
@@ -270,9 +355,15 @@ def _best_each(trials: Sequence[Trial]) -> list[Trial]:
     kept: dict[int, Trial] = {}
     for t in trials:
         had = kept.get(t.pick.candidate)
-        if had is None or had.refit.failure or (not t.refit.failure and t.refit.chi2 < had.refit.chi2):
+        if had is None or had.refit.failure or (not t.refit.failure and _cost(t) < _cost(had)):
             kept[t.pick.candidate] = t
     return list(kept.values())
+
+
+def _cost(trial: Trial) -> float:
+    """What a refit leaves of all data, and what its parameters cost, before it is known what BIC counts by."""
+    refit, held = trial.refit, unseen(trial.refit)
+    return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
 
 def _elsewhere(
@@ -284,9 +375,13 @@ def _elsewhere(
     sound = _sound(trials)
     if not sound:
         return []
-    least = sound[0].refit.chi2 + 2.0 * search.options.set_bic
-    leading = {found[t.pick.candidate].effect for t in sound if t.refit.chi2 < least}
-    tried = {t.pick.candidate for t in trials} | {p.candidate for twins in opened.same.values() for p in twins}
+    margin = 2.0 * search.options.set_bic
+    least, cost = min(t.refit.chi2 for t in sound) + margin, _cost(sound[0]) + margin
+    leading = {found[t.pick.candidate].effect for t in sound if t.refit.chi2 < least or _cost(t) < cost}
+    twins = {
+        p.candidate for k, same in opened.same.items() for p in same if found[p.candidate].source == found[k].source
+    }
+    tried = {t.pick.candidate for t in trials} | twins
     threshold = opened.scores.threshold(search.options.significance)
     left = [
         p for p in picks if found[p.candidate].effect in leading and p.candidate not in tried and p.score > threshold
@@ -296,11 +391,11 @@ def _elsewhere(
     )
 
 
-def _far(before: Refit, trials: Sequence[Trial]) -> bool:
-    """Whether no refit comes near the noise, on the fitted data and on the others, or near enough."""
+def _far(before: Refit, trials: Sequence[Trial], near: float = NEAR) -> bool:
+    """Whether no refit comes near the noise, on the fitted data and on the others, or near enough: to a share of what was."""
     was = _left(before)
     return all(
-        (excess(t.refit) or _misses(t.refit)) and _left(t.refit) > NEAR * was for t in trials if not t.refit.failure
+        (excess(t.refit) or _misses(t.refit)) and _left(t.refit) > near * was for t in trials if not t.refit.failure
     )
 
 
@@ -318,27 +413,26 @@ def _left(refit: Refit) -> float:
 def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> Round:
     """The round with its refits ranked and its winner, or what speaks against the best.
 
-    Of those that explain the fitted data equally well the winner is the one that with the held-out data explains most.
+    Ranked by what the fitted and the held-out data say together.
     """
     before, found = opened.before, opened.candidates
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
         return replace(opened, failed=failed, why="no candidate could be refitted")
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
-    ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.gain)
-    level = [t for t in ranked if ranked[0].gain - t.gain <= search.options.set_bic]
+    ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
+    level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
     refused = {id(t): against(search, before, t, opened.scores, first=number == 1) for t in level}
-    standing = [t for t in level if not refused[id(t)]]
-    share = ruler.effective / ruler.rows / ruler.scale
-    winner = max(standing, key=lambda t: evidence(before, t, share), default=None)
+    winner = next((t for t in level if not refused[id(t)]), None)
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
 
 
 def gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
-    """The trial with what it gains in BIC over the model before."""
+    """The trial with what it gains in BIC over the model before, and what the held-out data add to that."""
     more = trial.refit.count - before.count
-    return Trial(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
+    own = Trial(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
+    return replace(own, evidence=evidence(before, own, ruler.effective / ruler.rows / ruler.scale))
 
 
 def against(search: Search, before: Refit, trial: Trial, scores: Scores, *, first: bool) -> str:

@@ -1,23 +1,29 @@
-"""A closer look at effects whose size has to be met: levels of a quantiser, the period of a sampler.
+"""A closer look at effects whose trace is another one at every size, or with every bias of the gains.
 
-Neighbouring sizes leave traces with little in common, so a few finite sizes miss them and no slope leads there; inside a
-loop their traces are not near those of a linear answer either. The model itself is run with many sizes instead, the
-gains as they stand; around the best, closer still.
+Levels of a quantiser and periods of a sampler have to be met: neighbouring sizes leave traces with little in common, so a
+few finite sizes miss them and no slope leads there. What bends its signal (a limit, a play, a rate limit) shows where that
+signal is, and gains that are biased by what is missing put it elsewhere. Many sizes are put on the slot's signal as the
+model has it and as the records tell it (`inversion`); at the best the model itself is run, around those that have to
+be met at sizes closer still, with the gains that would go with them. A model that is closed inside is run from the
+beginning, at sizes that have to be met.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.block import block, parameter
 from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.inversion import Inversion
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit, added
-from hvdc_ident.discrepancy.scores import Scores, two_sided
-from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.scores import Path, Scores, two_sided
+from hvdc_ident.discrepancy.signatures import Column, is_linear, kind_of
 from hvdc_ident.effects import Probe, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit.executor import Executor, Progress, mapped
@@ -26,24 +32,43 @@ from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
-SPOTS = 6
-"""Sizes of an effect, the best by score at any place, around which is looked closer still."""
-PLACES = 3
+SPOTS = 10
+"""Sizes of an effect, the best at any place, at which the model is run."""
+EACH = 3
+"""Of these at one place at most."""
+PLACES = 4
 """Places of an effect that are refitted then."""
-BETWEEN = 10
+WORTH = 0.3
+"""Share of the best fall of chi2 that another one has to bring to be refitted too."""
+BENT = 50
+"""Sizes of an effect that has not to be met."""
+WIDE = 20.0
+"""Below the least and above the largest probe of such an effect: how far its sizes reach."""
+BETWEEN = 7
 """Sizes between one of the scan and its neighbour, then."""
+TOGETHER = 400
+"""Sizes whose traces are worked out at a time."""
+THIN = 150
+"""Sizes at which a closed model is run at first."""
 QUICK = Tolerance(rtol=1e-5, atol=1e-8, max_steps=600, search=False)
-"""Of a scan's runs: one that takes more steps, chattering in a loop, or hardly comes to rest, is passed over."""
+"""Of runs at many sizes: one that takes more steps, chattering in a loop, or hardly comes to rest, is passed over."""
+PATIENT = replace(QUICK, max_steps=5000, search=True)
+"""The same where few sizes are left: a record that never rests crosses hundreds of levels."""
 SAMPLE = 16
 """Sizes, spread over all, that are run first: where most of them are passed over, so is the place."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Spot:
-    """Where a scan was best at one place: the candidate with that size alone, and its score."""
+    """A size worth a look: the candidate with it alone, or with the sizes around it, and its score.
+
+    fall: by how much chi2 would fall. theta: the unknowns of the model before that go with it.
+    """
 
     candidate: Candidate
     score: float
+    fall: float
+    theta: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,19 +81,37 @@ class Scan:
 
 
 @dataclass(frozen=True, eq=False)
+class View:
+    """The model with some gains, and its runs with their answers, by experiment."""
+
+    nominal: Nominal
+    paths: Mapping[str, Path]
+
+
+@dataclass(frozen=True, eq=False)
+class Slot:
+    """What is looked at through one slot's signal: the model's runs, the candidates there, and (N, B) noise."""
+
+    view: View
+    found: tuple[Candidate, ...]
+    noise: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Job:
-    """One place: the model without the effect and what it leaves, the candidate with all sizes, and what traces are
-    multiplied with."""
+    """One place: the model without the effect and what it leaves, the candidate with all sizes, what traces are
+    multiplied with, and how patiently the model is run."""
 
     before: Refit
     residual: Array
     candidate: Candidate
     right: Array
+    tolerance: Tolerance
 
 
 def scan(
     before: Refit,
-    nominal: Nominal,
+    views: Sequence[View],
     dense: Sequence[Candidate],
     bootstraps: int,
     seed: int,
@@ -76,21 +119,29 @@ def scan(
     progress: Progress | None,
     text: str,
 ) -> Scan:
-    """The best sizes of effects that are scanned, and how large a score noise alone gives among so many.
+    """The best sizes of effects that are scanned, and how large a score noise alone gives among those that were run.
 
-    before: the model without them; nominal: the same at its optimum.
+    before: the model without them; views: the same at its optimum, and with other gains that the records may be looked
+    at with.
     """
-    right = _right_sides(nominal, bootstraps, seed)
-    rough = _looked(before, nominal, dense, right, executor, progress, text)
-    best = [_neighbourhood(dense[c.candidate], c.probe) for c in _tops(dense, rough)]
-    fine = _looked(before, nominal, best, right, executor, progress, f"{text}, closer still")
+    nominal = views[0].nominal
+    right, known = _right_sides(nominal, bootstraps, seed), nominal.basis.shape[1]
+    if all(isinstance(p, Along) for p in views[0].paths.values()):
+        spots, largest = _told(views, dense, right[:, 1 + known :], executor, progress, text)
+    else:
+        thin = [replace(c, probes=c.probes[:: max(len(c.probes) // THIN, 1)]) for c in dense]
+        rough = _looked([Job(before, nominal.residual, c, right, QUICK) for c in thin], known, executor, progress, text)
+        spots, largest = _spots(thin, rough, before.theta), rough.largest
+    best = _tops(spots)
+    jobs = [Job(replace(before, theta=s.theta), nominal.residual, s.candidate, right, PATIENT) for s in best]
+    fine = _looked(jobs, known, executor, progress, f"{text}, closer still")
     chosen = _best(best, fine)
+    kept = [replace(best[c.candidate], candidate=_alone(best[c.candidate].candidate, c.probe)) for c in chosen]
     at = [fine.columns.index(c) for c in chosen]
-    kept = [replace(best[c.candidate], probes=(best[c.candidate].probes[c.probe],)) for c in chosen]
-    spots = tuple(Spot(c, float(fine.t[k])) for c, k in zip(kept, at, strict=True))
+    spots = [replace(s, score=float(fine.t[k]), fall=float(fine.falls[k])) for s, k in zip(kept, at, strict=True)]
     parts = {n: getattr(fine, n)[at] for n in ("raw", "size", "left", "noise", "sound", "two_sided")}
     columns = tuple(Column(i, 0) for i in range(len(kept)))
-    return Scan(spots, Scores(columns, **parts), np.maximum(rough.largest, fine.largest))
+    return Scan(tuple(spots), Scores(columns, **parts), np.maximum(largest, fine.largest))
 
 
 def _right_sides(nominal: Nominal, bootstraps: int, seed: int) -> Array:
@@ -100,58 +151,163 @@ def _right_sides(nominal: Nominal, bootstraps: int, seed: int) -> Array:
     return np.hstack(parts)
 
 
-def _tops(found: Sequence[Candidate], scores: Scores) -> list[Column]:
-    """The best sizes of every effect at any place, neighbours of better ones left out."""
-    kept: dict[str, list[Column]] = {}
-    for c in _falling(scores):
-        same = kept.setdefault(found[c.candidate].effect, [])
-        near = any(k.candidate == c.candidate and abs(k.probe - c.probe) <= 1 for k in same)
-        if len(same) < SPOTS and not near:
-            same.append(c)
-    return [c for group in kept.values() for c in group]
-
-
-def _best(found: Sequence[Candidate], scores: Scores) -> list[Column]:
-    """The best size at each of the best places of every effect."""
-    kept: dict[str, dict[tuple[str, ...], Column]] = {}
-    for c in _falling(scores):
-        places = kept.setdefault(found[c.candidate].effect, {})
-        if len(places) < PLACES:
-            places.setdefault(found[c.candidate].at, c)
-    return [c for places in kept.values() for c in places.values()]
-
-
-def _falling(scores: Scores) -> list[Column]:
-    """The columns with something to score, the best first."""
-    return [scores.columns[k] for k in np.argsort(-scores.t, kind="stable") if scores.t[k] > 0]
-
-
-def _looked(
-    before: Refit,
-    nominal: Nominal,
-    found: Sequence[Candidate],
-    right: Array,
+def _told(
+    views: Sequence[View],
+    dense: Sequence[Candidate],
+    noise: Array,
     executor: Executor | None,
     progress: Progress | None,
     text: str,
-) -> Scores:
-    """The scores of every size of some candidates, by running the model."""
-    jobs = [Job(before, nominal.residual, c, right) for c in found]
-    outcomes = mapped(executor, _traces, jobs)
-    products, squares = [np.zeros((0, right.shape[1]))], [np.zeros(0)]
-    for k, (p, s) in enumerate(outcomes):
+) -> tuple[list[Spot], Array]:
+    """The best sizes of every candidate, on the model's signal at its slot and on the one that the records tell; and (B,)
+    the largest score of all sizes in each record of noise."""
+    by_place: dict[str, list[Candidate]] = {}
+    for c in dense:
+        by_place.setdefault(c.at[0], []).append(c)
+    jobs = [Slot(view, tuple(group), noise) for view in views for group in by_place.values()]
+    spots, largest = [], np.zeros(noise.shape[1])
+    for k, (more, under) in enumerate(mapped(executor, _at_slot, jobs), start=1):
+        spots += more
+        largest = np.maximum(largest, under)
+        if progress:
+            progress(k, len(jobs), text)
+    return spots, largest
+
+
+def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
+    """The best sizes of the candidates at one slot, and (B,) the largest score of any in each record of noise."""
+    nominal, paths = slot.view.nominal, {n: p for n, p in slot.view.paths.items() if isinstance(p, Along)}
+    inverse = Inversion.of(nominal, paths, slot.found[0].at[0])
+    noise = inverse.against(nominal.projected(slot.noise))
+    spots, largest = [], np.zeros(slot.noise.shape[1])
+    for c in slot.found:
+        for signals in (inverse.own, inverse.told):
+            parts = [_at_knots(inverse, part, signals) for part in _parts(c)]
+            tables = [inverse.falls(part, noise) for part in parts]
+            falls, scores = (np.concatenate([t[k] for t in tables]) for k in range(2))
+            largest = np.max([largest, *(t[2] for t in tables)], axis=0)
+            at_knots = np.hstack(parts)
+            for k in _leading(falls, scores if _met(c) else np.zeros(scores.size)):
+                theta = inverse.answer(nominal, at_knots[:, k])
+                near = _neighbourhood(c, k) if _met(c) else _alone(c, k)
+                spots.append(Spot(near, float(scores[k]), float(falls[k]), theta))
+    return spots, largest
+
+
+def _met(candidate: Candidate) -> bool:
+    """Whether the size has to be met."""
+    return effects()[candidate.effect].scanned
+
+
+def bent(candidate: Candidate) -> bool:
+    """Whether the effect bends its signal at one slot by one parameter that need not be met, and is no kind of delay."""
+    entry = effects()[candidate.effect]
+    single = len(candidate.at) == 1 and not candidate.source and all(len(p.free) == 1 for p in candidate.probes)
+    return single and entry.late is None and not entry.scanned and not is_linear(kind_of(candidate, 0))
+
+
+def widened(candidate: Candidate) -> Candidate:
+    """The candidate with many sizes, evenly in the logarithm."""
+    name = sized(candidate)
+    low, high = candidate.probes[0].free[name]
+    tried = [p.values[name] for p in candidate.probes]
+    sizes = np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT)
+    return replace(candidate, probes=tuple(_resized(candidate.probes[0], name, float(s)) for s in sizes))
+
+
+def _parts(candidate: Candidate) -> list[Candidate]:
+    """The candidate with a part of its sizes each: of all at once the traces would fill the memory."""
+    return [
+        replace(candidate, probes=candidate.probes[k : k + TOGETHER]) for k in range(0, len(candidate.probes), TOGETHER)
+    ]
+
+
+def _at_knots(inverse: Inversion, candidate: Candidate, signals: Sequence[Array]) -> Array:
+    """(k n, C) at the knots: what each size of a candidate makes of a signal, less the signal."""
+    kind, changes = kind_of(candidate, 0), []
+    own = {parameter(n): np.array([p.values[n] for p in candidate.probes]) for n in kind.present}
+    for time, u in zip(inverse.time, signals, strict=True):
+        wide = np.repeat(u[:, None], len(candidate.probes), axis=1)
+        changes.append(block(kind.effect, kind.present, kind.brings).run(own, time, wide, None) - wide)
+    return np.nan_to_num(inverse.knots(changes))
+
+
+def _leading(falls: Array, scores: Array) -> list[int]:
+    """The best columns by one measure and the other, neighbours of better ones left out."""
+    kept: list[int] = []
+    for by in (np.where(falls > 0, falls, 0.0), scores):
+        own: list[int] = []
+        for k in np.argsort(-by, kind="stable")[: 20 * EACH]:
+            if by[k] > 0 and len(own) < EACH and all(abs(int(k) - j) > 1 for j in (*kept, *own)):
+                own.append(int(k))
+        kept += own
+    return kept
+
+
+def _spots(found: Sequence[Candidate], scores: Scores, theta: Array) -> list[Spot]:
+    """The best sizes of candidates that were run at all of theirs."""
+    spots: list[Spot] = []
+    for i, c in enumerate(found):
+        own = [k for k, column in enumerate(scores.columns) if column.candidate == i]
+        spots += [
+            Spot(_neighbourhood(c, k), float(scores.t[own[k]]), float(scores.falls[own[k]]), theta)
+            for k in _leading(scores.falls[own], scores.t[own])
+        ]
+    return spots
+
+
+def _tops(spots: Sequence[Spot]) -> list[Spot]:
+    """The best of every effect at any place, in turn by how much chi2 falls and by their score."""
+    chosen: list[Spot] = []
+    for effect in dict.fromkeys(s.candidate.effect for s in spots):
+        own = [s for s in spots if s.candidate.effect == effect]
+        ranks = [sorted(own, key=lambda s: -s.fall), sorted(own, key=lambda s: -s.score)]
+        kept: list[Spot] = []
+        for s in (s for pair in zip(*ranks, strict=True) for s in pair):
+            beside = [k for k in kept if k.candidate.at == s.candidate.at]
+            if len(kept) < SPOTS and len(beside) < EACH and all(k.candidate != s.candidate for k in beside):
+                kept.append(s)
+        chosen += kept
+    return chosen
+
+
+def _best(spots: Sequence[Spot], scores: Scores) -> list[Column]:
+    """The best size of each of the best places of every effect, by what the model itself makes of it."""
+    kept: dict[str, dict[tuple[str, ...], Column]] = {}
+    worth = np.where(scores.falls > 0, scores.falls, 1e-6 * scores.t)
+    least = WORTH * float(worth.max(initial=0.0))
+    for k in np.argsort(-worth, kind="stable"):
+        c = scores.columns[k]
+        places = kept.setdefault(spots[c.candidate].candidate.effect, {})
+        if worth[k] > 0 and worth[k] >= least and len(places) < PLACES:
+            places.setdefault(spots[c.candidate].candidate.at, c)
+    return [c for places in kept.values() for c in places.values()]
+
+
+def _alone(candidate: Candidate, probe: int) -> Candidate:
+    """The candidate with one of its sizes."""
+    return replace(candidate, probes=(candidate.probes[probe],))
+
+
+def _looked(jobs: Sequence[Job], known: int, executor: Executor | None, progress: Progress | None, text: str) -> Scores:
+    """The scores of every size of some candidates, by running the model.
+
+    known: how many of the right-hand sides are what parameters can make good.
+    """
+    right = jobs[0].right.shape[1] if jobs else 1 + known
+    products, squares = [np.zeros((0, right))], [np.zeros(0)]
+    for k, (p, s) in enumerate(mapped(executor, _traces, jobs), start=1):
         products.append(p)
         squares.append(s)
         if progress:
-            progress(k + 1, len(jobs), text)
+            progress(k, len(jobs), text)
     size, product = np.concatenate(squares), np.concatenate(products)
     sound = np.isfinite(size)
     size, product = np.where(sound, size, 0.0), np.where(sound[:, None], product, 0.0)
-    k = nominal.basis.shape[1]
-    left = np.maximum(size - np.sum(product[:, 1 : 1 + k] ** 2, axis=1), 0.0)
-    columns = tuple(Column(i, k) for i, c in enumerate(found) for k in range(len(c.probes)))
-    either = np.array([two_sided(found[c.candidate]) for c in columns], dtype=bool)
-    return Scores(columns, product[:, 0], size, left, product[:, 1 + k :], sound, either)
+    left = np.maximum(size - np.sum(product[:, 1 : 1 + known] ** 2, axis=1), 0.0)
+    columns = tuple(Column(i, n) for i, job in enumerate(jobs) for n in range(len(job.candidate.probes)))
+    either = np.array([two_sided(jobs[c.candidate].candidate) for c in columns], dtype=bool)
+    return Scores(columns, product[:, 0], size, left, product[:, 1 + known :], sound, either)
 
 
 def _traces(job: Job) -> tuple[Array, Array]:
@@ -163,14 +319,14 @@ def _traces(job: Job) -> tuple[Array, Array]:
         model, problem, placed, start = added(before.model, before.problem, c, 0, 1.0)
     except HvdcIdentError:  # it cannot sit there: no size of it is sound
         return products, squares
-    problem = replace(problem, simulator=ModelSimulator(model, QUICK))
-    k, at = len(before.problem.free), list(placed.bounds).index(scanned(c))
+    problem = replace(problem, simulator=ModelSimulator(model, job.tolerance))
+    k, at = len(before.problem.free), list(placed.bounds).index(sized(c))
     apart = max(len(c.probes) // SAMPLE, 1)
     order = sorted(range(len(c.probes)), key=lambda i: (i % apart > 0, i))
     for n, i in enumerate(order):
         if n == SAMPLE and 2 * np.count_nonzero(np.isfinite(squares)) < SAMPLE:
             break
-        start[at] = c.probes[i].values[scanned(c)]
+        start[at] = c.probes[i].values[sized(c)]
         try:
             blocks = problem.blocks(np.concatenate([before.theta[:k], start, before.theta[k:]]), derivatives=False)
         except SimulationError:
@@ -182,7 +338,7 @@ def _traces(job: Job) -> tuple[Array, Array]:
 
 def _neighbourhood(candidate: Candidate, probe: int) -> Candidate:
     """The candidate with the sizes around one of its scan, evenly in the logarithm."""
-    name = scanned(candidate)
+    name = sized(candidate)
     sizes = sorted(p.values[name] for p in candidate.probes)
     own = candidate.probes[probe].values[name]
     k = sizes.index(own)
@@ -191,9 +347,10 @@ def _neighbourhood(candidate: Candidate, probe: int) -> Candidate:
     return replace(candidate, probes=tuple(_resized(candidate.probes[probe], name, s) for s in sorted(tried)))
 
 
-def scanned(candidate: Candidate) -> str:
-    """The parameter that is scanned."""
-    return next(n for n, q in effects()[candidate.effect].parameters.items() if q.scan)
+def sized(candidate: Candidate) -> str:
+    """The parameter whose size is looked for: the one that has to be met, or the only one."""
+    parameters = effects()[candidate.effect].parameters
+    return next((n for n, q in parameters.items() if q.scan is not None), next(iter(parameters)))
 
 
 def _resized(probe: Probe, name: str, size: float) -> Probe:

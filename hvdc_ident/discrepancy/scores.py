@@ -86,6 +86,11 @@ class Scores:
         return np.where(self.left > 0, self.raw / np.where(self.left > 0, self.left, 1.0), 0.0)
 
     @property
+    def falls(self) -> Array:
+        """(C,) by how much chi2 falls with each size as it is; 0 where there is nothing to score."""
+        return np.where(self.usable, 2.0 * self.raw - self.left, 0.0)
+
+    @property
     def absorbed(self) -> Array:
         """(C,) the share of the signature that the parameters take up."""
         return np.where(self.size > 0, 1.0 - self.left / np.where(self.size > 0, self.size, 1.0), 0.0)

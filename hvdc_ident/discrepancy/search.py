@@ -9,22 +9,34 @@ from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.rounds import Round, Search, excess, one_round
 from hvdc_ident.discrepancy.settle import settled
+from hvdc_ident.errors import SimulationError
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Where the search ended. rounds: all of them; kept: by effect of the final model, the round that judges its rivals."""
+    """Where the search ended.
+
+    rounds: all of them; kept: by effect of the final model, the round that judges its rivals; notes: what could not be done.
+    """
 
     refit: Refit
     rounds: tuple[Round, ...]
     kept: tuple[Round, ...]
+    notes: tuple[str, ...] = ()
 
 
 def forward(search: Search, first: Refit) -> Outcome:
     """The effects that are added one after the other, each with all others refitted, until nothing is worth adding."""
     here, rounds, kept = first, [], []
+    notes: tuple[str, ...] = ()
     for number in range(1, search.options.most + 1):
-        found = one_round(search, here, number)
+        try:
+            found = one_round(search, here, number)
+        except SimulationError as error:
+            if number == 1:
+                raise
+            notes = (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
+            break
         rounds.append(found)
         if found.winner is None:
             both = pair(search, here, found) if found.significant and number < search.options.most else None
@@ -39,8 +51,9 @@ def forward(search: Search, first: Refit) -> Outcome:
         if is_noise(here, search):
             break
     if len(kept) > 1:
-        here, kept = settled(search, first, here, kept, len(rounds))
-    return Outcome(here, tuple(rounds), tuple(kept))
+        here, kept, more = settled(search, first, here, kept, len(rounds))
+        notes += more
+    return Outcome(here, tuple(rounds), tuple(kept), notes)
 
 
 def is_noise(refit: Refit, search: Search) -> bool:

@@ -18,6 +18,8 @@ from hvdc_ident.trajectory import Array
 
 SAME = 1.0
 """Difference of scores, in units of chi2, up to which two signatures of one effect are one: its places cannot be told apart."""
+CLEARLY = 30.0
+"""In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say."""
 CLEAR = 2.0
 """Standard deviations by which an effect has to be off doing nothing."""
 EACH = 4
@@ -26,21 +28,42 @@ EACH = 4
 
 @dataclass(frozen=True)
 class Pick:
-    """A candidate to refit: its best probe, the size asked for in units of the probe's, and its score."""
+    """A candidate to refit: its best probe, the size asked for in units of the probe's, and its score.
+
+    gains: unknowns of the model before that go with this size, where they are known.
+    """
 
     candidate: int
     probe: int
     factor: float
     score: float
+    gains: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC)."""
+    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC).
+
+    evidence: the same with what it brings on the held-out data, where that is known.
+    """
 
     pick: Pick
     refit: Refit
     gain: float
+    evidence: float | None = None
+
+    @property
+    def told(self) -> float:
+        """What all data say for it, as far as that is known."""
+        return self.gain if self.evidence is None else self.evidence
+
+
+def behinds(trials: Sequence[Trial]) -> list[float]:
+    """By how much each is behind the best, in BIC: on all data together; or on the fitted ones, where that is less and the
+    held-out ones do not speak clearly against it, for a difference of a few units there is not known better than the noise.
+    """
+    gain, told = (max(values, default=0.0) for values in ([t.gain for t in trials], [t.told for t in trials]))
+    return [min(gain - t.gain, told - t.told) if told - t.told < CLEARLY else told - t.told for t in trials]
 
 
 def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:

@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
 from hvdc_ident.discrepancy.rounds import Round, Search, closed, one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.transform import home
@@ -24,12 +24,15 @@ OTHERS = 6
 """Rivals of each effect in its own round that are tried again once the other effects are in."""
 
 
-def settled(search: Search, first: Refit, here: Refit, kept: Sequence[Round], number: int) -> tuple[Refit, list[Round]]:
-    """The refit, and by effect the round that judges its rivals, after looking for each again and doing without it.
+def settled(
+    search: Search, first: Refit, here: Refit, kept: Sequence[Round], number: int
+) -> tuple[Refit, list[Round], tuple[str, ...]]:
+    """The refit, by effect the round that judges its rivals, and what could not be done, after looking for each again and
+    doing without it.
 
     here: the refit of the model `first` with several effects; kept: the rounds that brought them; number: rounds so far.
     """
-    kept = list(kept)
+    kept, notes = list(kept), []
     k = 0
     while k < len(kept):
         search.tell(k, len(kept), f"again with the others: {here.placed[k].candidate.label}")
@@ -46,10 +49,13 @@ def settled(search: Search, first: Refit, here: Refit, kept: Sequence[Round], nu
             here = without
             del kept[k]
             continue
-        kept[k], winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
-        here = _in_place(winner.refit, k)
+        try:
+            kept[k], winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
+            here = _in_place(winner.refit, k)
+        except SimulationError as error:  # refitted it runs, as far as a refit needs it to
+            notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
         k += 1
-    return here, kept
+    return here, kept, tuple(notes)
 
 
 def _looked_again(

@@ -17,6 +17,7 @@ from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Delay, Model, Sampled, Signal, State
 from hvdc_ident.model.transform import fresh
+from hvdc_ident.trajectory import Array
 
 SLOT_KINDS = ("input", "signal", "algebraic", "state", "output")
 FOLLOW = 2e-4
@@ -39,6 +40,15 @@ Measure = Literal[
 ]
 
 
+class Extent(Protocol):
+    """How far a slot's signal reaches: its largest magnitude, and how far it moves, in its unit."""
+
+    @property
+    def peak(self) -> float: ...
+    @property
+    def range(self) -> float: ...
+
+
 @dataclass(frozen=True)
 class EffectParameter:
     """A parameter of an effect.
@@ -49,8 +59,8 @@ class EffectParameter:
     measure: what a size is counted in when the effect is looked for; probes: the sizes worth trying, counted so;
     search: the bounds of a refit, counted so (None: those of the measure). near: instead, a factor up and down from the
     probe. held: a refit leaves it where it stands. companion: an optional one that is tried with the others only.
-    scan: the sizes of a closer look, where neighbouring sizes have little in common and no slope leads from one to the
-    next; counted in scanned_in (None: the measure).
+    scan: from a slot's signal the sizes of a closer look, where neighbouring sizes have little in common and no slope
+    leads from one to the next; counted in scanned_in (None: the measure).
     """
 
     value: float
@@ -61,7 +71,7 @@ class EffectParameter:
     description: str = ""
     measure: Measure = "one"
     probes: tuple[float, ...] = ()
-    scan: tuple[float, ...] = ()
+    scan: Callable[[Extent], Sequence[float]] | None = None
     scanned_in: Measure | None = None
     search: tuple[float, float] | None = None
     near: float | None = None
@@ -152,7 +162,8 @@ class Effect:
     needs_source: whether it brings another signal in (`from`). needs_expression: whether its form is given with it,
     with coefficients of the user's own names. resistance: the parameter for which a resistance of the model stands in.
     restless: whether it moves the model by itself, so that a record of it does not begin at rest. late: by how long, s, it
-    delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common.
+    delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common. quick: the
+    same y of u as the equations, in numpy, where those are too many to be evaluated for thousands of sizes.
     """
 
     name: str
@@ -170,6 +181,7 @@ class Effect:
     resistance: str = ""
     restless: bool = False
     late: Callable[[Mapping[str, float]], float] | None = None
+    quick: Callable[[Array, Mapping[str, Array]], Array] | None = None
 
     def late_by(self, values: Mapping[str, float]) -> float | None:
         """By how long it delays a slow signal with these values, s; None for what is no delay of any kind."""
@@ -178,7 +190,7 @@ class Effect:
     @property
     def scanned(self) -> bool:
         """Whether looking for it takes a closer look at many sizes."""
-        return any(q.scan for q in self.parameters.values())
+        return any(q.scan is not None for q in self.parameters.values())
 
     @property
     def shown(self) -> str:

@@ -175,9 +175,9 @@ def probes(
     settled = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
     if closer:
         settled |= {
-            n: replace(q, probes=q.scan, measure=q.scanned_in or q.measure)
+            n: replace(q, probes=tuple(q.scan(signal)), measure=q.scanned_in or q.measure)
             for n, q in effect.parameters.items()
-            if q.scan
+            if q.scan is not None
         }
     effect = replace(effect, parameters=effect.parameters | settled)
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}

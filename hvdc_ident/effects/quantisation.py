@@ -1,10 +1,11 @@
 """A quantiser: u rounded to multiples of step."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import sympy as sp
 
-from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
+from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter, Extent
 from hvdc_ident.expression.functions import clip, where
 from hvdc_ident.frozen import FrozenMap
 
@@ -14,6 +15,11 @@ EDGE = 2e-3
 """Of a step: over how much of u a level changes into the next inside the model (a recorded output jumps)."""
 BORDER = 0.3
 """Of a step: where, between two edges, the count of levels moves on. No value that a signal is likely to rest at."""
+
+APART = 0.1
+"""Of a level: how far at the peak two steps of a closer look lie apart."""
+MOST = 400.0
+"""Levels that a closer look goes through."""
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
@@ -33,6 +39,16 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
         return rounded
     rounded = add.signal("rounded", rounded)
     return add.state("y", lambda y: (rounded - y) / FOLLOW)
+
+
+def _levels(signal: Extent) -> Sequence[float]:
+    """Levels up to the signal's peak, from one that it hardly reaches to hundreds that it passes.
+
+    Of two steps the marks lie apart where the signal is at its peak: even in the levels there, a tenth of one each.
+    """
+    share = signal.peak / signal.range
+    first = max(0.8, 0.5 * share)
+    return tuple(np.arange(first, min(150.0 * share, first + MOST), APART).tolist())
 
 
 def _floor(x: sp.Expr, add: Additions) -> sp.Expr:
@@ -67,12 +83,12 @@ EFFECT = Effect(
                 description="distance of two levels",
                 measure="peak/n",
                 probes=(3.0, 10.0, 30.0, 100.0, 300.0),
-                # A level of n is told from the next where the signal is at its peak: even steps in n, a part of a level each.
-                scan=tuple(0.8 + 0.4 * k for k in range(150)),
+                scan=lambda signal: _levels(signal),
             )
         }
     ),
     rewrite=rewrite,
+    quick=lambda u, p: p["step"] * np.floor(u / p["step"] + 0.5),
     sentence="{at} is rounded to multiples of {step}",
     excited_by="slow ramps both ways over several levels",
     example=FrozenMap({"step": 0.03}),

@@ -115,7 +115,8 @@ def test_forms_that_are_alike_and_not_all_of_it_are_a_set_that_says_so() -> None
         places=["wm", "err", "torque"],
     )
     assert found.verdict == "ambiguous" and "None is all of it" in found.text
-    assert {at for _, at in _members(found)} == {("wm",), ("err",), ("torque",)}
+    # Behind the load step that is held out a delayed torque answers otherwise.
+    assert {at for _, at in _members(found)} == {("wm",), ("err",)}
     assert not found.remaining["adequate"]
     assert 0.02 < found.effects[0].parameters["T"].value < 0.06
     both = diagnose(model(), experiments(lag=0.05), FREE, effects=["delay"], places=["wm", "err", "torque"])

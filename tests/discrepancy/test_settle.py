@@ -12,9 +12,10 @@ from refits import beside, plain
 from hvdc_ident.discrepancy import settle
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.rounds import Search, one_round
-from hvdc_ident.discrepancy.select import Trial, clear
+from hvdc_ident.discrepancy.rounds import Round, Search, one_round
+from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, clear
 from hvdc_ident.discrepancy.settle import _last, job_of, settled
+from hvdc_ident.errors import SimulationError
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.transform import home
 
@@ -57,7 +58,8 @@ def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit
     search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
     begun = one_round(search, first, 1)
     rounds = tuple(replace(begun, winner=Trial(begun.trials[0].pick, r, 100.0), trials=()) for r in (one, both))
-    here, kept = settled(search, first, both, rounds, 2)
+    here, kept, notes = settled(search, first, both, rounds, 2)
+    assert notes == ()
     assert [p.candidate.label for p in here.placed] == ["lag at wm"]
     assert [k.winner.refit.placed[-1].candidate.label for k in kept if k.winner] == ["lag at wm"]
 
@@ -68,8 +70,23 @@ def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest
     begun = one_round(search, first, 1)
     lost = Trial(begun.trials[-1].pick, replace(begun.trials[-1].refit, failure="it does not run"), -np.inf)
     monkeypatch.setattr(settle, "one_round", lambda *_: replace(begun, trials=begun.trials[:-1], failed=(lost,)))
-    _, kept = settled(search, first, lagged, [replace(begun, winner=begun.trials[0], trials=())], 1)
+    _, kept, _ = settled(search, first, lagged, [replace(begun, winner=begun.trials[0], trials=())], 1)
     assert kept[0].failed == (lost,)
+
+
+def test_what_could_not_be_looked_for_again_stays_and_is_told(first: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
+    lagged = run(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
+    search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
+    begun = replace(one_round(search, first, 1), trials=())
+    begun = replace(begun, winner=Trial(Pick(0, 0, 1.0, 0.0), lagged, 100.0), ruler=Ruler.of(lagged))
+
+    def stopped(*_: object) -> Round:
+        raise SimulationError("the simulation stopped", got="step-limit")
+
+    monkeypatch.setattr(settle, "one_round", stopped)
+    here, kept, notes = settled(search, first, lagged, [begun], 1)
+    assert [p.candidate.label for p in here.placed] == ["lag at wm"] and kept == [begun]
+    assert len(notes) == 1 and "lag at wm" in notes[0] and "step-limit" in notes[0]
 
 
 @pytest.mark.parametrize(

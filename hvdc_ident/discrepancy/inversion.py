@@ -1,0 +1,143 @@
+"""What the records say of a slot's signal, and how well an effect of that signal explains them.
+
+Gains that are biased by what is missing give the slot another signal than it had: an effect that hangs on its levels or
+instants leaves traces with little in common with the true ones. The records know better. What would have to be added at
+the slot, smooth only as far as they ask for it, makes good what the bias spoiled; with it the slot's signal is near to
+the true one, and an effect of the right size, put on that signal, explains the residual as it stands.
+
+All of this is linear in what is added at the slot: hats over time, a knot for every row or so, are put on it once, and
+thousands of sizes are then had by their values at the knots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+from scipy.linalg import block_diag
+
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.scores import SEEN, Whitening
+from hvdc_ident.trajectory import Array
+
+KNOTS = 600
+"""Of all records together, at most: where there are more rows, several are taken together."""
+WEAK = 1e-4
+"""Of the strongest direction: weaker ones leave no trace."""
+TRIED = np.geomspace(1e-4, 1e4, 60)
+"""Sizes of what is added, in units of what the strongest direction shows, of which the likeliest is taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inversion:
+    """A slot, what is added to it, and what of it shows.
+
+    time: (K,) instants of each experiment, s. own: the model's signal there, one array an experiment. seen: (K, k) what
+    the slot's signal makes of hats put on it. means: (k, K) values at the knots of what is given at the instants. shown:
+    (rows, k) hats in whitened rows. Of all n experiments' hats, without what parameters can make good: strength (m,) and
+    directions (k n, m), and wanted (m,), what the residual has of each.
+    """
+
+    time: tuple[Array, ...]
+    own: tuple[Array, ...]
+    seen: tuple[Array, ...]
+    means: tuple[scipy.sparse.csr_array, ...]
+    shown: tuple[Array, ...]
+    strength: Array
+    directions: Array
+    wanted: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, nominal: Nominal, paths: Mapping[str, Along], place: str) -> Inversion:
+        """The inversion of one slot on the fitted experiments."""
+        experiments = nominal.problem.fitted_experiments
+        time, own, seen, means, shown = [], [], [], [], []
+        for e in experiments:
+            path = paths[e.name]
+            hats, mean = _hats(path.time, min(KNOTS // len(experiments), path.count))
+            u, y = path.answer([place], hats[None])
+            whitening = Whitening.of([b for b in nominal.blocks if b.experiment == e.name], e, nominal)
+            shown.append(np.nan_to_num(whitening(y)))
+            time.append(path.time)
+            own.append(path.signal(place))
+            seen.append(u[0])
+            means.append(mean)
+        taken = np.hstack([q.T @ s for q, s in zip(_parts(nominal.basis, shown), shown, strict=True)])
+        square, directions = np.linalg.eigh(block_diag(*(s.T @ s for s in shown)) - taken.T @ taken)
+        strength = np.sqrt(np.maximum(square[::-1], 0.0))
+        kept = strength > WEAK * strength[0]
+        found = cls(
+            tuple(time), tuple(own), tuple(seen), tuple(means), tuple(shown), strength[kept],
+            directions[:, ::-1][:, kept],
+        )  # fmt: skip
+        return replace(found, wanted=found.against(nominal.projected(nominal.residual[:, None]))[:, 0])
+
+    @cached_property
+    def added(self) -> Array:
+        """(k n,) what was added at the slot, at the knots, as far as the records ask for anything; 0 where nothing shows."""
+        if not self.strength.size:
+            return np.zeros(self.directions.shape[0])
+        likely = []
+        for size in TRIED / self.strength[0]:
+            spread = 1.0 + (size * self.strength) ** 2
+            likely.append(float(np.sum(self.wanted**2 / spread + np.log(spread))))
+        size = TRIED[int(np.argmin(likely))] / self.strength[0]
+        weights = size**2 * self.strength / (1.0 + (size * self.strength) ** 2)
+        return np.asarray(self.directions @ (weights * self.wanted))
+
+    @cached_property
+    def told(self) -> tuple[Array, ...]:
+        """The slot's signal as the records tell it, one array (K,) an experiment."""
+        parts = np.split(self.added, np.cumsum([m.shape[0] for m in self.means])[:-1])
+        return tuple(u + w @ c for u, w, c in zip(self.own, self.seen, parts, strict=True))
+
+    def knots(self, changes: Sequence[Array]) -> Array:
+        """(k n, C) at the knots of what is added at the instants, (K, C) in each experiment."""
+        return np.vstack([m @ d for m, d in zip(self.means, changes, strict=True)])
+
+    def against(self, rows: Array) -> Array:
+        """(m, B) what whitened rows (N, B), without what parameters can make good, have of each direction."""
+        at_knots = np.vstack([s.T @ r for s, r in zip(self.shown, _parts(rows, self.shown), strict=True)])
+        return np.asarray(self.directions.T @ at_knots / self.strength[:, None])
+
+    def falls(self, at_knots: Array, noise: Array) -> tuple[Array, Array, Array]:
+        """By how much chi2 falls with each of C additions, the parameters' answer to first order.
+
+        at_knots: (k n, C); noise: (m, B), as `against` gives it. (C,) as it is; (C,) at its best multiple, the score;
+        (B,) the largest such score in each record of noise.
+        """
+        shown = self.strength[:, None] * (self.directions.T @ at_knots)
+        raw, square = self.wanted @ shown, np.sum(shown**2, axis=0)
+        share = np.where(square > SEEN, 1.0 / np.maximum(square, SEEN), 0.0)
+        under = np.max(np.maximum(shown.T @ noise, 0.0) ** 2 * share[:, None], axis=0, initial=0.0)
+        return np.where(share > 0, 2.0 * raw - square, 0.0), np.maximum(raw, 0.0) ** 2 * share, under
+
+    def answer(self, nominal: Nominal, at_knots: Array) -> Array:
+        """(p,) the unknowns, to first order, where this is added (k n,), within their bounds."""
+        jacobian = np.vstack([b.jacobian for b in nominal.blocks])
+        norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        parts = np.split(at_knots, np.cumsum([m.shape[0] for m in self.means])[:-1])
+        left = nominal.residual - np.concatenate([s @ c for s, c in zip(self.shown, parts, strict=True)])
+        step = np.linalg.lstsq(jacobian / norms, left, rcond=1e-6)[0] / norms
+        low = np.array([u.min for u in nominal.problem.unknowns])
+        high = np.array([u.max for u in nominal.problem.unknowns])
+        return np.clip(nominal.theta - step, low, high)
+
+
+def _parts(rows: Array, shown: Sequence[Array]) -> list[Array]:
+    """The rows of each experiment, of whose answers there are as many."""
+    return np.split(rows, np.cumsum([s.shape[0] for s in shown])[:-1])
+
+
+def _hats(time: Array, knots: int) -> tuple[Array, scipy.sparse.csr_array]:
+    """(K, k) hats over the instants, and (k, K) the weights of the means under them."""
+    at = np.linspace(time[0], time[-1], knots)
+    hats = np.array([np.interp(time, at, unit) for unit in np.eye(knots)]).T
+    weights = hats.T * np.gradient(time)
+    return np.ascontiguousarray(hats), scipy.sparse.csr_array(
+        weights / np.maximum(weights.sum(axis=1), 1e-300)[:, None]
+    )

@@ -1,0 +1,158 @@
+"""What the records tell of a slot's signal, and the closer look that goes by it, against records computed by scipy."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, experiments, model
+from refits import plain
+from scipy.integrate import solve_ivp
+
+from hvdc_ident import Experiment, InputSignal, Trajectory
+from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy.inversion import Inversion
+from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.scores import Whitening, runs
+from hvdc_ident.effects import SlotSignal, effects
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+STEP = 0.11
+
+
+@pytest.fixture(scope="module")
+def levels() -> tuple[tuple[Experiment, ...], dict[str, Array]]:
+    """Records of the drive whose torque acts in levels of STEP, and by experiment the torque before it is rounded.
+
+    A loop between two levels turns about their edge: the edges have a width here, as they have in the package.
+    """
+    random = np.random.default_rng(0)
+    found, asked = [], {}
+    for name, (role, moves) in RUNS.items():
+        inputs = {n: InputSignal.corners(_corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
+        y = _rounded(inputs)
+        asked[name] = y[:, 1].copy()
+        y[:, 1] = [_level(u) for u in y[:, 1]]
+        seen = y + random.standard_normal(y.shape) * list(SIGMA.values())
+        measured = Trajectory(TIME, seen, tuple(SIGMA), ("", ""))
+        found.append(
+            Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
+        )
+    return tuple(found), asked
+
+
+def _corners(before: float, moves: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    points, level = [(0.0, before)], before
+    for t, change in moves:
+        points += [(t, level), (t, level + change)]
+        level += change
+    return points
+
+
+def _level(u: float) -> float:
+    whole = np.floor(u / STEP)
+    return float(STEP * (whole + np.clip((u / STEP - whole - 0.5) / 2e-3 + 0.5, 0.0, 1.0)))
+
+
+def _rounded(inputs: dict[str, InputSignal]) -> Array:
+    """(n, 2) speed and torque, from a start that was waited for."""
+
+    def given(name: str, t: float) -> float:
+        return float(inputs[name](t)) if name in inputs else {"ref": 1.0, "load": 0.0}[name]
+
+    def slopes(t: float, s: Array, at: float | None = None) -> list[float]:
+        err = given("ref", t if at is None else at) - s[0]
+        torque = _level(TRUE["Kp"] * err + s[1])
+        return [
+            (torque - TRUE["b"] * s[0] - given("load", t if at is None else at)) / TRUE["J"],
+            TRUE["Ki"] * err,
+        ]
+
+    settings = {"method": "LSODA", "rtol": 1e-7, "atol": 1e-9, "max_step": 2e-3}
+    state = solve_ivp(lambda t, s: slopes(t, s, 0.0), (0.0, 20.0), [1.0, TRUE["b"]], method="Radau", rtol=1e-8).y[:, -1]
+    jumps = sorted({float(b) for i in inputs.values() for b in i.breaks if 0 < b < TIME[-1]})
+    rows = np.zeros((TIME.size, 2))
+    for a, b in pairwise([0.0, *jumps, float(TIME[-1]) + 1e-6]):
+        inner = (a <= TIME) & (b > TIME)
+        done = solve_ivp(slopes, (a, b - 1e-9), state, t_eval=[*TIME[inner], b - 1e-9], **settings)
+        err = np.array([given("ref", t) for t in TIME[inner]]) - done.y[0, :-1]
+        rows[inner] = np.column_stack([done.y[0, :-1], TRUE["Kp"] * err + done.y[1, :-1]])
+        state = done.y[:, -1]
+    return rows
+
+
+def test_falls_are_those_of_the_whole_linear_problem() -> None:
+    """By the whitened answers themselves and a regression on everything, without the directions."""
+    first = plain(experiments(lag=0.03))
+    nominal = first.nominal()
+    paths = {n: p for n, p in runs(model(), nominal).items() if isinstance(p, Along)}
+    inverse = Inversion.of(nominal, paths, "wm")
+    knots = inverse.directions.shape[0]
+    random = np.random.default_rng(3)
+    put = np.cumsum(random.standard_normal((knots, 5)), axis=0) * 1e-3
+    halves = np.split(put, 2)
+    answers = []
+    for (name, path), part in zip(paths.items(), halves, strict=True):
+        e = next(e for e in nominal.problem.fitted_experiments if e.name == name)
+        at = np.linspace(path.time[0], path.time[-1], part.shape[0])
+        d = np.array([np.interp(path.time, at, c) for c in part.T]).T
+        whitening = Whitening.of([b for b in nominal.blocks if b.experiment == name], e, nominal)
+        answers.append(whitening(path.answer(["wm"], d[None])[1]))
+    rows = np.vstack(answers)
+    was = float(np.sum(nominal.projected(nominal.residual[:, None]) ** 2))
+    left = [float(np.sum(nominal.projected((nominal.residual - r)[:, None]) ** 2)) for r in rows.T]
+    falls, scores, _ = inverse.falls(put, np.zeros((inverse.strength.size, 1)))
+    assert falls == pytest.approx(was - np.array(left), rel=1e-6, abs=1e-6 * was)
+    freed = nominal.projected(rows)
+    best = (freed.T @ nominal.residual) ** 2 / np.sum(freed**2, axis=0)
+    assert scores == pytest.approx(np.where(freed.T @ nominal.residual > 0, best, 0.0), rel=1e-4, abs=1e-4)
+
+
+def test_nothing_is_added_where_the_records_ask_for_nothing() -> None:
+    first = plain(experiments())
+    paths = {n: p for n, p in runs(model(), first.nominal()).items() if isinstance(p, Along)}
+    inverse = Inversion.of(first.nominal(), paths, "torque")
+    # What noise asks for is smaller than a hundredth of what moves.
+    for own, told in zip(inverse.own, inverse.told, strict=True):
+        assert np.abs(own - told).max() < 0.01 * np.ptp(own)
+
+
+def test_the_records_know_a_slot_better_than_gains_that_are_biased(
+    levels: tuple[tuple[Experiment, ...], dict[str, Array]],
+) -> None:
+    records, asked = levels
+    first = plain(records)
+    paths = {n: p for n, p in runs(model(), first.nominal()).items() if isinstance(p, Along)}
+    inverse = Inversion.of(first.nominal(), paths, "torque")
+    for k, (name, path) in enumerate(paths.items()):
+        at = np.flatnonzero(path.rows >= 0)
+        truth = asked[name][path.rows[at]]
+        own, told = (np.sqrt(np.mean((s[k][at] - truth) ** 2)) for s in (inverse.own, inverse.told))
+        assert told < 0.6 * own
+
+
+def test_a_step_is_met_among_hundreds(levels: tuple[tuple[Experiment, ...], dict[str, Array]]) -> None:
+    found = diagnose(
+        model(), levels[0], FREE, effects=["quantisation", "deadband", "backlash", "lag", "gain"], seed=0,
+        options=Options(fallback=False),
+    )  # fmt: skip
+    assert found.verdict == "named", found.text
+    assert (found.effects[0].effect, found.effects[0].at) == ("quantisation", ("torque",))
+    assert found.effects[0].parameters["step"].value == pytest.approx(STEP, rel=2e-3)
+
+
+def test_levels_and_periods_of_a_closer_look_follow_the_signal() -> None:
+    time = np.linspace(0.0, 1.0, 101)
+    near_one = SlotSignal.of([time], [1.0 + 0.05 * np.sin(7 * time)])
+    whole = SlotSignal.of([time], [np.sin(7 * time)])
+    scan = effects()["quantisation"].parameters["step"].scan
+    assert scan is not None
+    for signal in (near_one, whole):
+        steps = signal.peak / np.array(scan(signal))
+        assert steps[0] > 0.5 * signal.range and steps[-1] < signal.range / 15
+        # A tenth of a level apart where the signal is at its peak.
+        assert np.abs(np.diff(signal.peak / steps) - 0.1).max() < 1e-9
+    # A signal about 1 that moves by a twentieth: levels are counted from 0, and none of them is as wide as 1.
+    assert max(signal.peak / n for n in scan(near_one)) < 0.3
