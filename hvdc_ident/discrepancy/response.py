@@ -7,7 +7,7 @@ the equations linearised along it, limits as they stand. Every slot is had from 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sympy as sp
@@ -87,6 +87,16 @@ class Along:
             s.start_w[:, at] @ d[:, 0], np.ascontiguousarray(d), u, y,
         )  # fmt: skip
         return u, y
+
+    def only(self, place: str) -> Along:
+        """The same with one slot: small enough to be sent to where it is worked with."""
+        s, k = self.system, self.slots.index(place)
+        at = [k]
+        system = replace(
+            s, g0=_of(s.g0, at), g1=_of(s.g1, at), cs=s.cs[:, at], ds=s.ds[:, at][:, :, at], csw=s.csw[:, at],
+            do=_of(s.do, at), df=_of(s.df, at), start=s.start[:, at], start_w=s.start_w[:, at],
+        )  # fmt: skip
+        return replace(self, values={place: self.values[place]}, slots=(place,), system=system)
 
     def starts(self) -> Array:
         """(o, R, nx): what the outputs show of a unit change of each state at the start."""

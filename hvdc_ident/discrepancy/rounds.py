@@ -289,9 +289,11 @@ def _other_forms(opened: Round, trials: Sequence[Trial], was: float) -> list[Pic
 
 
 def _akin(candidate: Candidate, opened: Round, trials: Sequence[Trial]) -> bool:
-    """Whether a candidate is worth a closer look because of what is best so far: a bend where something bends its signal, at
-    any place, and a sampler where something delays it."""
+    """Whether a candidate is worth a closer look because of what is best so far: the same at any place, where its size has
+    to be met; a bend at any place, where something bends its signal; a sampler where something delays it."""
     leading = [opened.candidates[t.pick.candidate] for t in _sound(trials)[:LEADERS]]
+    if effects()[candidate.effect].scanned and leading and leading[0].effect == candidate.effect:
+        return True
     if effects()[candidate.effect].late is not None:
         return any(effects()[c.effect].late is not None and c.at == candidate.at for c in leading)
     return any(bent(c) for c in leading) and not effects()[candidate.effect].scanned

@@ -164,7 +164,7 @@ def _told(
     by_place: dict[str, list[Candidate]] = {}
     for c in dense:
         by_place.setdefault(c.at[0], []).append(c)
-    jobs = [Slot(view, tuple(group), noise) for view in views for group in by_place.values()]
+    jobs = [Slot(_at_one(view, p), tuple(group), noise) for view in views for p, group in by_place.items()]
     spots, largest = [], np.zeros(noise.shape[1])
     for k, (more, under) in enumerate(mapped(executor, _at_slot, jobs), start=1):
         spots += more
@@ -172,6 +172,11 @@ def _told(
         if progress:
             progress(k, len(jobs), text)
     return spots, largest
+
+
+def _at_one(view: View, place: str) -> View:
+    """The view of one slot."""
+    return View(view.nominal, {n: p.only(place) for n, p in view.paths.items() if isinstance(p, Along)})
 
 
 def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:

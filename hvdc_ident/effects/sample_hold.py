@@ -26,7 +26,7 @@ EFFECT = Effect(
                 measure="time",
                 probes=(0.1, 0.4, 0.7),
                 # Samples of a record: as many are told from a third more of one, until a sample is but a few rows.
-                scan=lambda signal: (*(4.0 + 0.3 * k for k in range(390)), *(121.0 * 1.008**k for k in range(220))),
+                scan=lambda signal: (*(4.0 + 0.3 * k for k in range(390)), *(121.0 * 1.004**k for k in range(440))),
                 scanned_in="record/n",
             ),
             # At most one period: a bound that moves with Ts, so a refit leaves it.

@@ -156,3 +156,14 @@ def test_levels_and_periods_of_a_closer_look_follow_the_signal() -> None:
         assert np.abs(np.diff(signal.peak / steps) - 0.1).max() < 1e-9
     # A signal about 1 that moves by a twentieth: levels are counted from 0, and none of them is as wide as 1.
     assert max(signal.peak / n for n in scan(near_one)) < 0.3
+
+
+def test_one_slot_of_a_run_answers_as_among_all() -> None:
+    nominal = plain(experiments(lag=0.03)).nominal()
+    path = runs(model(), nominal)["fit-1"]
+    assert isinstance(path, Along)
+    d = np.random.default_rng(0).standard_normal((1, path.time.size, 3))
+    alone = path.only("err")
+    assert alone.slots == ("err",) and set(alone.values) == {"err"}
+    for all_of_it, one in zip(path.answer(["err"], d), alone.answer(["err"], d), strict=True):
+        assert np.array_equal(all_of_it, one)
