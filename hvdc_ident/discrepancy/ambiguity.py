@@ -9,9 +9,9 @@ from typing import Any
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_of, clear
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
+from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.frozen import FrozenMap
 
 

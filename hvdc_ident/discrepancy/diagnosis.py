@@ -20,8 +20,8 @@ from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, judged
 from hvdc_ident.discrepancy.result import Diagnosis, Found, Rival
-from hvdc_ident.discrepancy.rounds import Search
 from hvdc_ident.discrepancy.search import Outcome, forward
+from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.discrepancy.verdict import Judgement, judge
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment

@@ -14,10 +14,10 @@ from hvdc_ident.discrepancy.hidden import Regression, over_signal, over_time, re
 from hvdc_ident.discrepancy.library import Term, along, terms
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.refit import Job, Placed, Refit, run, unseen
-from hvdc_ident.discrepancy.rounds import Search, slot_signals
 from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Ruler
+from hvdc_ident.discrepancy.state import Search, slot_signals
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free

@@ -11,9 +11,9 @@ from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import unseen
 from hvdc_ident.discrepancy.result import Line
-from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Trial
+from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.effects import clearance, effects
 from hvdc_ident.frozen import FrozenMap
 

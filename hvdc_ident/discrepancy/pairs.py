@@ -11,10 +11,11 @@ import numpy as np
 from hvdc_ident.discrepancy.jobs import job
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Job, Refit
-from hvdc_ident.discrepancy.rounds import Round, Search, against, gained
+from hvdc_ident.discrepancy.rounds import against, gained
 from hvdc_ident.discrepancy.scores import signature_rows
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, best_of
 from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.trajectory import Array

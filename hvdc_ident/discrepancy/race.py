@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.refit import Found, Job, Refit, find
 from hvdc_ident.fit.executor import mapped
 
 if TYPE_CHECKING:
-    from hvdc_ident.discrepancy.rounds import Search
+    from hvdc_ident.discrepancy.state import Search
 
 
 @dataclass(frozen=True)

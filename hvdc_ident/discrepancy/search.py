@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.rounds import Round, Search, excess, one_round
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.settle import settled
+from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.discrepancy.trials import excess
 from hvdc_ident.errors import SimulationError
 
 

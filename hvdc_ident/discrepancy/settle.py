@@ -11,8 +11,9 @@ import numpy as np
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
-from hvdc_ident.discrepancy.rounds import Round, Search, closed, one_round
+from hvdc_ident.discrepancy.rounds import closed, one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
+from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Free

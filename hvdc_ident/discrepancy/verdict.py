@@ -15,9 +15,9 @@ from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.objections import silent, worst
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.result import Rival, Verdict
-from hvdc_ident.discrepancy.rounds import Search
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import material_gap
+from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.trajectory import Array

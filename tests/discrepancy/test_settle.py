@@ -12,9 +12,10 @@ from refits import beside, plain
 from hvdc_ident.discrepancy import settle
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.rounds import Round, Search, one_round
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, clear
 from hvdc_ident.discrepancy.settle import _last, job_of, settled
+from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.transform import home

@@ -14,11 +14,13 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy.akin import as_late, with_begun
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.refit import Job, Refit, run
-from hvdc_ident.discrepancy.rounds import Search, _as_late, _begun, one_round
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, clear
+from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -158,7 +160,7 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     names = {c.effect: k for k, c in enumerate(opened.candidates)}
     late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
     trial = Trial(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
-    begun = [t for t in _begun(search, opened, [trial], _as_late(opened, [trial]), 1) if t is not trial]
+    begun = [t for t in with_begun(search, opened, [trial], as_late(opened, [trial]), 1) if t is not trial]
     assert {opened.candidates[t.pick.candidate].effect for t in begun} == {"window-mean", "lag"}
     best = min(begun, key=lambda t: t.refit.chi2)
     assert opened.candidates[best.pick.candidate].effect == "window-mean"

@@ -1,0 +1,134 @@
+"""What the best refits so far suggest to be tried besides: other places, other forms, other kinds of delay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.scan import bent
+from hvdc_ident.discrepancy.select import Pick, Trial
+from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.discrepancy.trials import HEAT, best_each, by_cost, cost_of, excess, misses, once_more, refitted
+from hvdc_ident.effects import effects
+
+ELSEWHERE = 40
+"""Other places at most at which the best effects are refitted."""
+ALIKE = 0.9
+"""Share of the best fall of chi2 from which a refit is tried in the effect's other forms."""
+FORMS = 16
+"""Of these refits at most."""
+LEADERS = 4
+"""Of the refits the best, whose places other kinds of delay are tried at."""
+STARTS = 2
+"""Sizes that another kind of delay is begun at."""
+LIKE = 0.3
+"""Of a logarithm: up to where two delays are alike."""
+
+
+def elsewhere(
+    search: Search, opened: Round, picks: Sequence[Pick], trials: Sequence[Trial], number: int
+) -> list[Trial]:
+    """Refits of the best effects at every other place where they score more than noise: the places that cannot be told from
+    theirs are to be had by no other way, for a score is that of one size and of gains that are biased."""
+    found = opened.candidates
+    sound = by_cost(trials)
+    if not sound:
+        return []
+    margin = 2.0 * search.options.set_bic
+    least, cost = min(t.refit.chi2 for t in sound) + margin, cost_of(sound[0]) + margin
+    leading = {found[t.pick.candidate].effect for t in sound if t.refit.chi2 < least or cost_of(t) < cost}
+    twins = {
+        p.candidate for k, same in opened.same.items() for p in same if found[p.candidate].source == found[k].source
+    }
+    tried = {t.pick.candidate for t in trials} | twins
+    threshold = opened.scores.threshold(search.options.significance)
+    left = [
+        p for p in picks if found[p.candidate].effect in leading and p.candidate not in tried and p.score > threshold
+    ]
+    return refitted(
+        search, opened, left[:ELSEWHERE], f"round {number}: {', '.join(sorted(leading))} elsewhere", trials, HEAT
+    )
+
+
+def other_forms(opened: Round, trials: Sequence[Trial], was: float) -> list[Pick]:
+    """The best candidates with other parts of the effect, where it is made of optional ones: a score is that of one of them.
+
+    was: chi2 of the model before. A loss in proportion to a current is no better told from its square by the gains as they
+    are than other sizes are.
+    """
+    found, scores = opened.candidates, opened.scores
+    sound = by_cost(trials)
+    most = was - min((t.refit.chi2 for t in sound), default=was)
+    good = [t for t in sound if was - t.refit.chi2 > ALIKE * most]
+    picks: list[Pick] = []
+    for k in dict.fromkeys(t.pick.candidate for t in good):
+        done_here = {frozenset(found[k].probes[t.pick.probe].free) for t in trials if t.pick.candidate == k}
+        columns = [(float(scores.t[n]), n, c.probe) for n, c in enumerate(scores.columns) if c.candidate == k]
+        for score, n, probe in sorted(columns, reverse=True):
+            form = frozenset(found[k].probes[probe].free)
+            if score > 0 and form not in done_here:
+                done_here.add(form)
+                picks.append(Pick(k, probe, float(scores.expected[n]), score))
+    return picks[:FORMS]
+
+
+def as_late(opened: Round, trials: Sequence[Trial]) -> list[Pick]:
+    """The other kinds of delay at the best places of one, to be begun where they delay a slow signal by as much.
+
+    A score is had at few sizes, and from a wrong one no slope leads to the right one: a window to another of its zeros.
+    """
+    found = opened.candidates
+    sound = by_cost(trials)
+    goals: dict[tuple[str, ...], float] = {}
+    for t in sound[:LEADERS]:
+        late = _late(t)
+        if late and late > 0.0:
+            goals.setdefault(found[t.pick.candidate].at, late)
+    done_here = {t.pick.candidate: late for t in sound if (late := _late(t)) and late > 0.0}
+    picks = []
+    for k, c in enumerate(found):
+        late_of, goal = effects()[c.effect].late, goals.get(c.at)
+        if late_of is None or goal is None or (k in done_here and _apart(done_here[k], goal) < LIKE):
+            continue
+        lates = {n: late_of(p.values) for n, p in enumerate(c.probes)}
+        nearest = sorted((n for n in lates if lates[n] > 0.0), key=lambda n: _apart(lates[n], goal))
+        picks += [Pick(k, n, goal / lates[n], opened.score_p(k)[0]) for n in nearest[:STARTS]]
+    return picks
+
+
+def with_begun(
+    search: Search, opened: Round, trials: Sequence[Trial], picks: Sequence[Pick], number: int
+) -> list[Trial]:
+    """The trials with those picks, of each candidate the best.
+
+    A period that has to be met is looked for where there is something left for it to explain.
+    """
+    text = f"round {number}: as late as the best"
+    begun = refitted(search, opened, picks, text, trials)
+    sound = by_cost(trials)
+    if sound and (excess(sound[0].refit) or misses(sound[0].refit)):
+        begun = once_more(search, opened.candidates, begun, text, most=1)
+    return best_each([*trials, *begun])
+
+
+def is_akin(candidate: Candidate, opened: Round, trials: Sequence[Trial]) -> bool:
+    """Whether a candidate is worth a closer look because of what is best so far: the same at any place, where its size has
+    to be met; a bend at any place, where something bends its signal; a sampler where something delays it."""
+    leading = [opened.candidates[t.pick.candidate] for t in by_cost(trials)[:LEADERS]]
+    if effects()[candidate.effect].scanned and leading and leading[0].effect == candidate.effect:
+        return True
+    if effects()[candidate.effect].late is not None:
+        return any(effects()[c.effect].late is not None and c.at == candidate.at for c in leading)
+    return any(bent(c) for c in leading) and not effects()[candidate.effect].scanned
+
+
+def _apart(a: float, b: float) -> float:
+    """How far two times are from each other, as a logarithm."""
+    return abs(math.log(a / b))
+
+
+def _late(trial: Trial) -> float | None:
+    """By how long the effect that a trial added delays a slow signal, s; None for what is no kind of delay."""
+    placed = trial.refit.placed[-1]
+    return effects()[placed.candidate.effect].late_by(trial.refit.sizes(placed))

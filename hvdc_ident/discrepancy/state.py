@@ -1,0 +1,77 @@
+"""What a search carries from room to room: what stays the same over its rounds, and what one of them found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.refit import Placed, Refit
+from hvdc_ident.discrepancy.scores import Path, Scores
+from hvdc_ident.discrepancy.select import Pick, Ruler, Trial
+from hvdc_ident.fit.executor import Executor, Progress
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+
+@dataclass(frozen=True)
+class Search:
+    """What stays the same over the rounds."""
+
+    effects: tuple[str, ...] | Literal["all"]
+    places: tuple[str | tuple[str, ...], ...] | None
+    material: FrozenMap[float]
+    options: Options
+    seed: int
+    executor: Executor | None = None
+    progress: Progress | None = None
+
+    def tries(self, effect: str) -> bool:
+        """Whether an effect is among those looked for."""
+        return self.effects == "all" or effect in self.effects
+
+    def tell(self, done: int, total: int, text: str) -> None:
+        """Nothing; whoever watches is told."""
+        if self.progress:
+            self.progress(done, total, text)
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """What one round found. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
+
+    trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
+    """
+
+    before: Refit
+    paths: Mapping[str, Path]
+    candidates: tuple[Candidate, ...]
+    scores: Scores
+    trials: tuple[Trial, ...]
+    failed: tuple[Trial, ...]
+    same: Mapping[int, list[Pick]]
+    winner: Trial | None
+    why: str
+    significant: bool
+    ruler: Ruler | None
+
+    def score_p(self, candidate: int) -> tuple[float, float, int]:
+        """The best score of a candidate, its p, and the column it stands in (-1: none)."""
+        t = self.scores.t
+        own = [k for k, c in enumerate(self.scores.columns) if c.candidate == candidate]
+        if not own:
+            return 0.0, 1.0, -1
+        k = max(own, key=lambda j: t[j])
+        return float(t[k]), self.scores.p(float(t[k])), k
+
+
+def slot_signals(paths: Mapping[str, Path], placed: Sequence[Placed] = ()) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot that all experiments have, one array an experiment.
+
+    placed: effects that are in the model already; nothing is looked for inside them.
+    """
+    common = [p for p in next(iter(paths.values())).slots if all(p in a.slots for a in paths.values())]
+    outer = [p for p in common if not any(one.use.made(p) for one in placed)]
+    return {p: tuple(a.signal(p) for a in paths.values()) for p in outer}

@@ -1,0 +1,109 @@
+"""Candidates refitted, in a race with each other, and how good what they come to is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.hops import hop
+from hvdc_ident.discrepancy.jobs import job
+from hvdc_ident.discrepancy.objections import unseen_rows
+from hvdc_ident.discrepancy.race import Race, done
+from hvdc_ident.discrepancy.refit import Job, Refit, unseen
+from hvdc_ident.discrepancy.select import Pick, Trial
+from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import HvdcIdentError
+
+RACE = Race()
+HEAT = Race(sprint=5, reach=0.4)
+"""For many candidates: a short sprint."""
+PRICE = 8.0
+"""Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
+NEAR = 0.05
+"""Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
+AGAIN = 4
+"""Refits of one effect at most whose size is looked for again beside the gains they came to."""
+
+
+def refitted(
+    search: Search, opened: Round, picks: Sequence[Pick], text: str, earlier: Sequence[Trial] = (), race: Race = RACE
+) -> list[Trial]:
+    """The picks refitted, in a race with each other and with those refitted earlier."""
+    before, found = opened.before, opened.candidates
+    jobs, of, trials = [], [], []
+    for p in picks:
+        try:
+            jobs.append(job(before, found, [p]))
+            of.append(p)
+        except HvdcIdentError as error:
+            none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
+            trials.append(Trial(p, none, -np.inf))
+    texts = [f"{text}: {found[p.candidate].label}" for p in of]
+    best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
+    refits = race.run(search, before.chi2, jobs, texts, best)
+    return [*trials, *(Trial(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
+
+
+def once_more(
+    search: Search, found: Sequence[Candidate], trials: Sequence[Trial], text: str, most: int = AGAIN
+) -> list[Trial]:
+    """The trials, with another size where one is found beside the gains that a refit came to."""
+    chosen: dict[str, list[Trial]] = {}
+    for t in sorted(trials, key=lambda t: t.refit.chi2):
+        effect = found[t.pick.candidate].effect
+        if effects()[effect].scanned and not t.refit.failure and len(chosen.setdefault(effect, [])) < most:
+            chosen[effect].append(t)
+    again = [t for group in chosen.values() for t in group]
+    jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
+    refits = done(search, jobs, [f"{text}: {found[t.pick.candidate].label}" for t in again], hop)
+    better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
+    return [better.get(id(t), t) for t in trials]
+
+
+def best_each(trials: Sequence[Trial]) -> list[Trial]:
+    """Of the trials of each candidate the best, in their order."""
+    kept: dict[int, Trial] = {}
+    for t in trials:
+        had = kept.get(t.pick.candidate)
+        if had is None or had.refit.failure or (not t.refit.failure and cost_of(t) < cost_of(had)):
+            kept[t.pick.candidate] = t
+    return list(kept.values())
+
+
+def by_cost(trials: Sequence[Trial]) -> list[Trial]:
+    """Those that came to a result, the best first."""
+    return sorted((t for t in trials if not t.refit.failure), key=cost_of)
+
+
+def cost_of(trial: Trial) -> float:
+    """What a refit leaves of all data, and what its parameters cost, before it is known what BIC counts by."""
+    refit, held = trial.refit, unseen(trial.refit)
+    return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
+
+
+def excess(refit: Refit) -> bool:
+    """Whether a model leaves more than noise, by size."""
+    return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))
+
+
+def misses(refit: Refit) -> bool:
+    """Whether a model leaves more of data it has not seen than of those it was fitted to, by more than chance."""
+    seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
+    return now is not None and now**2 > seen * (1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective)))
+
+
+def left_by(refit: Refit) -> float:
+    """What a model leaves beyond noise, a row, of the fitted data or of the others."""
+    return max(refit.chi2 / refit.rows, (unseen(refit) or 0.0) ** 2) - 1.0
+
+
+def all_far(before: Refit, trials: Sequence[Trial], near: float = NEAR) -> bool:
+    """Whether no refit comes near the noise, on the fitted data and on the others, or near enough: to a share of what was."""
+    was = left_by(before)
+    return all(
+        (excess(t.refit) or misses(t.refit)) and left_by(t.refit) > near * was for t in trials if not t.refit.failure
+    )
