@@ -112,15 +112,19 @@ def with_begun(
     return best_each([*trials, *begun])
 
 
-def is_akin(candidate: Candidate, opened: Round, trials: Sequence[Trial]) -> bool:
+def leaders(opened: Round, trials: Sequence[Trial]) -> list[Candidate]:
+    """The candidates whose refits are the best, the best first."""
+    return [opened.candidates[t.pick.candidate] for t in by_cost(trials)[:LEADERS]]
+
+
+def is_akin(candidate: Candidate, best: Sequence[Candidate]) -> bool:
     """Whether a candidate is worth a closer look because of what is best so far: the same at any place, where its size has
     to be met; a bend at any place, where something bends its signal; a sampler where something delays it."""
-    leading = [opened.candidates[t.pick.candidate] for t in by_cost(trials)[:LEADERS]]
-    if effects()[candidate.effect].scanned and leading and leading[0].effect == candidate.effect:
+    if effects()[candidate.effect].scanned and best and best[0].effect == candidate.effect:
         return True
     if effects()[candidate.effect].late is not None:
-        return any(effects()[c.effect].late is not None and c.at == candidate.at for c in leading)
-    return any(bent(c) for c in leading) and not effects()[candidate.effect].scanned
+        return any(effects()[c.effect].late is not None and c.at == candidate.at for c in best)
+    return any(bent(c) for c in best) and not effects()[candidate.effect].scanned
 
 
 def _apart(a: float, b: float) -> float:

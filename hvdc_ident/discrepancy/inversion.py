@@ -66,7 +66,7 @@ class Inversion:
             own.append(path.signal(place))
             seen.append(u[0])
             means.append(mean)
-        taken = np.hstack([q.T @ s for q, s in zip(_parts(nominal.basis, shown), shown, strict=True)])
+        taken = np.hstack([q.T @ s for q, s in zip(_split(nominal.basis, shown), shown, strict=True)])
         square, directions = np.linalg.eigh(block_diag(*(s.T @ s for s in shown)) - taken.T @ taken)
         strength = np.sqrt(np.maximum(square[::-1], 0.0))
         kept = strength > WEAK * strength[0]
@@ -92,8 +92,8 @@ class Inversion:
     @cached_property
     def told(self) -> tuple[Array, ...]:
         """The slot's signal as the records tell it, one array (K,) an experiment."""
-        parts = np.split(self.added, np.cumsum([m.shape[0] for m in self.means])[:-1])
-        return tuple(u + w @ c for u, w, c in zip(self.own, self.seen, parts, strict=True))
+        parts = zip(self.own, self.seen, _split(self.added, self.means), strict=True)
+        return tuple(u + w @ c for u, w, c in parts)
 
     def knots(self, changes: Sequence[Array]) -> Array:
         """(k n, C) at the knots of what is added at the instants, (K, C) in each experiment."""
@@ -101,7 +101,7 @@ class Inversion:
 
     def against(self, rows: Array) -> Array:
         """(m, B) what whitened rows (N, B), without what parameters can make good, have of each direction."""
-        at_knots = np.vstack([s.T @ r for s, r in zip(self.shown, _parts(rows, self.shown), strict=True)])
+        at_knots = np.vstack([s.T @ r for s, r in zip(self.shown, _split(rows, self.shown), strict=True)])
         return np.asarray(self.directions.T @ at_knots / self.strength[:, None])
 
     def falls(self, at_knots: Array, noise: Array) -> tuple[Array, Array, Array]:
@@ -120,17 +120,17 @@ class Inversion:
         """(p,) the unknowns, to first order, where this is added (k n,), within their bounds."""
         jacobian = np.vstack([b.jacobian for b in nominal.blocks])
         norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-        parts = np.split(at_knots, np.cumsum([m.shape[0] for m in self.means])[:-1])
-        left = nominal.residual - np.concatenate([s @ c for s, c in zip(self.shown, parts, strict=True)])
+        parts = zip(self.shown, _split(at_knots, self.means), strict=True)
+        left = nominal.residual - np.concatenate([s @ c for s, c in parts])
         step = np.linalg.lstsq(jacobian / norms, left, rcond=1e-6)[0] / norms
         low = np.array([u.min for u in nominal.problem.unknowns])
         high = np.array([u.max for u in nominal.problem.unknowns])
         return np.clip(nominal.theta - step, low, high)
 
 
-def _parts(rows: Array, shown: Sequence[Array]) -> list[Array]:
-    """The rows of each experiment, of whose answers there are as many."""
-    return np.split(rows, np.cumsum([s.shape[0] for s in shown])[:-1])
+def _split(rows: Array, like: Sequence[Array | scipy.sparse.csr_array]) -> list[Array]:
+    """The rows of each experiment: as many as its own matrix has."""
+    return np.split(rows, np.cumsum([m.shape[0] for m in like])[:-1])
 
 
 def _hats(time: Array, knots: int) -> tuple[Array, scipy.sparse.csr_array]:

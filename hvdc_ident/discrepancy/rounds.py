@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from hvdc_ident.discrepancy.akin import as_late, elsewhere, is_akin, other_forms, with_begun
+from hvdc_ident.discrepancy.akin import as_late, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.discrepancy.closer import closer_look
 from hvdc_ident.discrepancy.nominal import Nominal
@@ -91,8 +91,8 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     trials = with_begun(search, opened, trials, kin, number)
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1:
-        far = all_far(before, trials, CLOSE)
-        opened, extra = closer_look(search, opened, nominal, number, lambda c: far or is_akin(c, opened, trials))
+        far, leading = all_far(before, trials, CLOSE), leaders(opened, trials)
+        opened, extra = closer_look(search, opened, nominal, number, lambda c: far or is_akin(c, leading))
         closer = refitted(search, opened, extra, f"round {number}: refits of the closer look", trials)
         trials = best_each([*trials, *closer])
     if number == 1 and all_far(before, trials):

@@ -69,7 +69,7 @@ def experiments(
     random = np.random.default_rng(seed)
     found = []
     for name, (role, moves) in RUNS.items():
-        inputs = {n: InputSignal.corners(_corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
+        inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
         clean = _solved(inputs, lag, drag or (lambda w: TRUE["b"] * w), offset)
         y = np.column_stack([_noisy(clean[:, k], s, noise, random) for k, s in enumerate(SIGMA.values())])
         measured = Trajectory(TIME, y, tuple(SIGMA), ("", ""))
@@ -78,7 +78,8 @@ def experiments(
     return tuple(found)
 
 
-def _corners(before: float, moves: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def corners(before: float, moves: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The corners of an input that jumps by so much at each time."""
     points, level = [(0.0, before)], before
     for t, change in moves:
         points += [(t, level), (t, level + change)]

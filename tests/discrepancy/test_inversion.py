@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, experiments, model
+from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, model
 from refits import plain
 from scipy.integrate import solve_ivp
 
@@ -31,7 +31,7 @@ def levels() -> tuple[tuple[Experiment, ...], dict[str, Array]]:
     random = np.random.default_rng(0)
     found, asked = [], {}
     for name, (role, moves) in RUNS.items():
-        inputs = {n: InputSignal.corners(_corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
+        inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
         y = _rounded(inputs)
         asked[name] = y[:, 1].copy()
         y[:, 1] = [_level(u) for u in y[:, 1]]
@@ -41,14 +41,6 @@ def levels() -> tuple[tuple[Experiment, ...], dict[str, Array]]:
             Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
         )
     return tuple(found), asked
-
-
-def _corners(before: float, moves: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    points, level = [(0.0, before)], before
-    for t, change in moves:
-        points += [(t, level), (t, level + change)]
-        level += change
-    return points
 
 
 def _level(u: float) -> float:

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, experiments, model
+from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, model
 from refits import beside, plain
 from scipy.integrate import solve_ivp
 
@@ -38,14 +38,7 @@ def records(course: Callable[[dict[str, InputSignal]], Array]) -> tuple[Experime
     random = np.random.default_rng(0)
     found = []
     for name, (role, moves) in RUNS.items():
-        inputs = {}
-        for n, steps in moves.items():
-            level = {"ref": 1.0, "load": 0.0}[n]
-            points = [(0.0, level)]
-            for t, change in steps:
-                points += [(t, level), (t, level + change)]
-                level += change
-            inputs[n] = InputSignal.corners(points)
+        inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
         measured = noisy(course(inputs), random)
         found.append(
             Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
