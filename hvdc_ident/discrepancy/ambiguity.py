@@ -42,6 +42,25 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     return tuple(each.values())
 
 
+def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) -> tuple[Rival, ...]:
+    """The winner with the formulas outside the catalogue that are within delta BIC of it; () where one is further ahead of it.
+
+    formulas: refitted in the winner's stead.
+    """
+    assert found.winner is not None
+    own, *behind = behinds([found.winner, *formulas])
+    if own > options.set_bic:
+        return ()
+    near = [(b, t) for b, t in zip(behind, formulas, strict=True) if b <= options.set_bic]
+    return tuple(sorted((_rival(found.winner, own), *(_rival(t, b) for b, t in near)), key=lambda r: r.delta_bic))
+
+
+def _rival(trial: Trial, behind: float) -> Rival:
+    placed = trial.refit.placed[-1]
+    c, sizes = placed.candidate, FrozenMap(trial.refit.sizes(placed))
+    return Rival(c.effect, c.at, behind, sizes, c.source, expression=placed.use.expression)
+
+
 def _unfitted(found: Round, best: float, options: Options, droop: bool) -> list[Rival]:
     """Candidates that were not refitted but, being linear in their size, gain what their score says."""
     assert found.ruler is not None

@@ -117,7 +117,7 @@ def _at(
         ]  # fmt: skip
     if not effect.needs_source:
         sizes = probes(effect, signal, closer=closer)
-        return [Candidate(effect.name, at, sizes, still=still and not _additive(effect))]
+        return [Candidate(effect.name, at, sizes, still=still and not additive(effect))]
     if len(at) > 1:
         return []
     open_to = set(sources(model, at[0])) if isinstance(model, Model) else set(_open_ends(model, at[0]))
@@ -135,7 +135,7 @@ def _proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
     return bool(np.linalg.norm(across) <= STILL * max(float(np.linalg.norm(u) * np.linalg.norm(v)), STILL))
 
 
-def _additive(effect: Effect) -> bool:
+def additive(effect: Effect) -> bool:
     """Whether the effect is there with a signal that never moves."""
     return effect.name in ("offset", "gain", "disturbance")
 

@@ -8,18 +8,18 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import Binned
-from hvdc_ident.discrepancy.ambiguity import rivals, separating
+from hvdc_ident.discrepancy.ambiguity import separating
 from hvdc_ident.discrepancy.bode import responses
 from hvdc_ident.discrepancy.candidates import entries
 from hvdc_ident.discrepancy.explain import found_of
-from hvdc_ident.discrepancy.fallback import Fallback, fallback
+from hvdc_ident.discrepancy.fallback import Fallback, fallback, formula_found
 from hvdc_ident.discrepancy.gap import gap, with_given
 from hvdc_ident.discrepancy.lines import detectable, lines
 from hvdc_ident.discrepancy.localise import localise
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, judged
-from hvdc_ident.discrepancy.result import Diagnosis, Found, Rival
+from hvdc_ident.discrepancy.result import Diagnosis, Found
 from hvdc_ident.discrepancy.search import Outcome, forward
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.discrepancy.verdict import Judgement, judge
@@ -82,9 +82,11 @@ def diagnose(
     outcome = forward(search, first)
     judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)
-    other = (
-        fallback(search, first, outcome) if judgement.verdict == "unnameable" and chosen.fallback and inside else None
-    )
+    other = None
+    if judgement.instead is not None:
+        other = formula_found(judgement.instead.refit, judgement.instead.gain)
+    elif judgement.verdict == "unnameable" and chosen.fallback and inside:
+        other = fallback(search, first, outcome)
     if not inside:
         notes = (*notes, CLOSED)
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
@@ -127,19 +129,17 @@ def _assembled(
 ) -> Diagnosis:
     search.tell(0, 1, "before and after")
     in_place = judgement.verdict in ("named", "ambiguous")
-    groups: tuple[tuple[Rival, ...], ...] = ()
     effects: tuple[Found, ...] = ()
     last = first
     if in_place:
         last = outcome.refit
         effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
-        groups = tuple(rivals(r, search.options, search.tries("droop")) for r in outcome.kept)
     elif other is not None and other.refit is not None:
         last = other.refit
     augmented = None if last is first else last.model.with_values(_own(last))
     given = with_given(first, {f.name: f.start for f in free})
     responses_found = responses(model, first, augmented, last)
-    sets = tuple(g for g in groups if len(g) > 1)
+    sets = tuple(g for g in judgement.sets if len(g) > 1)
     return Diagnosis(
         verdict=judgement.verdict,
         text=judgement.text if other is None else f"{judgement.text} {other.text}",

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import adequacy
-from hvdc_ident.discrepancy.candidates import Candidate, kind_of, source_signals
+from hvdc_ident.discrepancy.candidates import kind_of, source_signals
+from hvdc_ident.discrepancy.formula import at_run, filled, formula_job
 from hvdc_ident.discrepancy.hidden import Regression, over_signal, over_time, regression
-from hvdc_ident.discrepancy.library import Term, along, terms
+from hvdc_ident.discrepancy.library import Term, terms
 from hvdc_ident.discrepancy.noise import draws
-from hvdc_ident.discrepancy.refit import Job, Placed, Refit, run, unseen
+from hvdc_ident.discrepancy.refit import Refit, run, unseen
 from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Ruler
 from hvdc_ident.discrepancy.state import Search, slot_signals
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit import Free
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
 MOST = 3
@@ -68,7 +67,7 @@ def fallback(search: Search, first: Refit, outcome: Outcome) -> Fallback:
     for k, place in enumerate(places):
         search.tell(k, len(places), f"hidden input at {place}")
         library = terms([place, *(s for s in signals if s != place)] if not _is_output(first, place) else signals)
-        found = regression(nominal, r.paths, place, [_along(t) for t in library])
+        found = regression(nominal, r.paths, place, [at_run(t) for t in library])
         chosen = found.selected(MOST, price)
         if chosen:
             coefficients, gain = found.solved(chosen)
@@ -85,10 +84,6 @@ def fallback(search: Search, first: Refit, outcome: Outcome) -> Fallback:
     if tried:
         return min(tried, key=lambda item: item[0])[1]
     return _curve(search, first, outcome, [p for _, p, *_ in ranked] or places)
-
-
-def _along(term: Term) -> Callable[[str, Path], Array]:
-    return lambda _, path: along(term, path.values)
 
 
 def _is_output(first: Refit, place: str) -> bool:
@@ -131,32 +126,13 @@ def _inserted(
     search: Search, first: Refit, place: str, chosen: Sequence[Term], coefficients: Array, stability: float
 ) -> Fallback | None:
     """The term in the model, refitted; None where it does not stand the tests an effect of the catalogue has to."""
-    names = [f"k{i + 1}" for i in range(len(chosen))]
-    expression = " + ".join(f"{n}*{t.text}" for n, t in zip(names, chosen, strict=True))
-    values = {n: float(c) for n, c in zip(names, coefficients, strict=True)}
-    use = EffectUse("term", (place,), FrozenMap(values), expression=expression)
     try:
-        before = set(first.model.parameters)
-        model = first.model.with_effects([use])
-        new = [n for n in model.parameters if n not in before]
-        bounds = {n: (-20.0 * abs(v), 20.0 * abs(v)) for n, v in values.items()}
-        free = tuple(Free(m, values[n], *bounds[n]) for n, m in zip(names, new, strict=True))
-        problem = replace(first.problem, simulator=ModelSimulator(model), free=(*first.problem.free, *free))
-        k = len(first.problem.free)
-        begin = np.concatenate([first.theta[:k], list(values.values()), first.theta[k:]])
-        placed = Placed(
-            Candidate("term", (place,), ()),
-            use,
-            FrozenMap(dict(zip(names, new, strict=True))),
-            FrozenMap(bounds),
-            FrozenMap(values),
-        )
-        refit = run(Job(model, (placed,), problem, (begin,), first.noise))
+        refit = run(formula_job(first, place, chosen, coefficients))
     except HvdcIdentError:
         return None
     if refit.failure:
         return None
-    gain = Ruler.of(refit).gain(first.chi2, refit.chi2, len(names))
+    gain = Ruler.of(refit).gain(first.chi2, refit.chi2, refit.count)
     was, now = unseen(first), unseen(refit)
     if not (
         gain > search.options.named_bic
@@ -171,22 +147,20 @@ def _inserted(
     tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
     if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):
         return None
-    at, spread = refit.values, refit.std
-    shown = {
-        n: {
-            "value": at[m],
-            "ci95": None
-            if spread.get(m) is None
-            else [at[m] - 1.96 * float(spread[m] or 0), at[m] + 1.96 * float(spread[m] or 0)],
-        }
-        for n, m in zip(names, new, strict=True)
-    }
-    text = effects()["term"].sentence.replace("{at}", place)
-    filled = expression
-    for n, m in zip(names, new, strict=True):
-        filled = filled.replace(f"{n}*", f"{at[m]:.4g}*")
+    return formula_found(refit, gain, stability)
+
+
+def formula_found(refit: Refit, gain: float, stability: float | None = None) -> Fallback:
+    """The formula that a refit ends with. gain: delta BIC; stability: share of noise records that choose the same terms."""
+    placed = refit.placed[-1]
+    (place,) = placed.candidate.at
+    shown = {}
+    for n, value in refit.sizes(placed).items():
+        std = refit.std.get(placed.names[n])
+        shown[n] = {"value": value, "ci95": None if std is None else [value - 1.96 * std, value + 1.96 * std]}
+    text = effects()["term"].sentence.replace("{at}", place).replace("{expression}", filled(placed, refit))
     return Fallback(
-        "term", place, f"Found from the data, outside the catalogue: {text.replace('{expression}', filled)}.", expression,
+        "term", place, f"Found from the data, outside the catalogue: {text}.", placed.use.expression,
         FrozenMap(shown), stability, gain, None, refit,
     )  # fmt: skip
 

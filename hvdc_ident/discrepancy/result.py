@@ -55,7 +55,8 @@ class Found:
 class Rival:
     """A member of an ambiguity set. delta_bic: how far it is behind the best, 0 for the best itself.
 
-    refitted: whether that comes from a refit, or from the best one's with which its signature is the same.
+    refitted: whether that comes from a refit, or from the best one's with which its signature is the same. expression: of
+    a formula outside the catalogue, with its coefficients' names.
     """
 
     effect: str
@@ -64,6 +65,7 @@ class Rival:
     parameters: FrozenMap[float] = field(default_factory=FrozenMap)
     source: str = ""
     refitted: bool = True
+    expression: str = ""
 
     @property
     def late(self) -> float | None:
@@ -181,5 +183,6 @@ def _named(value: Found | Rival | Line) -> dict[str, Any]:
 
 
 def _member(value: Found | Rival) -> dict[str, Any]:
-    """The same, with `late` only where it is one kind of delay or another."""
-    return _named(value) | ({} if value.late is None else {"late": value.late})
+    """The same, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
+    out = {k: v for k, v in _named(value).items() if k != "expression" or v}
+    return out | ({} if value.late is None else {"late": value.late})

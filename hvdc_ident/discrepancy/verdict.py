@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.discrepancy.adequacy import Binned, adequacy
-from hvdc_ident.discrepancy.ambiguity import rivals
+from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
+from hvdc_ident.discrepancy.beyond import beyond
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.objections import silent, worst
+from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.result import Rival, Verdict
 from hvdc_ident.discrepancy.search import Outcome
-from hvdc_ident.discrepancy.select import material_gap
+from hvdc_ident.discrepancy.select import Trial, material_gap
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
@@ -33,12 +35,18 @@ that has no name: less is what a wrong idea of the noise makes."""
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict, why, the tests of what is left, and the experiment that would show more where nothing was excited."""
+    """The verdict, why, and the tests of what is left.
+
+    sets: by effect that was put in, it and what cannot be told from it. experiment: what would show more where nothing was
+    excited. instead: the refit of a formula outside the catalogue that explains more than what would have been named.
+    """
 
     verdict: Verdict
     text: str
     tests: tuple[Binned, ...]
+    sets: tuple[tuple[Rival, ...], ...] = ()
     experiment: Mapping[str, Any] = field(default_factory=dict)
+    instead: Trial | None = None
 
 
 def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
@@ -69,20 +77,40 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
                 f"{max(told, 0.0):.0%}: the form is not the right one.",
                 tests,
             )
-    sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
+    sets = tuple(rivals(r, options, search.tries("droop")) for r in outcome.kept)
+    if all(len(g) == 1 for g in sets):
+        tried = [(r, beyond(search, r)) for r in outcome.kept]
+        sets = tuple(
+            formula_rivals(r, forms, options) if forms else g for (r, forms), g in zip(tried, sets, strict=True)
+        )
+        if not all(sets):
+            better = max(
+                (t for (_, forms), g in zip(tried, sets, strict=True) if not g for t in forms), key=lambda t: t.told
+            )
+            text = (
+                f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
+            )
+            return Judgement("unnameable", text, tests, instead=better)
+    return _named(labels, sets, tests, explained, options)
+
+
+def _named(
+    labels: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...], explained: float, options: Options
+) -> Judgement:
+    """Named or ambiguous; or unnameable where what is left is no noise in the region that the effect was put there for."""
     others = max(len(g) for g in sets) - 1
     rest = f"one of {others} others" if others > 1 else "another one"
     like = f"{labels}, or {rest} that these data cannot tell from it" if others else labels
     kind: Verdict = "ambiguous" if others else "named"
     worst = max((b for b in tests if b.p <= REFUTED_P), key=lambda b: b.excess, default=None)
     if worst is None:
-        return Judgement(kind, f"Missing: {like}.", tests)
+        return Judgement(kind, f"Missing: {like}.", tests, sets)
     left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
     if worst.excess <= options.refuted * explained:
-        return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests)
+        return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
     # Where all that explain most of it are of one kind, that kind is told, and none of them is to be believed.
     if others and all(_one_kind(g) for g in sets) and worst.excess < (1.0 - DOMINANT) * explained:
-        return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests)
+        return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
 
@@ -134,7 +162,7 @@ def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned
         still = list(dict.fromkeys(c.effect for c in found.candidates))
         text = "None of the effects looked for is excited by these experiments."
         advice = {"text": ". ".join(f"{e}: {effects()[e].excited_by}" for e in still)}
-        return Judgement("not-excited", text, tests, advice)
+        return Judgement("not-excited", text, tests, experiment=advice)
     if found.significant:
         return Judgement("no-evidence", f"No gap that matters: {found.why}.", tests)
     return Judgement("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)

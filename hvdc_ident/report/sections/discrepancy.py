@@ -58,7 +58,7 @@ def _sets(found: dict[str, Any]) -> str:
     for group in found.get("ambiguity") or []:
         rows = [
             [
-                text(r["effect"]),
+                text(f"{r['effect']} {r.get('expression', '')}".rstrip()),
                 text(", ".join(r["at"])),
                 text(r.get("from", "")),
                 "" if r.get("late") is None else number(1e3 * r["late"], 3),

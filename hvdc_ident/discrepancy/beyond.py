@@ -1,0 +1,75 @@
+"""What a named form might be instead, outside the catalogue: powers, magnitudes and products of signals at its slot.
+
+A saturation bends by the third order, a coupling is a product at its operating point: whoever has only the catalogue's
+name for it takes a form for told that the data do not tell.
+"""
+
+from __future__ import annotations
+
+from hvdc_ident.discrepancy.candidates import additive, source_signals
+from hvdc_ident.discrepancy.formula import at_run, formula_job
+from hvdc_ident.discrepancy.hidden import regression
+from hvdc_ident.discrepancy.library import Term, terms
+from hvdc_ident.discrepancy.race import done
+from hvdc_ident.discrepancy.refit import Job
+from hvdc_ident.discrepancy.rounds import gained
+from hvdc_ident.discrepancy.select import Trial
+from hvdc_ident.discrepancy.state import Round, Search, slot_signals
+from hvdc_ident.discrepancy.trials import PRICE
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import ModelError
+from hvdc_ident.model.definition import Model
+
+TRIED = 6
+"""Formulas, the best by regression, that are refitted."""
+
+
+def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
+    """The refits of formulas at the winner's slot in its stead, each with the winner's pick; those that failed are left out.
+
+    Only for what bends a signal or brings one in, without memory, at one slot inside a model: no formula of signals at one
+    time is a delay.
+    """
+    winner = found.winner
+    assert winner is not None and found.ruler is not None
+    placed = winner.refit.placed[-1]
+    effect = effects()[placed.candidate.effect]
+    remembers = (
+        effect.states != "none" and not effect.needs_source
+    )  # of what it brings in it keeps the start value alone
+    if remembers or effect.scanned or additive(effect):
+        return ()
+    if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
+        return ()
+    jobs = _jobs(found, placed.candidate.at[0], placed.candidate.source)
+    texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
+    refits = [r for r in done(search, jobs, texts) if not r.failure]
+    return tuple(gained(Trial(winner.pick, r, 0.0), found.before, found.ruler) for r in refits)
+
+
+def _jobs(found: Round, place: str, source: str) -> list[Job]:
+    """The formulas that by regression leave least for what their coefficients cost."""
+    nominal = found.before.nominal()
+    ranked = []
+    for formula in _formulas(found, place.removeprefix("outputs."), source):
+        regressed = regression(nominal, found.paths, place, [at_run(t) for t in formula])
+        coefficients, gain = regressed.solved(range(len(formula)))
+        if coefficients.all():
+            ranked.append((gain - PRICE * len(formula), formula, coefficients))
+    ranked.sort(key=lambda r: -r[0])
+    jobs = []
+    for _, formula, coefficients in ranked[:TRIED]:
+        try:
+            jobs.append(formula_job(found.before, place, formula, coefficients))
+        except ModelError:  # a formula that would close a loop through itself is none of this model
+            continue
+    return jobs
+
+
+def _formulas(found: Round, own: str, source: str) -> list[tuple[Term, ...]]:
+    """Powers, magnitudes and products of the slot's signal with what is brought in, or with any; each also beside a gain."""
+    others = (source,) if source else source_signals(found.before.model, slot_signals(found.paths))
+    library = terms([own, *(s for s in others if s != own)])
+    linear, bent = next(t for t in library if t.signals == (own,)), [t for t in library if t.form != "x"]
+    near = [t for t in bent if own in t.signals or source in t.signals]
+    return [*((t,) for t in near), *((t, linear) for t in near)]

@@ -1,0 +1,61 @@
+"""A formula of the model's own signals, put on a slot as a further term and ready to be refitted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.library import Term, along
+from hvdc_ident.discrepancy.refit import Job, Placed, Refit
+from hvdc_ident.discrepancy.scores import Path
+from hvdc_ident.effects import EffectUse
+from hvdc_ident.fit import Free
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.trajectory import Array
+
+WIDE = 20.0
+"""Times its start value: how large a coefficient may become."""
+
+
+def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients: Array) -> Job:
+    """The refit of a model with the sum of k1, k2, … times the terms added at a slot, begun at those coefficients.
+
+    Raises ModelError where the term cannot be put there.
+    """
+    names = [f"k{i + 1}" for i in range(len(chosen))]
+    expression = " + ".join(f"{n}*{t.text}" for n, t in zip(names, chosen, strict=True))
+    values = {n: float(c) for n, c in zip(names, coefficients, strict=True)}
+    use = EffectUse("term", (place,), FrozenMap(values), expression=expression)
+    had = set(before.model.parameters)
+    model = before.model.with_effects([use])
+    new = [n for n in model.parameters if n not in had]
+    bounds = {n: (-WIDE * abs(v), WIDE * abs(v)) for n, v in values.items()}
+    free = tuple(Free(m, values[n], *bounds[n]) for n, m in zip(names, new, strict=True))
+    problem = replace(before.problem, simulator=ModelSimulator(model), free=(*before.problem.free, *free))
+    placed = Placed(
+        Candidate("term", (place,), ()),
+        use,
+        FrozenMap(dict(zip(names, new, strict=True))),
+        FrozenMap(bounds),
+        FrozenMap(values),
+    )
+    k = len(before.problem.free)
+    begin = np.concatenate([before.theta[:k], list(values.values()), before.theta[k:]])
+    return Job(model, (*before.placed, placed), problem, (begin,), before.noise)
+
+
+def filled(placed: Placed, refit: Refit) -> str:
+    """The formula with its coefficients as they came out."""
+    text = placed.use.expression
+    for n, value in refit.sizes(placed).items():
+        text = text.replace(f"{n}*", f"{value:.4g}*")
+    return text.replace("+ -", "- ")
+
+
+def at_run(term: Term) -> Callable[[str, Path], Array]:
+    """The term along an experiment's run, as a regression takes it."""
+    return lambda _, path: along(term, path.values)
