@@ -9,6 +9,7 @@ import numpy as np
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.refit import Job, Refit, added, moved
 from hvdc_ident.discrepancy.select import Pick
+from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.trajectory import Array
 
 BIASED = 0.4
@@ -20,7 +21,7 @@ def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job
 
     Gains that have taken an effect's place hold the refit where they are: where one has moved far, or stands on a bound,
     another start is with the gains as they were given. A single effect, too, begins a second time where the score asks for a
-    size far from the one probed. Raises ModelError where an effect cannot sit there.
+    size far from the one probed, and is not right at every size. Raises ModelError where an effect cannot sit there.
     """
     model, problem, placed, sizes = before.model, before.problem, list(before.placed), []
     for p in picks:
@@ -30,8 +31,10 @@ def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job
     asked = np.concatenate(sizes)
     begins = [_begin(before, np.array(p.gains), asked) for p in picks[:1] if p.gains]
     begins.append(_begin(before, before.theta, asked))
-    if len(picks) == 1 and not 0.5 <= abs(picks[0].factor) <= 2.0:
-        at = moved(found[picks[0].candidate], picks[0].probe, float(np.sign(picks[0].factor)) or 1.0)
+    only = found[picks[0].candidate]
+    exact = is_linear(kind_of(only, picks[0].probe))
+    if len(picks) == 1 and not exact and not 0.5 <= abs(picks[0].factor) <= 2.0:
+        at = moved(only, picks[0].probe, float(np.sign(picks[0].factor)) or 1.0)
         begins.append(_begin(before, before.theta, np.array([at[n] for n in placed[-1].bounds])))
     if (given := as_given(before)) is not None:
         begins.append(_begin(before, given, asked))
