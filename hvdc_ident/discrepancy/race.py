@@ -20,11 +20,13 @@ class Race:
     """How a race is run.
 
     sprint: evaluations of every refit at first; more are for those within reach of the best. reach: share of the best
-    refit's fall of chi2 from which another that has not ended is within its reach.
+    refit's fall of chi2 from which another that has not ended is within its reach. second: refits, the best of the first
+    sprint, that run another before that is asked.
     """
 
     sprint: int = 15
     reach: float = 0.7
+    second: int = 0
 
     def run(
         self, search: Search, before: float, jobs: Sequence[Job], texts: Sequence[str], best: float = np.inf
@@ -33,19 +35,28 @@ class Race:
 
         before: chi2 of the model without what they add. best: the least chi2 of refits done before.
         """
-        first = done(search, [replace(j, evaluations=self.sprint) for j in jobs], texts)
-        gained = [0.0 if r.failure else before - r.chi2 for r in first]
+        laps = [replace(j, evaluations=self.sprint) for j in jobs]
+        refits = done(search, laps, texts)
+        running = [k for k, r in enumerate(refits) if not (r.failure or r.ended)]
+        slow = sorted(running, key=lambda k: refits[k].chi2)[: self.second]
+        self._on(search, laps, refits, slow, texts)
+        gained = [0.0 if r.failure else before - r.chi2 for r in refits]
         leader = max([before - best, *gained])
         # Where none is better than nothing, all are still on their way.
         goal = self.reach * leader if leader > 0.0 else -np.inf
-        on = [k for k, r in enumerate(first) if not (r.failure or r.ended) and gained[k] >= goal]
-        further = [
-            replace(jobs[k], begins=(first[k].theta,), evaluations=jobs[k].evaluations - self.sprint) for k in on
-        ]
-        for k, refit in zip(on, done(search, further, [f"{texts[k]}, to the end" for k in on]), strict=True):
+        near = [k for k in running if not refits[k].ended and gained[k] >= goal]
+        rest = [replace(j, evaluations=j.evaluations - self.sprint) for j in jobs]
+        self._on(search, rest, refits, near, [f"{t}, to the end" for t in texts])
+        return refits
+
+    def _on(
+        self, search: Search, jobs: Sequence[Job], refits: list[Refit], which: Sequence[int], texts: Sequence[str]
+    ) -> None:
+        """Some of the refits run on from where they are; one that fails stays there."""
+        further = [replace(jobs[k], begins=(refits[k].theta,)) for k in which]
+        for k, refit in zip(which, done(search, further, [texts[k] for k in which]), strict=True):
             if not refit.failure:
-                first[k] = refit
-        return first
+                refits[k] = refit
 
 
 def done(search: Search, jobs: Sequence[Job], texts: Sequence[str], how: Callable[[Job], Found] = find) -> list[Refit]:

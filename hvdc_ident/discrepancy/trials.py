@@ -19,8 +19,8 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 
 RACE = Race()
-HEAT = Race(sprint=5, reach=0.4)
-"""For many candidates: a short sprint."""
+HEAT = Race(sprint=5, reach=0.4, second=20)
+"""For many candidates: a short sprint, and another for the best."""
 PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
 NEAR = 0.05
