@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
-from hvdc_ident.discrepancy.candidates import Candidate, candidates, kind_of
+from hvdc_ident.discrepancy.candidates import Candidate, candidates
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit
@@ -35,7 +35,7 @@ def closer_look(
         closer=True,
     )
     known = {(c.effect, c.at): k for k, c in enumerate(found)}
-    dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(before, c))
+    dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(c))
     if all(isinstance(p, Along) for p in opened.paths.values()):
         dense += tuple(widened(c) for c in found if not c.still and bent(c))
     dense = tuple(c for c in dense if wanted(c))
@@ -74,9 +74,6 @@ def _views(before: Refit, nominal: Nominal, paths: Mapping[str, Path]) -> list[V
     return views
 
 
-def _worth_a_scan(before: Refit, candidate: Candidate) -> bool:
-    """Whether many sizes are run: at one slot that moves; not of levels at a state, which seldom come to rest."""
-    if len(candidate.at) > 1 or candidate.still:
-        return False
-    memory = effects()[candidate.effect].states != "none"
-    return memory or kind_of(before.model, candidate.at[0]) != "state"
+def _worth_a_scan(candidate: Candidate) -> bool:
+    """Whether many sizes are looked at: at one slot that moves."""
+    return len(candidate.at) == 1 and not candidate.still

@@ -24,6 +24,8 @@ WIDER = 80
 """Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
+NEARLY = 0.1
+"""Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
 CLOSE = 0.01
 """Share of what the model before leaves beyond noise that a refit may leave for a closer look to be saved."""
 
@@ -55,7 +57,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     p = scores.p(picks[0].score)
     if p > options.significance:
         nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
-        return _met(search, nothing, nominal) if number == 1 and excess(before) else nothing
+        return _met(search, nothing, nominal) if number == 1 and (excess(before) or p < NEARLY) else nothing
     return _refitted(search, replace(opened, significant=True), nominal, number, picks)
 
 
