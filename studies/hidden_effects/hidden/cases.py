@@ -12,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hidden.campaigns import EVENT, EXCITATIONS, INTERVAL, ROWS, VARIANTS
-from hidden.noise import KINDS, WRONG, added
+from hidden.noise import KINDS, WRONG, added, whitened
 from hidden.operators import CATALOGUE, OUTSIDE
 from hidden.plants import PLANTS
-from hidden.simulator import Hidden, Run, simulate
-from hidden.sizes import Nominal, needs_source, nominal, sized, units
+from hidden.simulator import STEP, Hidden, Run, simulate
+from hidden.sizes import UNIT, Nominal, needs_source, nominal, sized, units
 
 Array = NDArray[np.floating]
 SIZES = (1.0, 3.0, 10.0, 30.0)
 TRIES = 12
+FIRM = 1.0
+"""Units by which the answer may change at half the step."""
 LOUDNESS = (math.log(2e-3), math.log(2e-2))
 """Of the noise: its standard deviation in shares of an output's range, as logarithms."""
 PARTS = {"single": 340, "pair": 60, "clean": 400, "outside": 50, "left-out": 60}
@@ -191,13 +193,25 @@ def _drawn(
         if len(hidden) < len(design.effects):
             continue
         clean = simulate(base.plant, base.runs, hidden)
-        if not np.isfinite(clean).all():
+        if not np.isfinite(clean).all() or not _firm(base, hidden, clean, sigma, kind, channels):
             continue
         size = float(units(base, clean[:, :2, None], sigma, kind, channels)[0])
         # Of two effects each has the size; together they may have more or less.
         if len(hidden) != 1 or design.size == 0.0 or 0.6 < size / design.size < 1.7:
             return hidden, clean, size, tries
     return None
+
+
+def _firm(
+    base: Nominal, hidden: list[Hidden], clean: Array, sigma: Array, kind: str, channels: tuple[int, ...]
+) -> bool:
+    """Whether the answer is the plant's and not the integrator's: at half its step the same to FIRM units.
+
+    A quantised loop that comes to rest between two levels chatters from step to step, and which of them a row catches is
+    no truth that could be found.
+    """
+    off = simulate(base.plant, base.runs, hidden, step=0.5 * STEP) - clean
+    return float(np.linalg.norm(whitened(off, sigma, kind)[..., list(channels)])) < FIRM * UNIT
 
 
 def _told(design: Design, sigma: Array) -> Array | None:
