@@ -16,7 +16,6 @@ from hvdc_ident.discrepancy.scores import Path, runs
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
-from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.model.definition import Model
 

@@ -66,6 +66,9 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             tests,
         )
     was, now = unseen(first), unseen(last)
+    # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
+    if all(b.p > REFUTED_P for b in tests):
+        floor = max(floor, last.chi2 / last.rows)
     least = (1.0 + options.holdout_share) * np.sqrt(floor)
     # What is left may be of no interest, and told from the noise it is no more then.
     if was is not None and now is not None and min(was, now) > least and not silent(first, last):
