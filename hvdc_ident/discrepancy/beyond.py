@@ -34,9 +34,8 @@ def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
     assert winner is not None and found.ruler is not None
     placed = winner.refit.placed[-1]
     effect = effects()[placed.candidate.effect]
-    remembers = (
-        effect.states != "none" and not effect.needs_source
-    )  # of what it brings in it keeps the start value alone
+    # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
+    remembers = effect.states != "none" and not effect.needs_source
     if remembers or effect.scanned or additive(effect):
         return ()
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:

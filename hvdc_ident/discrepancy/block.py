@@ -230,7 +230,7 @@ def _held(signal: Array, time: Array, period: Any, compute: Any) -> Array:
     for c, (apart, late) in enumerate(each):
         number = np.floor((since - late) / apart + 1e-9).astype(np.intp)
         samples = time[0] + np.arange(number[0], number[-1] + 1) * apart
-        y[:, c] = _at(signal[:, c : c + 1], time, samples[:, None])[number - number[0], 0]
+        y[:, c] = np.interp(samples, time, signal[:, c])[number - number[0]]  # of a doubled instant the later value
     return y
 
 

@@ -80,21 +80,29 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
                 f"{max(told, 0.0):.0%}: the form is not the right one.",
                 tests,
             )
-    sets = tuple(rivals(r, options, search.tries("droop")) for r in outcome.kept)
-    if all(len(g) == 1 for g in sets):
-        tried = [(r, beyond(search, r)) for r in outcome.kept]
-        sets = tuple(
-            formula_rivals(r, forms, options) if forms else g for (r, forms), g in zip(tried, sets, strict=True)
-        )
-        if not all(sets):
-            better = max(
-                (t for (_, forms), g in zip(tried, sets, strict=True) if not g for t in forms), key=lambda t: t.told
-            )
-            text = (
-                f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
-            )
-            return Judgement("unnameable", text, tests, instead=better)
+    sets, better = _sets(search, outcome)
+    if better is not None:
+        text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
+        return Judgement("unnameable", text, tests, instead=better)
     return _named(labels, sets, tests, explained, options)
+
+
+def _sets(search: Search, outcome: Outcome) -> tuple[tuple[tuple[Rival, ...], ...], Trial | None]:
+    """By effect that was put in, it and what cannot be told from it; and a formula that explains more than one of them does.
+
+    Formulas are tried where the catalogue has no rival: before a name is said.
+    """
+    options = search.options
+    sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
+    if any(len(g) > 1 for g in sets):
+        return tuple(sets), None
+    for k, found in enumerate(outcome.kept):
+        formulas = beyond(search, found)
+        near = formula_rivals(found, formulas, options)
+        if not near:
+            return (), max(formulas, key=lambda t: t.told)
+        sets[k] = near
+    return tuple(sets), None
 
 
 def _named(
