@@ -18,7 +18,8 @@ from hvdc_ident.discrepancy.kernel import propagate
 from hvdc_ident.discrepancy.tangent import Partials, Tangent, tangent
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression.functions import symbol
-from hvdc_ident.model.definition import Model
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model, Output
 from hvdc_ident.model.transform import slot
 from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.recording import with_recording
@@ -116,6 +117,11 @@ def _of(matrix: Array, at: Sequence[int]) -> Array:
     return np.ascontiguousarray(matrix[:, :, at])
 
 
+def _observed(model: Model, parts: Tangent) -> Model:
+    """The model whose outputs are all its variables."""
+    return replace(model, outputs=FrozenMap({n: Output(symbol(n)) for n in parts.variables}))
+
+
 def along(model: Model, experiment: Experiment, values: Mapping[str, float]) -> Along:
     """The model's run of the experiment with the answers of its measured outputs.
 
@@ -125,7 +131,7 @@ def along(model: Model, experiment: Experiment, values: Mapping[str, float]) -> 
     outputs = experiment.outputs
     parts = tangent(plant, outputs)
     time, rows = instants(experiment)
-    run = simulate(parts.observed, experiment.with_(time=time, measured=None, drive=(), instrument={}), values)
+    run = simulate(_observed(plant, parts), experiment.with_(time=time, measured=None, drive=(), instrument={}), values)
     states = np.column_stack([run[n] for n in parts.variables])
     given = {**experiment.values, **values}
     p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])

@@ -7,14 +7,13 @@ compiled anew to put it anywhere.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from hvdc_ident.expression.functions import symbol
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Output
+from hvdc_ident.model.definition import Model
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function
 from hvdc_ident.trajectory import Array
@@ -38,25 +37,20 @@ class Partials:
 
 
 class Tangent:
-    """The equations of one model structure, compiled with their partial derivatives; reusable for any values."""
+    """The equations of one model structure, compiled with their partial derivatives; it knows no values, and serves for any."""
 
     def __init__(self, model: Model, outputs: tuple[str, ...]) -> None:
-        self.model, self.outputs = model, outputs
+        self.outputs = outputs
         self.states = tuple(model.states)
         self.signals = (*model.signals, *model.algebraic)
         self.inputs = tuple(model.inputs)
         self.memory = (*model.delays, *model.sampled)
         self.variables = (*self.states, *self.signals, *self.inputs, *self.memory)
         self.place = {n: k for k, n in enumerate(self.variables)}
-        self._compile()
+        self._compile(model)
 
-    @cached_property
-    def observed(self) -> Model:
-        """The model whose outputs are all its variables."""
-        return replace(self.model, outputs=FrozenMap({n: Output(symbol(n)) for n in self.variables}))
-
-    def _compile(self) -> None:
-        m, g = self.model, Graph()
+    def _compile(self, m: Model) -> None:
+        g = Graph()
         nodes = {n: g.leaf("y", k) for k, n in enumerate(self.variables)}
         nodes |= {n: g.leaf("p", k) for k, n in enumerate(m.parameters)} | {"time": g.leaf("w", 0)}
         memo: dict = {}

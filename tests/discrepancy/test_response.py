@@ -57,3 +57,13 @@ def test_the_grid_has_every_row_and_both_sides_of_a_jump() -> None:
     assert (np.diff(time) >= 0).all()
     assert np.array_equal(time[rows >= 0], e.time)
     assert np.count_nonzero(np.isclose(time, 0.2, atol=1e-12)) == 2
+
+
+def test_a_card_with_other_values_runs_with_its_own() -> None:
+    """One structure is compiled once: of the values that it was compiled with nothing may stay."""
+    e = experiments()[0]
+    for m in (model(), model().with_values({"b": 0.9})):
+        path = along(m, e, {})
+        run = simulate(m, e.with_(time=instants(e)[0], measured=None), outputs=["w", "drag"])
+        assert path.signal("w") == pytest.approx(run["w"], abs=1e-9)
+        assert path.signal("drag") == pytest.approx(run["drag"], abs=1e-9)
