@@ -48,27 +48,27 @@ def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
 
 def _jobs(found: Round, place: str, source: str) -> list[Job]:
     """The formulas that by regression leave least for what their coefficients cost."""
-    nominal = found.before.nominal()
+    library, formulas = _formulas(found, place.removeprefix("outputs."), source)
+    regressed = regression(found.before.nominal(), found.paths, place, [at_run(t) for t in library])
     ranked = []
-    for formula in _formulas(found, place.removeprefix("outputs."), source):
-        regressed = regression(nominal, found.paths, place, [at_run(t) for t in formula])
-        coefficients, gain = regressed.solved(range(len(formula)))
+    for formula in formulas:
+        coefficients, gain = regressed.solved(formula)
         if coefficients.all():
-            ranked.append((gain - PRICE * len(formula), formula, coefficients))
+            ranked.append((gain - PRICE * len(formula), [library[k] for k in formula], coefficients))
     ranked.sort(key=lambda r: -r[0])
     jobs = []
-    for _, formula, coefficients in ranked[:TRIED]:
+    for _, chosen, coefficients in ranked[:TRIED]:
         try:
-            jobs.append(formula_job(found.before, place, formula, coefficients))
+            jobs.append(formula_job(found.before, place, chosen, coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model
             continue
     return jobs
 
 
-def _formulas(found: Round, own: str, source: str) -> list[tuple[Term, ...]]:
-    """Powers, magnitudes and products of the slot's signal with what is brought in, or with any; each also beside a gain."""
+def _formulas(found: Round, own: str, source: str) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
+    """A library, the slot's own signal first in it, and formulas as places in that: powers, magnitudes and products of the
+    signal with what is brought in, or with any; each also beside a gain."""
     others = (source,) if source else source_signals(found.before.model, slot_signals(found.paths))
     library = terms([own, *(s for s in others if s != own)])
-    linear, bent = next(t for t in library if t.signals == (own,)), [t for t in library if t.form != "x"]
-    near = [t for t in bent if own in t.signals or source in t.signals]
-    return [*((t,) for t in near), *((t, linear) for t in near)]
+    near = [k for k, t in enumerate(library) if t.form != "x" and (own in t.signals or source in t.signals)]
+    return library, [*((k,) for k in near), *((k, 0) for k in near)]

@@ -39,24 +39,23 @@ class Race:
         refits = done(search, laps, texts)
         running = [k for k, r in enumerate(refits) if not (r.failure or r.ended)]
         slow = sorted(running, key=lambda k: refits[k].chi2)[: self.second]
-        self._on(search, laps, refits, slow, texts)
+        refits = _on(search, laps, refits, slow, texts)
         gained = [0.0 if r.failure else before - r.chi2 for r in refits]
         leader = max([before - best, *gained])
         # Where none is better than nothing, all are still on their way.
         goal = self.reach * leader if leader > 0.0 else -np.inf
         near = [k for k in running if not refits[k].ended and gained[k] >= goal]
         rest = [replace(j, evaluations=j.evaluations - self.sprint) for j in jobs]
-        self._on(search, rest, refits, near, [f"{t}, to the end" for t in texts])
-        return refits
+        return _on(search, rest, refits, near, [f"{t}, to the end" for t in texts])
 
-    def _on(
-        self, search: Search, jobs: Sequence[Job], refits: list[Refit], which: Sequence[int], texts: Sequence[str]
-    ) -> None:
-        """Some of the refits run on from where they are; one that fails stays there."""
-        further = [replace(jobs[k], begins=(refits[k].theta,)) for k in which]
-        for k, refit in zip(which, done(search, further, [texts[k] for k in which]), strict=True):
-            if not refit.failure:
-                refits[k] = refit
+
+def _on(
+    search: Search, jobs: Sequence[Job], refits: Sequence[Refit], which: Sequence[int], texts: Sequence[str]
+) -> list[Refit]:
+    """The refits, some of them run on from where they are; one that fails stays there."""
+    further = done(search, [replace(jobs[k], begins=(refits[k].theta,)) for k in which], [texts[k] for k in which])
+    better = {k: r for k, r in zip(which, further, strict=True) if not r.failure}
+    return [better.get(k, r) for k, r in enumerate(refits)]
 
 
 def done(search: Search, jobs: Sequence[Job], texts: Sequence[str], how: Callable[[Job], Found] = find) -> list[Refit]:

@@ -219,7 +219,8 @@ def moved(candidate: Candidate, probe: int, factor: float) -> dict[str, float]:
         neutral = values[q.neutral] if isinstance(q.neutral, str) else float(q.neutral)
         if np.isinf(neutral):
             # A delay is in proportion to 1/wn; where a bend begins is in proportion to nothing.
-            found[n] = values[n] / size if entry.late is not None and factor > 0 else values[n]
+            if entry.late is not None and factor > 0:
+                found[n] = values[n] / size
             continue
         found[n] = neutral + sign * size * (values[n] - neutral)
     for n, (low, high) in free.items():

@@ -193,7 +193,7 @@ def _drawn(
         if len(hidden) < len(design.effects):
             continue
         clean = simulate(base.plant, base.runs, hidden)
-        if not np.isfinite(clean).all() or not _firm(base, hidden, clean, sigma, kind, channels):
+        if not np.isfinite(clean).all() or (hidden and not _firm(base, hidden, clean, sigma, kind, channels)):
             continue
         size = float(units(base, clean[:, :2, None], sigma, kind, channels)[0])
         # Of two effects each has the size; together they may have more or less.
