@@ -90,11 +90,11 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
 def _sets(search: Search, outcome: Outcome) -> tuple[tuple[tuple[Rival, ...], ...], Trial | None]:
     """By effect that was put in, it and what cannot be told from it; and a formula that explains more than one of them does.
 
-    Formulas are tried where the catalogue has no rival: before a name is said.
+    Formulas are tried where the catalogue has no rival, before a name is said, unless no form outside it is asked for.
     """
     options = search.options
     sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
-    if any(len(g) > 1 for g in sets):
+    if not options.fallback or any(len(g) > 1 for g in sets):
         return tuple(sets), None
     for k, found in enumerate(outcome.kept):
         formulas = beyond(search, found)

@@ -7,10 +7,10 @@ import math
 import pytest
 from cases import FREE, TRUE, experiments, model
 
-from hvdc_ident.discrepancy import Diagnosis, diagnose
+from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
 
 
-def bent(third: float, level: float) -> Diagnosis:
+def bent(third: float, level: float, options: Options | None = None) -> Diagnosis:
     """The drive whose drag bends: by a third order, or towards a level; looked for are the bends of the catalogue."""
 
     def drag(w: float) -> float:
@@ -18,7 +18,7 @@ def bent(third: float, level: float) -> Diagnosis:
         return level * math.tanh(u / level) if math.isfinite(level) else u + third * u**3
 
     effects = ("saturation", "limit", "deadband", "loss")
-    return diagnose(model(), experiments(drag=drag), FREE, effects=effects, places=["drag"])
+    return diagnose(model(), experiments(drag=drag), FREE, effects=effects, places=["drag"], options=options)
 
 
 def test_a_bend_of_third_order_is_not_called_a_saturation_alone() -> None:
@@ -46,3 +46,9 @@ def test_a_formula_that_explains_more_is_told_instead() -> None:
     assert found.fallback is not None
     assert found.fallback["kind"] == "term"
     assert "drag" in found.fallback["expression"]
+
+
+def test_no_formula_is_tried_where_none_is_asked_for() -> None:
+    found = bent(-0.25, math.inf, Options(fallback=False))
+    assert found.verdict == "named"
+    assert found.effects[0].effect == "saturation"
