@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 _SMALLER = ((1e-4, 1e6, "µs"), (0.1, 1e3, "ms"))
 
@@ -27,3 +28,8 @@ def listed(names: Iterable[str]) -> str:
     """The names as a sentence has them: A, B and C."""
     *most, last = [*names] or [""]
     return f"{', '.join(most)} and {last}" if most else last
+
+
+def form_of(told: Mapping[str, Any]) -> str:
+    """The name of an effect as the results tell it; with its formula where it is one outside the catalogue."""
+    return f"{told['effect']} {told.get('expression', '')}".rstrip()

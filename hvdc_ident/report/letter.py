@@ -18,7 +18,7 @@ from hvdc_ident.files import write_text
 from hvdc_ident.report.drawing import AFTER, MEASURED, figure, svg, visible_rows
 from hvdc_ident.report.html import text
 from hvdc_ident.report.results import Results
-from hvdc_ident.words import listed, span
+from hvdc_ident.words import form_of, listed, span
 
 FILE = "letter.html"
 STAGE = "discrepancy"
@@ -111,9 +111,7 @@ def _consistent(found: dict[str, Any]) -> str:
     rivals = [r for group in found.get("ambiguity") or [] for r in group]
     names = list(
         dict.fromkeys(
-            f"{r['effect']} at {listed(r['at'])}"
-            for r in rivals
-            if (r["effect"], r["at"], r.get("from", "")) not in own
+            f"{form_of(r)} at {listed(r['at'])}" for r in rivals if (r["effect"], r["at"], r.get("from", "")) not in own
         )
     )
     if names:

@@ -102,6 +102,15 @@ def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp
     assert "No other effect of the catalogue" in consistent and "not all" not in consistent
 
 
+def test_a_rival_outside_the_catalogue_is_told_with_its_formula(tmp_path: Path) -> None:
+    rivals = [
+        {"effect": "lag", "at": ["P2_m"], "delta_bic": 0.0},
+        {"effect": "term", "at": ["P2_m"], "delta_bic": 1.0, "expression": "k1*P2**3"},
+    ]
+    _, consistent, *_ = letter_of(Results(folder_with(tmp_path, diagnosis(ambiguity=[rivals])))).sentences
+    assert "cannot tell it from: term k1*P2**3 at P2_m." in consistent
+
+
 def test_what_the_members_of_a_set_have_in_common_is_said(tmp_path: Path) -> None:
     rivals = [
         {"effect": n, "at": ["P2_m"], "delta_bic": 0.0, "late": late}

@@ -9,7 +9,7 @@ from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import number, share, table, text
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
-from hvdc_ident.words import span
+from hvdc_ident.words import form_of, span
 
 MOST = 12
 SHOWN = 5e-3
@@ -58,7 +58,7 @@ def _sets(found: dict[str, Any]) -> str:
     for group in found.get("ambiguity") or []:
         rows = [
             [
-                text(f"{r['effect']} {r.get('expression', '')}".rstrip()),
+                text(form_of(r)),
                 text(", ".join(r["at"])),
                 text(r.get("from", "")),
                 "" if r.get("late") is None else number(1e3 * r["late"], 3),

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.words import form_of
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
@@ -62,10 +63,7 @@ def told(data: Mapping[str, Any]) -> Sequence[str]:
     if data["effects"] and data["gap"]["shrink_holdout"] is not None:
         lines.append(f"The held-out gap shrinks by {100 * data['gap']['shrink_holdout']:.1f} %.")
     for group in data["ambiguity"]:
-        names = [f"{r['effect']} {r.get('expression', '')}".rstrip() for r in group[:8]]
-        members = "; ".join(
-            f"{n} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for n, r in zip(names, group[:8], strict=True)
-        )
+        members = "; ".join(f"{form_of(r)} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for r in group[:8])
         rest = f"; and {len(group) - 8} more" if len(group) > 8 else ""
         lines.append(f"As good (delta BIC): {members}{rest}.")
     advice = (data["separating_experiment"] or {}).get("text")
