@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.scan import bent
+from hvdc_ident.discrepancy.scores import SEEN
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.discrepancy.trials import HEAT, best_each, by_cost, cost_of, excess, misses, once_more, refitted
@@ -22,6 +25,8 @@ LEADERS = 4
 """Of the refits the best, whose places other kinds of delay are tried at."""
 STARTS = 2
 """Sizes that another kind of delay is begun at."""
+EFFORT = 600_000
+"""Refits of what bends its signal, times the rows of the records."""
 LIKE = 0.3
 """Of a logarithm: up to where two delays are alike."""
 
@@ -108,8 +113,29 @@ def with_begun(
     begun = refitted(search, opened, picks, text, trials)
     sound = by_cost(trials)
     if sound and (excess(sound[0].refit) or misses(sound[0].refit)):
-        begun = once_more(search, opened.candidates, begun, text, most=1)
+        begun = once_more(search, opened, begun, text, most=1, best=sound[0].refit.chi2)
     return best_each([*trials, *begun])
+
+
+def bends(opened: Round) -> list[Pick]:
+    """What bends its signal at one slot, at every size probed: as many as records of this length leave time for.
+
+    Where a loop answers such an effect otherwise than a linear one would, no score tells of it, and from a size at which it
+    does nothing, or nearly all, no slope leads to the right one. The largest traces come first.
+    """
+    scores, found = opened.scores, opened.candidates
+    order = np.argsort(-scores.size, kind="stable")
+    columns = [scores.columns[k] for k in order if scores.size[k] > SEEN]
+    every = [c for c in columns if bent(found[c.candidate]) or _met_by_level(found[c.candidate])]
+    return [Pick(c.candidate, c.probe, 1.0, opened.score_p(c.candidate)[0]) for c in every][
+        : EFFORT // opened.before.rows
+    ]
+
+
+def _met_by_level(candidate: Candidate) -> bool:
+    """Whether the size has to be met and is no time."""
+    entry = effects()[candidate.effect]
+    return entry.scanned and entry.late is None and len(candidate.at) == 1
 
 
 def leaders(opened: Round, trials: Sequence[Trial]) -> list[Candidate]:

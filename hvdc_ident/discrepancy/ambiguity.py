@@ -6,10 +6,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_of, clear
+from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_gain, best_of, clear
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.frozen import FrozenMap
@@ -20,11 +22,16 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
 
     droop: whether a negative coupling is one, for they are the same.
     """
-    assert found.winner is not None
-    best = max(t.gain for t in found.trials)
+    assert found.winner is not None and found.ruler is not None
+    behind_by = behinds(found.trials)
+    sound = [trial is found.winner or not _is_nothing(trial) for trial in found.trials]
+    alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
+    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
+    price = 0.0 if alone else float(np.log(found.ruler.effective))
     group: list[Rival] = []
-    for trial, behind in zip(found.trials, behinds(found.trials), strict=True):
-        if behind > options.set_bic or (trial is not found.winner and _is_nothing(trial)):
+    for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
+        more = trial.refit.count - found.winner.refit.count == 1
+        if not good or behind > options.set_bic + (price if more else 0.0):
             continue
         c = found.candidates[trial.pick.candidate]
         sizes = trial.refit.sizes(trial.refit.placed[-1])
@@ -35,7 +42,7 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
             other = found.candidates[twin.candidate]
             same = Rival(other.effect, other.at, behind, FrozenMap(), other.source, refitted=False)
             group += [same, *_as_droop(same, signed, droop)]
-    group += _unfitted(found, best, options, droop)
+    group += _unfitted(found, best_gain(found.trials), options, droop)
     each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
     for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
         each.setdefault((r.effect, r.at, r.source), r)

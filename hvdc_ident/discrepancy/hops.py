@@ -13,9 +13,10 @@ import numpy as np
 
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
+from hvdc_ident.discrepancy.objections import unseen_rows
 from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run, signal
 from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, sized
-from hvdc_ident.effects import effects
+from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.simulate.model_simulator import ModelSimulator
@@ -28,12 +29,16 @@ WIDTH = 3.0
 SIZES = 120
 TEETH = 4
 """Sizes, each the best among its neighbours, from which is refitted: the cost over a period is a saw."""
+LEVELS = 15.0
+"""Over the signal's range: fewer are looked for all over, for any number of them may come near."""
+OF_LEVELS = 12
+"""Sizes from which is refitted then."""
 CLOSE = 1.3
 """The same as WIDTH for the closest look."""
 PHASE = 0.2
 """Of a step or period: by how much the last one of a record moves from one size of the closest look to the next."""
 MOST = 1500
-PATIENT = replace(QUICK, max_steps=5000)
+PATIENT = replace(QUICK, max_steps=5000, search=True)
 """A record that never rests crosses hundreds of levels."""
 BETTER = 0.02
 """Share by which chi2 has to fall for another hop."""
@@ -44,21 +49,41 @@ def hop(job: Job) -> Found:
     here = run(job)
     if here.failure:
         return found_by(here)
-    for _ in range(HOPS):
-        there = _from(job, here, _around(here))
-        if not there.chi2 < (1.0 - BETTER) * here.chi2:
-            break
-        here = there
     try:
+        if not _timed(here):
+            here = _from(job, here, _levels(here), OF_LEVELS)
+        for _ in range(HOPS):
+            there = _from(job, here, _around(here))
+            if not _left(there) < (1.0 - BETTER) * _left(here):
+                break
+            here = there
         return found_by(_from(job, here, _closely(here)))
-    except SimulationError:  # the refit runs, the slot's signal by itself does not: how close is close is not known
+    except SimulationError:  # the refit runs, the slot's signal by itself does not: what is to be counted is not known
         return found_by(here)
 
 
-def _from(job: Job, here: Refit, grid: Array) -> Refit:
+def _from(job: Job, here: Refit, grid: Array, teeth: int = TEETH) -> Refit:
     """The best refit from the best sizes of a grid, or the one there is."""
-    ends = [run(replace(job, begins=(begin,))) for begin in _begins(here, grid)]
-    return min((r for r in [here, *ends] if not r.failure), key=lambda r: r.chi2)
+    ends = [run(replace(job, begins=(begin,))) for begin in _begins(here, grid, teeth)]
+    return min((r for r in [here, *ends] if not r.failure), key=_left)
+
+
+def _left(refit: Refit) -> float:
+    """What a refit leaves of all data: of sizes that come near the fitted records one is near the others too."""
+    held = refit.holdout
+    return refit.chi2 + (held**2 * unseen_rows(refit) if held is not None else 0.0)
+
+
+def _levels(here: Refit) -> Array:
+    """Sizes of a few levels over the slot's signal, the largest last: those of a closer look."""
+    _, _, low, high = _size(here)
+    placed = here.placed[-1]
+    seen = signal(here, placed.use.at[0])
+    about = SlotSignal.of([e.time for e in here.problem.fitted_experiments], list(seen.values()))
+    scan = effects()[placed.candidate.effect].parameters[sized(placed.candidate)].scan
+    assert scan is not None
+    sizes = about.peak / np.array(scan(about))
+    return np.sort(sizes[(sizes > low) & (sizes < high) & (sizes > about.range / LEVELS)])
 
 
 def _around(here: Refit) -> Array:
@@ -86,21 +111,28 @@ def _held(here: Refit) -> float:
 
     Raises SimulationError where that signal cannot be had.
     """
-    placed = here.placed[-1]
-    if effects()[placed.candidate.effect].parameters[sized(placed.candidate)].unit == "s":
+    if _timed(here):
         return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
-    return max(float(np.abs(u).max()) for u in signal(here, placed.use.at[0]).values())
+    return max(float(np.abs(u).max()) for u in signal(here, here.placed[-1].use.at[0]).values())
 
 
-def _begins(here: Refit, grid: Array) -> list[Array]:
+def _timed(here: Refit) -> bool:
+    """Whether the size is a period, not a level."""
+    candidate = here.placed[-1].candidate
+    return effects()[candidate.effect].parameters[sized(candidate)].unit == "s"
+
+
+def _begins(here: Refit, grid: Array, teeth: int) -> list[Array]:
     """Unknowns with the best sizes of a grid, those the refit has and those that were given."""
+    if grid.size < 2:
+        return []
     at = _size(here)[0]
     left = _Left.of(here, at)
     rough = np.array([left(s) for s in grid])
     padded = np.concatenate([[np.inf], rough, [np.inf]])
-    teeth = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
+    best = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
     begins, given = [], as_given(here)
-    for k in teeth[:TEETH]:
+    for k in best[:teeth]:
         beside = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)], 2 * BETWEEN + 1)
         size = min(beside, key=left)
         for theta in (here.theta, given):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from hvdc_ident.discrepancy.akin import as_late, elsewhere, is_akin, leaders, other_forms, with_begun
+from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.discrepancy.closer import closer_look
 from hvdc_ident.discrepancy.nominal import Nominal
@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, behinds, best_of, 
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.discrepancy.tones import tones
-from hvdc_ident.discrepancy.trials import HEAT, all_far, best_each, by_cost, excess, once_more, refitted
+from hvdc_ident.discrepancy.trials import HEAT, LONGER, all_far, best_each, by_cost, excess, once_more, refitted
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
@@ -69,7 +69,7 @@ def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
         return opened
     trials = refitted(search, seen, picks, text)
     if all_far(opened.before, trials):
-        trials = once_more(search, seen.candidates, trials, "round 1: once more")
+        trials = once_more(search, seen, trials, "round 1: once more")
     return closed(search, replace(seen, significant=True, why=""), trials, 1)
 
 
@@ -91,6 +91,7 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
     trials = best_each([*trials, *refitted(search, opened, forms, f"round {number}: in another form", trials, HEAT)])
     kin = as_late(opened, trials)
     trials = with_begun(search, opened, trials, kin, number)
+    trials += elsewhere(search, opened, picks, trials, number)
     # Beside an effect that is there already a closer look costs more than it has been seen to find.
     if number == 1:
         far, leading = all_far(before, trials, CLOSE), leaders(opened, trials)
@@ -98,12 +99,15 @@ def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, pick
         closer = refitted(search, opened, extra, f"round {number}: refits of the closer look", trials)
         trials = best_each([*trials, *closer])
     if number == 1 and all_far(before, trials):
-        trials = once_more(search, opened.candidates, trials, f"round {number}: once more")
-    if number == 1 and all_far(before, trials):
         tried += [t.pick.candidate for t in trials]
         wide = others(picks, scores, found, tried, WIDER)
         trials += refitted(search, opened, wide, f"round {number}: the other candidates", trials, HEAT)
         trials = with_begun(search, opened, trials, [p for p in as_late(opened, trials) if p not in kin], number)
+    if number == 1 and all_far(before, trials):
+        trials += refitted(search, opened, bends(opened), f"round {number}: from every size", trials, LONGER)
+        trials = best_each(trials)
+    if number == 1 and all_far(before, trials):
+        trials = once_more(search, opened, trials, f"round {number}: once more")
     return closed(search, opened, trials, number)
 
 

@@ -61,9 +61,17 @@ class Trial:
 def behinds(trials: Sequence[Trial]) -> list[float]:
     """By how much each is behind the best, in BIC: on all data together; or on the fitted ones, where that is less and the
     held-out ones do not speak clearly against it, for a difference of a few units there is not known better than the noise.
+
+    On the fitted ones the best is the best of those that the held-out ones do not speak clearly against either.
     """
-    gain, told = (max(values, default=0.0) for values in ([t.gain for t in trials], [t.told for t in trials]))
+    told, gain = max((t.told for t in trials), default=0.0), best_gain(trials)
     return [min(gain - t.gain, told - t.told) if told - t.told < CLEARLY else told - t.told for t in trials]
+
+
+def best_gain(trials: Sequence[Trial]) -> float:
+    """The largest gain of those that the held-out data do not speak clearly against."""
+    told = max((t.told for t in trials), default=0.0)
+    return max((t.gain for t in trials if told - t.told < CLEARLY), default=0.0)
 
 
 def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:
@@ -89,7 +97,8 @@ def shortlist(
     """The picks to refit, and for each (by candidate) those whose signature is the same at another place.
 
     rows: (n, N) residualised signatures of the picks. The best of all; of each effect, places whose signature is like one
-    of the best (|cos| > options.collinear) or that score near the best.
+    of the best (|cos| > options.collinear) or that score near the best. What bends its signal is the same where it is of
+    the same size.
     """
     unit = rows / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)[:, None]
     cosines = np.abs(unit @ unit.T)
@@ -100,11 +109,7 @@ def shortlist(
     for k, p in enumerate(picks):
         effect = found[p.candidate].effect
         twin = next(
-            (
-                j
-                for j in chosen
-                if found[picks[j].candidate].effect == effect and (1.0 - cosines[j, k] ** 2) * top < SAME
-            ),
+            (j for j in chosen if _same_form(found, picks[j], p) and (1.0 - cosines[j, k] ** 2) * top < SAME),
             None,
         )
         if twin is not None:
@@ -116,6 +121,19 @@ def shortlist(
             chosen.append(k)
             used[effect] = used.get(effect, 0) + 1
     return tuple(picks[k] for k in chosen), same
+
+
+def _same_form(found: Sequence[Candidate], one: Pick, other: Pick) -> bool:
+    """Whether two picks whose signatures are one may be one at every size.
+
+    In proportion to their size they are, and delays of what moves alike; a deadband of a load that stands still is one with
+    that of a torque at one size only.
+    """
+    a, b = found[one.candidate], found[other.candidate]
+    if a.effect != b.effect:
+        return False
+    alike = a.probes[one.probe].values == b.probes[other.probe].values
+    return alike or effects()[a.effect].late is not None or is_linear(kind_of(a, one.probe))
 
 
 def neighbours(

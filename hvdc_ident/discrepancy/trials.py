@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import job
 from hvdc_ident.discrepancy.objections import unseen_rows
@@ -21,12 +20,16 @@ from hvdc_ident.errors import HvdcIdentError
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4, second=20)
 """For many candidates: a short sprint, and another for the best."""
+LONGER = Race(sprint=12, reach=0.4, second=20)
+"""For those that begin far from where they end."""
 PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
 NEAR = 0.05
 """Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
 AGAIN = 4
 """Refits of one effect at most whose size is looked for again beside the gains they came to."""
+WORTHY = 0.5
+"""Share of the best fall of chi2 from which that is worth its time."""
 
 
 def refitted(
@@ -49,13 +52,19 @@ def refitted(
 
 
 def once_more(
-    search: Search, found: Sequence[Candidate], trials: Sequence[Trial], text: str, most: int = AGAIN
+    search: Search, opened: Round, trials: Sequence[Trial], text: str, most: int = AGAIN, best: float = np.inf
 ) -> list[Trial]:
-    """The trials, with another size where one is found beside the gains that a refit came to."""
+    """The trials, with another size where one is found beside the gains that a refit came to.
+
+    best: the least chi2 of refits done elsewhere; those far behind it are left as they are.
+    """
+    found, was = opened.candidates, opened.before.chi2
+    order = by_cost(trials)
+    goal = WORTHY * (was - min([best, *(t.refit.chi2 for t in order)]))
     chosen: dict[str, list[Trial]] = {}
-    for t in sorted(trials, key=lambda t: t.refit.chi2):
+    for t in sorted(order, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
-        if effects()[effect].scanned and not t.refit.failure and len(chosen.setdefault(effect, [])) < most:
+        if effects()[effect].scanned and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < most:
             chosen[effect].append(t)
     again = [t for group in chosen.values() for t in group]
     jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]

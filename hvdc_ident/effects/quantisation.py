@@ -16,10 +16,15 @@ EDGE = 2e-3
 BORDER = 0.3
 """Of a step: where, between two edges, the count of levels moves on. No value that a signal is likely to rest at."""
 
-APART = 0.1
-"""Of a level: how far at the peak two steps of a closer look lie apart."""
-MOST = 400.0
-"""Levels that a closer look goes through."""
+APART = 10
+"""Steps of a closer look that lie a level apart at the peak; and, in number, between which one step more or less passes
+another tenth of a level over the signal's range."""
+PASSED = 40.0
+"""Levels over the signal's range up to which a closer look goes."""
+COUNTED = 400.0
+"""Levels up to the signal's peak that are gone through where these are fewer."""
+FINEST = 150.0
+"""Levels over the signal's range at most: more look like noise."""
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
@@ -44,11 +49,15 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
 def _levels(signal: Extent) -> Sequence[float]:
     """Levels up to the signal's peak, from one that it hardly reaches to hundreds that it passes.
 
-    Of two steps the marks lie apart where the signal is at its peak: even in the levels there, a tenth of one each.
+    What a step leaves hangs on where the marks lie, which is told at the peak to a tenth of a level, and on how many are
+    passed. A signal that moves a little about a high level meets every place of the marks anew with each level more up
+    to its peak, and by then hardly passes more of them: such levels are gone through here and there.
     """
     share = signal.peak / signal.range
-    first = max(0.8, 0.5 * share)
-    return tuple(np.arange(first, min(150.0 * share, first + MOST), APART).tolist())
+    between = max(1.0, share / APART)
+    most = share * min(FINEST, max(PASSED, COUNTED / share))
+    whole = np.arange(max(0.8, 0.5 * share), most, between)
+    return tuple((whole[:, None] + np.arange(0.0, 1.0, 1.0 / APART)).ravel().tolist())
 
 
 def _floor(x: sp.Expr, add: Additions) -> sp.Expr:

@@ -26,6 +26,8 @@ EFFECT = Effect(
                 description="magnitude it tends to",
                 measure="peak",
                 probes=(0.8, 1.5, 3.0, 6.0),
+                # Of a signal that hardly moves a bend by a few parts in a million shows, as an offset does.
+                search=(0.1, 100.0),
             )
         }
     ),

@@ -135,19 +135,21 @@ def test_a_step_is_met_among_hundreds(levels: tuple[tuple[Experiment, ...], dict
     assert found.effects[0].parameters["step"].value == pytest.approx(STEP, rel=2e-3)
 
 
-def test_levels_and_periods_of_a_closer_look_follow_the_signal() -> None:
+@pytest.mark.parametrize("middle", [0.0, 1.0, 10.0])
+def test_of_the_levels_of_a_closer_look_one_puts_its_marks_where_any_step_does(middle: float) -> None:
     time = np.linspace(0.0, 1.0, 101)
-    near_one = SlotSignal.of([time], [1.0 + 0.05 * np.sin(7 * time)])
-    whole = SlotSignal.of([time], [np.sin(7 * time)])
+    signal = SlotSignal.of([time], [middle + 0.5 * np.sin(7 * time)])
     scan = effects()["quantisation"].parameters["step"].scan
     assert scan is not None
-    for signal in (near_one, whole):
-        steps = signal.peak / np.array(scan(signal))
-        assert steps[0] > 0.5 * signal.range and steps[-1] < signal.range / 15
-        # A tenth of a level apart where the signal is at its peak.
-        assert np.abs(np.diff(signal.peak / steps) - 0.1).max() < 1e-9
-    # A signal about 1 that moves by a twentieth: levels are counted from 0, and none of them is as wide as 1.
-    assert max(signal.peak / n for n in scan(near_one)) < 0.3
+    steps = signal.peak / np.array(scan(signal))
+    assert 0.5 * signal.range < steps.max() < 2.0 * signal.range and steps.min() < signal.range / 35
+    assert steps.size < 5000
+    u = np.linspace(signal.low, signal.high, 50)[:, None]
+    for step in signal.range / np.random.default_rng(0).uniform(2.0, 35.0, 40):
+        apart = u / step - u / steps
+        # Levels may be counted otherwise: what shows is where the marks lie.
+        apart -= np.round(apart[-1:])
+        assert np.abs(apart).max(axis=0).min() < 0.13
 
 
 def test_one_slot_of_a_run_answers_as_among_all() -> None:

@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 from hvdc_ident import simulate as package
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.hops import hop
+from hvdc_ident.discrepancy.nominal import nominal
+from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
+from hvdc_ident.effects import EffectUse, Probe, effects
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.frozen import FrozenMap
@@ -309,3 +313,23 @@ def test_a_large_effect_is_found_and_a_clean_record_is_left_alone(large):
     told = judging.summary([line, quiet])
     assert told["clean"]["false_names"] == 0 and told["large"]["right_or_covered"] == 1.0
     assert json.loads(json.dumps(told)) == told and "| lag |" in report(told)
+
+
+def test_levels_are_met_that_a_loop_slides_between(large):
+    """A line current in steps of 0.064: the dc voltage rests on edges, and the search begins from fewer, wider levels."""
+    runs = sizes.nominal("station", "rich", 0).runs
+    clean = simulate(STATION, runs, [Hidden("quantisation", "Iline", {"step": 0.0638})])
+    sigma = 1e-3 * np.ptp(clean, axis=(0, 1))
+    records = clean + sigma * np.random.default_rng(0).standard_normal(clean.shape)
+    case = replace(large, runs=runs, records=records, clean=clean, sigma=sigma, told=sigma)
+    model, given = model_of("station"), experiments_of(case)
+    start, _ = nominal(ModelSimulator(model), given, free_of(case), {}, None, starts=1, seed=0, executor=None)
+    before = judged(Refit(model, (), start.problem, start.noise, start.theta))
+    probe = Probe("quantisation", FrozenMap({"step": 0.08}), FrozenMap({"step": (1e-3, 0.5)}))
+    wider, problem, placed, begin = added(
+        model, before.problem, Candidate("quantisation", ("Iline",), (probe,)), 0, 1.0
+    )
+    job = Job(wider, (placed,), problem, (np.concatenate([before.theta, begin]),), before.noise)
+    found = hop(job).refit(job)
+    assert found.sizes(placed)["step"] == pytest.approx(0.0638, rel=1e-3)
+    assert found.chi2 < 0.05 * run(job).chi2
