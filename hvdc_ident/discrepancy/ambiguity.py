@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_gain, best_of, clear
+from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_gain, best_of
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.frozen import FrozenMap
@@ -24,7 +24,8 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     """
     assert found.winner is not None and found.ruler is not None
     behind_by = behinds(found.trials)
-    sound = [trial is found.winner or not _is_nothing(trial) for trial in found.trials]
+    # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
+    sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
     alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
     price = 0.0 if alone else float(np.log(found.ruler.effective))
@@ -91,11 +92,6 @@ def _as_droop(rival: Rival, k: float, droop: bool) -> list[Rival]:
     if rival.effect != "coupling" or k >= 0 or not droop:
         return []
     return [replace(rival, effect="droop", parameters=FrozenMap({"k": -k}), refitted=False)]
-
-
-def _is_nothing(trial: Trial) -> bool:
-    last = len(trial.refit.placed) - 1
-    return at_edge(trial.refit, last) or not clear(trial.refit, last)
 
 
 def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:

@@ -23,7 +23,9 @@ CLEARLY = 30.0
 CLEAR = 2.0
 """Standard deviations by which an effect has to be off doing nothing."""
 EACH = 4
-"""Places of one effect that are refitted at first."""
+"""Places of one effect that are refitted at first; twice as many where they score as well as the best."""
+CLOSE = 0.9
+"""Share of the best score that is as good."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,8 @@ def shortlist(
     """The picks to refit, and for each (by candidate) those whose signature is the same at another place.
 
     rows: (n, N) residualised signatures of the picks. The best of all; of each effect, places whose signature is like one
-    of the best (|cos| > options.collinear) or that score near the best. What bends its signal is the same where it is of
-    the same size.
+    of the best (|cos| > options.collinear) or that score near the best. What is not in proportion to its size is the same
+    where its one size is.
     """
     unit = rows / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)[:, None]
     cosines = np.abs(unit @ unit.T)
@@ -116,7 +118,8 @@ def shortlist(
             same.setdefault(picks[twin].candidate, []).append(p)
             continue
         near = bool(chosen) and float(cosines[k, chosen[: options.shortlist]].max()) > options.collinear
-        wanted = len(chosen) < options.shortlist or ((near or p.score > 0.5 * top) and used.get(effect, 0) < EACH)
+        each = 2 * EACH if p.score > CLOSE * top else EACH
+        wanted = len(chosen) < options.shortlist or ((near or p.score > 0.5 * top) and used.get(effect, 0) < each)
         if wanted and len(chosen) < options.refits and used.get(effect, 0) < 2 * EACH:
             chosen.append(k)
             used[effect] = used.get(effect, 0) + 1
@@ -126,14 +129,13 @@ def shortlist(
 def _same_form(found: Sequence[Candidate], one: Pick, other: Pick) -> bool:
     """Whether two picks whose signatures are one may be one at every size.
 
-    In proportion to their size they are, and delays of what moves alike; a deadband of a load that stands still is one with
-    that of a torque at one size only.
+    In proportion to their one size they are; a deadband of a load that stands still is one with that of a torque at one
+    size only, and two time constants are met at one pair of many.
     """
     a, b = found[one.candidate], found[other.candidate]
-    if a.effect != b.effect:
-        return False
-    alike = a.probes[one.probe].values == b.probes[other.probe].values
-    return alike or effects()[a.effect].late is not None or is_linear(kind_of(a, one.probe))
+    first, second = a.probes[one.probe], b.probes[other.probe]
+    same_size = first.values == second.values or is_linear(kind_of(a, one.probe))
+    return a.effect == b.effect and len(first.free) == 1 and same_size
 
 
 def neighbours(

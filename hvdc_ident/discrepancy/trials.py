@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import job
 from hvdc_ident.discrepancy.objections import unseen_rows
@@ -26,6 +27,12 @@ PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
 NEAR = 0.05
 """Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
+LOUD = 1.4
+"""Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
+SHAPED = 0.05
+"""Chance under noise of sums over time below which what is left has a shape."""
+LOOKED_AT = 3
+"""Of the refits the best, of which this is asked."""
 AGAIN = 4
 """Refits of one effect at most whose size is looked for again beside the gains they came to."""
 WORTHY = 0.5
@@ -113,6 +120,14 @@ def left_by(refit: Refit) -> float:
 def all_far(before: Refit, trials: Sequence[Trial], near: float = NEAR) -> bool:
     """Whether no refit comes near the noise, on the fitted data and on the others, or near enough: to a share of what was."""
     was = left_by(before)
-    return all(
+    far = all(
         (excess(t.refit) or misses(t.refit)) and left_by(t.refit) > near * was for t in trials if not t.refit.failure
     )
+    return far and not any(like_noise(t.refit) for t in by_cost(trials)[:LOOKED_AT])
+
+
+def like_noise(refit: Refit) -> bool:
+    """Whether what a model leaves is without shape, and on the others no larger: somewhat loud, for noise is told from few rows."""
+    if refit.chi2 > LOUD * refit.rows or refit.correlation > 0.0 or misses(refit):
+        return False
+    return all(b.p > SHAPED for b in adequacy(refit.nominal(), {}, bootstraps=100, seed=0))
