@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident import simulate as package
+from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.nominal import nominal
@@ -333,3 +334,13 @@ def test_levels_are_met_that_a_loop_slides_between(large):
     found = hop(job).refit(job)
     assert found.sizes(placed)["step"] == pytest.approx(0.0638, rel=1e-3)
     assert found.chi2 < 0.05 * run(job).chi2
+
+
+def test_a_bend_is_met_from_sizes_at_which_no_score_and_no_slope_tells_of_it():
+    """A rate limit at an integrator in its loop: slower it bends all, faster it does nothing, and both are far uphill."""
+    case = cases.made(cases.designs("single", 24)[175], 24)
+    assert case is not None and case.hidden[0].effect == "rate-limit" and case.hidden[0].at == "xi"
+    found = diagnose(model_of("station"), experiments_of(case), free_of(case), effects=["rate-limit"])
+    assert found.verdict == "named"
+    assert found.effects[0].at == ("xi",)
+    assert found.effects[0].parameters["rate"].value == pytest.approx(case.hidden[0].parameters["rate"], rel=0.01)

@@ -1,0 +1,75 @@
+"""What is refitted beside what, what may be told from what, and when what is left is noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import FREE, SIGMA, experiments, model
+from refits import plain
+
+from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
+from hvdc_ident.discrepancy.trials import excess, like_noise
+from hvdc_ident.effects import Probe
+from hvdc_ident.frozen import FrozenMap
+
+
+@pytest.fixture(scope="module")
+def before() -> Refit:
+    return plain(experiments())
+
+
+def of_size(effect: str, at: str, **values: float) -> Candidate:
+    """A candidate with one probe, all of whose values are free."""
+    bounds = FrozenMap({n: (0.1 * v, 10.0 * v) for n, v in values.items()})
+    return Candidate(effect, (at,), (Probe(effect, FrozenMap(values), bounds),))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "refitted"),
+    [
+        (of_size("deadband", "load", width=0.1), of_size("deadband", "torque", width=0.1), 1),
+        (of_size("deadband", "load", width=0.1), of_size("deadband", "torque", width=0.4), 2),
+        (of_size("offset", "load", c=0.1), of_size("offset", "torque", c=0.4), 1),
+        (of_size("lead-lag", "wm", T1=0.02, T2=0.01), of_size("lead-lag", "err", T1=0.005, T2=0.01), 2),
+        (of_size("lag", "wm", T=0.02), of_size("delay", "wm", T=0.02), 2),
+    ],
+)
+def test_one_trace_is_one_effect_where_it_is_one_at_every_size(one: Candidate, other: Candidate, refitted: int) -> None:
+    trace = np.random.default_rng(0).standard_normal(50)
+    picks = [Pick(0, 0, 1.0, 400.0), Pick(1, 0, 1.0, 399.0)]
+    chosen, same = shortlist(picks, [one, other], np.vstack([trace, -trace]), Options())
+    assert len(chosen) == refitted
+    assert {k: [p.candidate for p in twins] for k, twins in same.items()} == ({} if refitted == 2 else {0: [1]})
+
+
+def test_what_held_out_data_refute_sets_no_mark_for_the_others(before: Refit) -> None:
+    def trial(gain: float, told: float) -> Trial:
+        return Trial(Pick(0, 0, 1.0, 1.0), before, gain, told)
+
+    # Best on all data; a little ahead on the fitted ones; far ahead there and refuted by the others.
+    assert behinds([trial(100.0, 200.0), trial(104.0, 190.0), trial(150.0, 20.0)]) == [0.0, 0.0, 180.0]
+    assert behinds([trial(100.0, 200.0), trial(92.0, 195.0)]) == [0.0, 5.0]
+
+
+@pytest.mark.parametrize(("lag", "loud", "expected"), [(0.0, 1.0, True), (0.0, 1.12, True), (0.03, 1.0, False)])
+def test_somewhat_louder_noise_is_noise_and_a_shape_is_not(lag: float, loud: float, expected: bool) -> None:
+    told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
+    refit = plain([replace(e, noise=told) for e in experiments(lag=lag)])
+    assert excess(refit) == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
+    assert like_noise(refit) == expected
+
+
+def test_a_parameter_more_is_no_refutation_where_several_explain_the_data() -> None:
+    looked_for = ("lag", "delay", "second-order", "gain")
+    found = diagnose(model(), experiments(lag=0.0015), FREE, effects=looked_for, places=["wm"])
+    (group,) = found.ambiguity
+    behind = {r.effect: r.delta_bic for r in group}
+    assert {"lag", "delay", "second-order"} == set(behind)
+    assert Options().set_bic < behind["second-order"] < Options().set_bic + np.log(1800)
+    alone = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm"])
+    assert alone.verdict == "named" and not alone.ambiguity
