@@ -129,3 +129,16 @@ def test_scaling_follows_the_bounds():
     assert Free("a", 2.0).span == 2.0
     assert Free("a", 1.0, 0.01, 100.0).draw(0.5) == pytest.approx(1.0)
     assert Free("a", 1.0, 0.0).drawn == (0.0, 11.0)
+
+
+def test_a_point_whose_sensitivities_overflow_is_walked_round():
+    def blowing(t, p):
+        y, slopes = decay(t, p)
+        return y, {n: s * (1e200 if p["k"] > 1.2 else 1.0) for n, s in slopes.items()}
+
+    simulator = Closed(parameters(a=1.0, k=1.0), {"y": blowing})
+    free = (Free("a", 1.0, 0.1, 10.0), Free("k", 1.0, 0.0, 20.0))
+    found = Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
+    run = TrustRegion().run(found, np.array([1.0, 1.0]))
+    assert run.status == "failed" and "beyond all bounds" in run.message
+    assert run.theta[1] <= 1.2

@@ -103,6 +103,11 @@ class _Walk:
         cost = 0.5 * float(r @ r)
         if not cost < better_than:
             return False
+        with np.errstate(over="ignore"):
+            bounded = bool(np.isfinite(np.linalg.norm(jacobian)))
+        if not bounded:
+            self.failure = "its sensitivities grow beyond all bounds"
+            return False
         self.x, self.theta, self.r, self.cost = space.scaled(theta), theta, r, cost
         self.jacobian = jacobian * space.slope(theta)
         return True
