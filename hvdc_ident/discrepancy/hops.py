@@ -64,7 +64,7 @@ def hop(job: Job) -> Found:
 
 def _from(job: Job, here: Refit, grid: Array, teeth: int = TEETH) -> Refit:
     """The best refit from the best sizes of a grid, or the one there is."""
-    ends = [run(replace(job, begins=(begin,))) for begin in _begins(here, grid, teeth)]
+    ends = [run(replace(job, begins=(begin,), spare=())) for begin in _begins(here, grid, teeth)]
     return min((r for r in [here, *ends] if not r.failure), key=_left)
 
 

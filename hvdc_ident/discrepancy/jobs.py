@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.refit import Job, Refit, added, moved
+from hvdc_ident.discrepancy.refit import Job, Placed, Refit, added, moved
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.trajectory import Array
@@ -21,7 +21,8 @@ def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job
 
     Gains that have taken an effect's place hold the refit where they are: where one has moved far, or stands on a bound,
     another start is with the gains as they were given. A single effect, too, begins a second time where the score asks for a
-    size far from the one probed, and is not right at every size. Raises ModelError where an effect cannot sit there.
+    size far from the one probed, and is not right at every size; where a model does not run at its size, it begins at the
+    next of those probed. Raises ModelError where an effect cannot sit there.
     """
     model, problem, placed, sizes = before.model, before.problem, list(before.placed), []
     for p in picks:
@@ -38,7 +39,15 @@ def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job
         begins.append(_begin(before, before.theta, np.array([at[n] for n in placed[-1].bounds])))
     if (given := as_given(before)) is not None:
         begins.append(_begin(before, given, asked))
-    return Job(model, tuple(placed), problem, tuple(begins), before.noise)
+    spare = [] if exact or len(picks) > 1 else [_begin(before, before.theta, s) for s in _sizes(only, placed[-1])]
+    return Job(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare))
+
+
+def _sizes(candidate: Candidate, placed: Placed) -> list[Array]:
+    """Of a candidate's probes that have the same parameters free, and lie within their bounds, the values of these."""
+    bounds = placed.bounds
+    alike = [p.values for p in candidate.probes if set(p.free) == set(bounds)]
+    return [np.array([v[n] for n in bounds]) for v in alike if all(b[0] < v[n] < b[1] for n, b in bounds.items())]
 
 
 def _begin(before: Refit, theta: Array, sizes: Array) -> Array:

@@ -11,7 +11,7 @@ from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
 from hvdc_ident.discrepancy.select import Trial, at_edge, clear, material_gap
 
 AGREED = 10.0
-"""By how much chi2 of the held-out data has to fall for them to agree."""
+"""By how much chi2 of the held-out data has to fall for them to agree, or to rise for them to speak against an effect."""
 SILENT = 30.0
 """Squared difference of held-out answers, in noise units, below which those data cannot judge an effect."""
 STEP = 0.05
@@ -36,7 +36,8 @@ def objections(
     was, now = unseen(before), unseen(refit)
     if was is None or now is None:
         return "nothing can be left out to judge it by"
-    if not now < was:
+    # Records that an effect does not move are better or worse by the noise they hold.
+    if not now < was and ((now**2 - was**2) * unseen_rows(refit) > AGREED or not silent(before, refit)):
         return f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
     tables = (worst(before), worst(refit)) if material else None
     fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))

@@ -57,7 +57,7 @@ class Placed:
 class Job:
     """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
 
-    evaluations: of each start at most.
+    evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
     """
 
     model: AnyModel
@@ -66,6 +66,7 @@ class Job:
     begins: tuple[Array, ...]
     noise: FrozenMap[Noise]
     evaluations: int = METHOD.max_evaluations
+    spare: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +236,10 @@ def run(job: Job) -> Refit:
     why = ""
     scanned = any(effects()[p.candidate.effect].scanned for p in job.placed)
     most = min(job.evaluations, SCANNED) if scanned else job.evaluations
-    for begin in _apart(job.begins):
+    begins = _apart(job.begins)
+    for k, begin in enumerate([*begins, *job.spare]):
+        if best is not None and k >= len(begins):
+            break
         try:
             end = _walked(job.problem, begin, most, None if best is None else best.chi2)
             # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.

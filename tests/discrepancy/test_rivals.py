@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, experiments, model
-from refits import plain
+from cases import FREE, SIGMA, TRUE, experiments, model
+from refits import beside, plain
 
+from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.objections import objections
+from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
 from hvdc_ident.discrepancy.trials import excess, like_noise
 from hvdc_ident.effects import Probe
@@ -62,6 +65,51 @@ def test_somewhat_louder_noise_is_noise_and_a_shape_is_not(lag: float, loud: flo
     refit = plain([replace(e, noise=told) for e in experiments(lag=lag)])
     assert excess(refit) == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
     assert like_noise(refit) == expected
+
+
+def clipped(level: float) -> tuple[Experiment, ...]:
+    """Records of the drive whose torque is shown no larger than a level, with the noise behind it."""
+    random = np.random.default_rng(0)
+    found = []
+    for e in plainly(experiments()):
+        assert e.measured is not None
+        y = e.measured.values.copy()
+        y[:, 1] = np.clip(y[:, 1], -level, level)
+        y += random.standard_normal(y.shape) * list(SIGMA.values())
+        found.append(replace(e, measured=replace(e.measured, values=y)))
+    return tuple(found)
+
+
+def plainly(records: Sequence[Experiment]) -> list[Experiment]:
+    """The drive's own answers in place of what was recorded."""
+    return [replace(e, measured=simulate(model(), e, TRUE, outputs=tuple(SIGMA)).trajectory) for e in records]
+
+
+def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it() -> None:
+    records = clipped(1.4)
+    held = next(e for e in records if e.role == "holdout")
+    assert held.measured is not None and np.abs(held.measured.values[:, 1]).max() < 0.9
+    before = plain(records)
+    refit = run(beside(before, "limit", "outputs.torque", {"level": 1.45}, {"level": (0.5, 3.0)}))
+    assert before.holdout is not None
+    worse = {by: replace(refit, holdout=before.holdout + by) for by in (0.002, 0.05)}
+    told = {
+        by: objections(before, Trial(Pick(0, 0, 1.0, 500.0), r, 500.0), 0.005, Options(), {}, first=True)
+        for by, r in worse.items()
+    }
+    assert told[0.002] == ""
+    assert "held-out data speak against it" in told[0.05]
+
+
+def test_where_the_model_does_not_run_at_a_size_it_begins_at_a_spare_one(before: Refit) -> None:
+    job = beside(before, "limit", "torque", {"level": 1e-4}, {"level": (1e-5, 10.0)})  # cannot carry the drag
+    assert run(job).failure
+    spare = tuple(np.concatenate([before.theta, [level]]) for level in (2e-4, 1.0, 2.0))
+    found = run(replace(job, spare=spare))
+    assert not found.failure
+    assert found.chi2 <= 1.001 * before.chi2
+    runs = run(replace(job, begins=(spare[1],), spare=(spare[0],)))
+    assert runs.chi2 == found.chi2
 
 
 def test_a_parameter_more_is_no_refutation_where_several_explain_the_data() -> None:
