@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.objections import unseen_rows
-from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, run, signal
+from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, of_held_out, run, signal
 from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, sized
 from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.errors import SimulationError
@@ -144,21 +144,23 @@ def _begins(here: Refit, grid: Array, teeth: int) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Left:
-    """chi2 by the size of the last effect, with what the other unknowns can make good taken out to first order.
+    """chi2 of all data by the size of the last effect, with what the other unknowns can make good of the fitted ones taken
+    out to first order.
 
-    others: (N, k) orthonormal, what they can.
+    held: the problem of the held-out ones, where there are any. others: (N, k) orthonormal, what the unknowns can.
     """
 
     refit: Refit
     at: int
     problem: Problem
+    held: Problem | None
     others: Array
 
     @classmethod
     def of(cls, refit: Refit, at: int) -> _Left:
         quick = replace(refit.problem, simulator=ModelSimulator(refit.model, PATIENT))
         jacobian = np.vstack([b.jacobian for b in refit.problem.blocks(refit.theta)])
-        return cls(refit, at, quick, orthonormal(np.delete(jacobian, at, axis=1)))
+        return cls(refit, at, quick, of_held_out(quick), orthonormal(np.delete(jacobian, at, axis=1)))
 
     def __call__(self, size: float) -> float:
         """Infinite for a size that could not be run."""
@@ -166,6 +168,8 @@ class _Left:
         theta[self.at] = size
         try:
             r = np.concatenate([b.residual for b in self.problem.blocks(theta, derivatives=False)])
+            further = self.held.blocks(theta[: len(self.held.free)], derivatives=False) if self.held else ()
         except SimulationError:
             return np.inf
-        return float(r @ r - np.sum((self.others.T @ r) ** 2))
+        unseen = sum(float(b.residual @ b.residual) for b in further if b.output in self.problem.outputs)
+        return float(r @ r - np.sum((self.others.T @ r) ** 2)) + unseen

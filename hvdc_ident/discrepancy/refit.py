@@ -356,17 +356,23 @@ def holdout(problem: Problem, theta: Array) -> float | None:
 
 def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:
     """The residuals of the held-out experiments; None where there are none, () where one cannot be run."""
-    others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
-    others = [e for e in others if set(e.outputs) & set(problem.outputs)]
-    if not others:
+    others = of_held_out(problem)
+    if others is None:
         return None
     # An output that was never fitted has no weight of its own; its records then judge nothing. The derivatives are not
     # needed, but with them the machine code is that of the fit: compiling another takes longer than running these.
     try:
-        blocks = replace(problem, experiments=tuple(others)).blocks(theta[: len(problem.free)])
+        blocks = others.blocks(theta[: len(problem.free)])
     except SimulationError:
         return ()
     return tuple(b for b in blocks if b.output in problem.outputs)
+
+
+def of_held_out(problem: Problem) -> Problem | None:
+    """The same problem of the held-out experiments, without nuisances; None where there are none."""
+    others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
+    others = [e for e in others if set(e.outputs) & set(problem.outputs)]
+    return replace(problem, experiments=tuple(others)) if others else None
 
 
 def press(blocks: Sequence[Block], parts: int = 4) -> float | None:
