@@ -127,9 +127,8 @@ def bends(opened: Round) -> list[Pick]:
     order = np.argsort(-scores.size, kind="stable")
     columns = [scores.columns[k] for k in order if scores.size[k] > SEEN]
     every = [c for c in columns if bent(found[c.candidate]) or _met_by_level(found[c.candidate])]
-    return [Pick(c.candidate, c.probe, 1.0, opened.score_p(c.candidate)[0]) for c in every][
-        : EFFORT // opened.before.rows
-    ]
+    chosen = every[: EFFORT // opened.before.rows]
+    return [Pick(c.candidate, c.probe, 1.0, opened.score_p(c.candidate)[0]) for c in chosen]
 
 
 def _met_by_level(candidate: Candidate) -> bool:
