@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.sensitivity.pivot import leading
 from hvdc_ident.trajectory import Array
 
 THRESHOLD = 1.92
@@ -211,7 +212,7 @@ def null_directions(columns: Array, error: float = SENSITIVITY_ERROR) -> Array:
     null = vt[s <= error * s[0]] / norms[seen]
     rows = np.zeros((null.shape[0], p))
     for k in range(null.shape[0]):
-        pivot = int(np.argmax(np.abs(null[k])))
+        pivot = leading(null[k])
         null[k] /= null[k, pivot]
         others = np.arange(null.shape[0]) != k
         null[others] -= np.outer(null[others, pivot], null[k])

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.search import BudgetSpentError, Search
@@ -14,6 +16,8 @@ from hvdc_ident.trajectory import Array
 
 NAME = "l-bfgs-b"
 SUMMARY = "quasi-Newton with bounds (SciPy), with exact gradients"
+FLAT = 1e-7
+"""Projected slope, of the cost at the start, below which an end that the line search could not better is an optimum."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +61,14 @@ class LBfgsB:
             )
         except BudgetSpentError:
             return search.spent()
-        if not end.success:
+        if not end.success and not _flat(end.x, end.jac, low, high):
             return search.refused(str(end.message))
         return search.ended(True, str(end.message))
+
+
+def _flat(x: Array, gradient: Array, low: Array, high: Array) -> bool:
+    """Whether no way down is left inside the bounds but what rounding makes of one: the line search then ends as abnormal."""
+    return bool(np.abs(np.clip(x - gradient, low, high) - x).max() < FLAT)
 
 
 OPTIMISER = LBfgsB

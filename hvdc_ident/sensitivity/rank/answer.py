@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.model.definition import Model
+from hvdc_ident.sensitivity.pivot import leading
 from hvdc_ident.sensitivity.rank.combination import Combination, listed, tied
 from hvdc_ident.sensitivity.rank.equations import Source, Start
 from hvdc_ident.sensitivity.rank.high_precision import context
@@ -203,7 +204,7 @@ class Ask:
             values = [self.model.parameters[n].value or 1e-3 * self.model.parameters[n].size for n in names]
             matrix = np.array([i.slopes(values) for i in found])
         null = np.linalg.svd(matrix)[2][len(matrix) :] if free else np.zeros((0, len(names)))
-        scaled = [v / v[np.argmax(np.abs(v))] for v in null]
+        scaled = [v / v[leading(v)] for v in null]
         return tuple(tuple(float(round(x, 12)) + 0.0 for x in v) for v in scaled), relative
 
 
