@@ -130,11 +130,13 @@ def scan(
         spots, largest = _told(views, dense, right[:, 1 + known :], executor, progress, text)
     else:
         thin = [replace(c, probes=c.probes[:: max(len(c.probes) // THIN, 1)]) for c in dense]
-        rough = _looked([Job(before, nominal.residual, c, right, QUICK) for c in thin], known, executor, progress, text)
+        rough = _looked(
+            [Job(before, nominal.residual, c, right, QUICK) for c in thin], right, known, executor, progress, text
+        )
         spots, largest = _spots(thin, rough, before.theta), rough.largest
     best = _tops(spots)
     jobs = [Job(replace(before, theta=s.theta), nominal.residual, s.candidate, right, PATIENT) for s in best]
-    fine = _looked(jobs, known, executor, progress, f"{text}, closer still")
+    fine = _looked(jobs, right, known, executor, progress, f"{text}, closer still")
     chosen = _best(best, fine)
     kept = [replace(best[c.candidate], candidate=_alone(best[c.candidate].candidate, c.probe)) for c in chosen]
     at = [fine.columns.index(c) for c in chosen]
@@ -294,13 +296,14 @@ def _alone(candidate: Candidate, probe: int) -> Candidate:
     return replace(candidate, probes=(candidate.probes[probe],))
 
 
-def _looked(jobs: Sequence[Job], known: int, executor: Executor | None, progress: Progress | None, text: str) -> Scores:
-    """The scores of every size of some candidates, by running the model.
+def _looked(
+    jobs: Sequence[Job], right: Array, known: int, executor: Executor | None, progress: Progress | None, text: str
+) -> Scores:
+    """The scores of every size of some candidates, by running the model; none where there is nothing to run.
 
-    known: how many of the right-hand sides are what parameters can make good.
+    right: right-hand sides of the jobs; known: how many of them are what parameters can make good.
     """
-    right = jobs[0].right.shape[1] if jobs else 1 + known
-    products, squares = [np.zeros((0, right))], [np.zeros(0)]
+    products, squares = [np.zeros((0, right.shape[1]))], [np.zeros(0)]
     for k, (p, s) in enumerate(mapped(executor, _traces, jobs), start=1):
         products.append(p)
         squares.append(s)

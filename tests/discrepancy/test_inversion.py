@@ -14,6 +14,7 @@ from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.inversion import Inversion
 from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.scan import _looked
 from hvdc_ident.discrepancy.scores import Whitening, runs
 from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.frozen import FrozenMap
@@ -161,3 +162,10 @@ def test_one_slot_of_a_run_answers_as_among_all() -> None:
     assert alone.slots == ("err",) and set(alone.values) == {"err"}
     for all_of_it, one in zip(path.answer(["err"], d), alone.answer(["err"], d), strict=True):
         assert np.array_equal(all_of_it, one)
+
+
+def test_where_no_size_is_worth_a_run_noise_alone_is_left() -> None:
+    right = np.zeros((20, 1 + 2 + 7))  # residual, two parameters, seven records of noise
+    found = _looked([], right, 2, None, None, "")
+    assert found.columns == () and found.t.shape == (0,)
+    assert np.maximum(np.arange(7.0), found.largest).tolist() == list(range(7))
