@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.scan import bent
+from hvdc_ident.discrepancy.scan import bent, by_level
 from hvdc_ident.discrepancy.scores import SEEN
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search
@@ -126,15 +126,10 @@ def bends(opened: Round) -> list[Pick]:
     scores, found = opened.scores, opened.candidates
     order = np.argsort(-scores.size, kind="stable")
     columns = [scores.columns[k] for k in order if scores.size[k] > SEEN]
-    every = [c for c in columns if bent(found[c.candidate]) or _met_by_level(found[c.candidate])]
+    at_one = [c for c in columns if len(found[c.candidate].at) == 1]
+    every = [c for c in at_one if bent(found[c.candidate]) or by_level(found[c.candidate])]
     chosen = every[: EFFORT // opened.before.rows]
     return [Pick(c.candidate, c.probe, 1.0, opened.score_p(c.candidate)[0]) for c in chosen]
-
-
-def _met_by_level(candidate: Candidate) -> bool:
-    """Whether the size has to be met and is no time."""
-    entry = effects()[candidate.effect]
-    return entry.scanned and entry.late is None and len(candidate.at) == 1
 
 
 def leaders(opened: Round, trials: Sequence[Trial]) -> list[Candidate]:

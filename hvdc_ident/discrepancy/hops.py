@@ -15,8 +15,8 @@ from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.objections import unseen_rows
 from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, of_held_out, run, signal
-from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, sized
-from hvdc_ident.effects import SlotSignal, effects
+from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, by_level, sized
+from hvdc_ident.effects import SlotSignal, effects, probes
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.simulate.model_simulator import ModelSimulator
@@ -50,7 +50,7 @@ def hop(job: Job) -> Found:
     if here.failure:
         return found_by(here)
     try:
-        if not _timed(here):
+        if by_level(here.placed[-1].candidate):
             here = _from(job, here, _levels(here), OF_LEVELS)
         for _ in range(HOPS):
             there = _from(job, here, _around(here))
@@ -80,9 +80,8 @@ def _levels(here: Refit) -> Array:
     placed = here.placed[-1]
     seen = signal(here, placed.use.at[0])
     about = SlotSignal.of([e.time for e in here.problem.fitted_experiments], list(seen.values()))
-    scan = effects()[placed.candidate.effect].parameters[sized(placed.candidate)].scan
-    assert scan is not None
-    sizes = about.peak / np.array(scan(about))
+    name, effect = sized(placed.candidate), effects()[placed.candidate.effect]
+    sizes = np.array([p.values[name] for p in probes(effect, about, closer=True)])
     return np.sort(sizes[(sizes > low) & (sizes < high) & (sizes > about.range / LEVELS)])
 
 
@@ -111,15 +110,10 @@ def _held(here: Refit) -> float:
 
     Raises SimulationError where that signal cannot be had.
     """
-    if _timed(here):
-        return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
-    return max(float(np.abs(u).max()) for u in signal(here, here.placed[-1].use.at[0]).values())
-
-
-def _timed(here: Refit) -> bool:
-    """Whether the size is a period, not a level."""
-    candidate = here.placed[-1].candidate
-    return effects()[candidate.effect].parameters[sized(candidate)].unit == "s"
+    placed = here.placed[-1]
+    if by_level(placed.candidate):
+        return max(float(np.abs(u).max()) for u in signal(here, placed.use.at[0]).values())
+    return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
 
 
 def _begins(here: Refit, grid: Array, teeth: int) -> list[Array]:

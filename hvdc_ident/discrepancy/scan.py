@@ -206,6 +206,11 @@ def _met(candidate: Candidate) -> bool:
     return effects()[candidate.effect].scanned
 
 
+def by_level(candidate: Candidate) -> bool:
+    """Whether the size has to be met and is a level of the signal, not a time."""
+    return _met(candidate) and effects()[candidate.effect].late is None
+
+
 def bent(candidate: Candidate) -> bool:
     """Whether the effect bends its signal at one slot by one parameter that need not be met, and is no kind of delay."""
     entry = effects()[candidate.effect]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.pairs import pair
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.settle import settled
 from hvdc_ident.discrepancy.state import Round, Search
-from hvdc_ident.discrepancy.trials import excess
+from hvdc_ident.discrepancy.trials import excess, shapeless
 from hvdc_ident.errors import SimulationError
 
 
@@ -60,7 +59,4 @@ def forward(search: Search, first: Refit) -> Outcome:
 
 def is_noise(refit: Refit, search: Search) -> bool:
     """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
-    if excess(refit):
-        return False
-    tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
-    return all(b.p > 0.05 for b in tests)
+    return not excess(refit) and shapeless(refit, search.seed)

@@ -130,4 +130,9 @@ def like_noise(refit: Refit) -> bool:
     """Whether what a model leaves is without shape, and on the others no larger: somewhat loud, for noise is told from few rows."""
     if refit.chi2 > LOUD * refit.rows or refit.correlation > 0.0 or misses(refit):
         return False
-    return all(b.p > SHAPED for b in adequacy(refit.nominal(), {}, bootstraps=100, seed=0))
+    return shapeless(refit, 0)
+
+
+def shapeless(refit: Refit, seed: int) -> bool:
+    """Whether sums over time of what a model leaves are what they are of noise."""
+    return all(b.p > SHAPED for b in adequacy(refit.nominal(), {}, bootstraps=100, seed=seed))
