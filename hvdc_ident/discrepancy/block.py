@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.discrepancy.march import march
+from hvdc_ident.discrepancy.march import hold, march
 from hvdc_ident.effects import Effect, EffectUse, alone
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.expression.functions import symbol
@@ -120,13 +120,13 @@ class Block:
         n, m = len(self.states), len(self.model.delays) + len(self.model.sampled)
         inputs = [u] if source is None else [u, source]
         own = [parameters[p] for p in self.model.parameters]
-        nothing: list[Any] = [np.zeros_like(u)] * (n + m)
-        whole = [*nothing, *inputs, time[:, None] * np.ones_like(u), *own]
+        nothing: list[Any] = [np.broadcast_to(0.0, u.shape)] * (n + m)
+        whole = [*nothing, *inputs, np.broadcast_to(time[:, None], u.shape), *own]
         memory = self._memory(whole, time, u)
         whole[n : n + m] = memory
         if n:
             whole[:n] = self._states(whole, time, own)
-        return np.broadcast_to(self.value([self.output], whole)[0], u.shape).astype(float)
+        return np.asarray(np.broadcast_to(self.value([self.output], whole)[0], u.shape), dtype=float)
 
     def _memory(self, whole: list[Any], time: Array, u: Array) -> list[Array]:
         """Delayed and sampled values, (K, nc) each."""
@@ -224,13 +224,9 @@ def _at(signal: Array, time: Array, when: Array) -> Array:
 
 def _held(signal: Array, time: Array, period: Any, compute: Any) -> Array:
     """The signal (K, nc) as it was sampled, `compute` earlier at least; before the first sample its first value."""
-    since = time - time[0]
-    y = np.empty_like(signal)
-    each = zip(np.broadcast_to(period, signal.shape[1:]), np.broadcast_to(compute, signal.shape[1:]), strict=True)
-    for c, (apart, late) in enumerate(each):
-        number = np.floor((since - late) / apart + 1e-9).astype(np.intp)
-        samples = time[0] + np.arange(number[0], number[-1] + 1) * apart
-        y[:, c] = np.interp(samples, time, signal[:, c])[number - number[0]]  # of a doubled instant the later value
+    y = np.empty(signal.shape)
+    each = (np.ascontiguousarray(np.broadcast_to(v, signal.shape[1:]), dtype=float) for v in (period, compute))
+    hold(time, np.ascontiguousarray(signal), *each, y)
     return y
 
 

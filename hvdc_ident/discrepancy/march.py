@@ -1,4 +1,5 @@
-"""The compiled steps through an effect's own states: linear in each step, exact for signals of straight pieces."""
+"""The compiled steps through an effect's own memory, many sizes at a time: states, linear in each step and exact for signals
+of straight pieces; and samples."""
 
 from __future__ import annotations
 
@@ -65,3 +66,21 @@ def march(address, time, driven, constants, start, fine, path):  # type: ignore[
                             y[i] += ahead[i]
             for i in range(n):
                 path[i, k + 1, c] = y[i]
+
+
+@njit(cache=True)
+def hold(time, signal, period, compute, y):  # type: ignore[no-untyped-def]
+    """Writes into y (K, nc) what signal (K, nc) was at the last sample, taken every period, (nc,), from the first instant on,
+    that is `compute`, (nc,), old at least; of a doubled instant the later value, before the first sample the first."""
+    count, columns = signal.shape
+    at = np.zeros(columns, np.int64)
+    for k in range(count):
+        for c in range(columns):
+            sample = time[0] + np.floor((time[k] - time[0] - compute[c]) / period[c] + 1e-9) * period[c]
+            j = at[c]
+            while j + 1 < count and time[j + 1] <= sample:
+                j += 1
+            at[c] = j
+            y[k, c] = signal[j, c]
+            if sample > time[j] and j + 1 < count:
+                y[k, c] += (sample - time[j]) / (time[j + 1] - time[j]) * (signal[j + 1, c] - signal[j, c])

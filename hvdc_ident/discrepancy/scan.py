@@ -10,6 +10,7 @@ beginning, at sizes that have to be met.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -188,6 +189,7 @@ def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
     noise = inverse.against(nominal.projected(slot.noise))
     spots, largest = [], np.zeros(slot.noise.shape[1])
     for c in slot.found:
+        sizes = _sizes(c)
         for signals in (inverse.own, inverse.told):
             parts = [_at_knots(inverse, part, signals) for part in _parts(c)]
             tables = [inverse.falls(part, noise) for part in parts]
@@ -196,7 +198,7 @@ def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
             at_knots = np.hstack(parts)
             for k in _leading(falls, scores if _met(c) else np.zeros(scores.size)):
                 theta = inverse.answer(nominal, at_knots[:, k])
-                near = _neighbourhood(c, k) if _met(c) else _alone(c, k)
+                near = _neighbourhood(c, k, sizes) if _met(c) else _alone(c, k)
                 spots.append(Spot(near, float(scores[k]), float(falls[k]), theta))
     return spots, largest
 
@@ -261,8 +263,9 @@ def _spots(found: Sequence[Candidate], scores: Scores, theta: Array) -> list[Spo
     spots: list[Spot] = []
     for i, c in enumerate(found):
         own = [k for k, column in enumerate(scores.columns) if column.candidate == i]
+        sizes = _sizes(c)
         spots += [
-            Spot(_neighbourhood(c, k), float(scores.t[own[k]]), float(scores.falls[own[k]]), theta)
+            Spot(_neighbourhood(c, k, sizes), float(scores.t[own[k]]), float(scores.falls[own[k]]), theta)
             for k in _leading(scores.falls[own], scores.t[own])
         ]
     return spots
@@ -349,12 +352,17 @@ def _traces(job: Job) -> tuple[Array, Array]:
     return products, squares
 
 
-def _neighbourhood(candidate: Candidate, probe: int) -> Candidate:
-    """The candidate with the sizes around one of its scan, evenly in the logarithm."""
+def _sizes(candidate: Candidate) -> list[float]:
+    """All sizes of a scan, the least first."""
     name = sized(candidate)
-    sizes = sorted(p.values[name] for p in candidate.probes)
+    return sorted(p.values[name] for p in candidate.probes)
+
+
+def _neighbourhood(candidate: Candidate, probe: int, sizes: Sequence[float]) -> Candidate:
+    """The candidate with the sizes around one of its scan (`_sizes`), evenly in the logarithm."""
+    name = sized(candidate)
     own = candidate.probes[probe].values[name]
-    k = sizes.index(own)
+    k = bisect_left(sizes, own)
     sides = [sizes[max(k - 1, 0)], sizes[min(k + 1, len(sizes) - 1)]]
     tried = {own, *(float(s) for side in sides for s in np.geomspace(own, side, BETWEEN + 2)[1:-1])}
     return replace(candidate, probes=tuple(_resized(candidate.probes[probe], name, s) for s in sorted(tried)))

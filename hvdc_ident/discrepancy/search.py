@@ -59,4 +59,4 @@ def forward(search: Search, first: Refit) -> Outcome:
 
 def is_noise(refit: Refit, search: Search) -> bool:
     """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
-    return not excess(refit) and shapeless(refit, search.seed)
+    return not excess(refit) and shapeless(refit.nominal(), search.seed)

@@ -10,9 +10,10 @@ import numpy as np
 from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import job
+from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import unseen_rows
 from hvdc_ident.discrepancy.race import Race, done
-from hvdc_ident.discrepancy.refit import Job, Refit, unseen
+from hvdc_ident.discrepancy.refit import Job, Refit, of_held_out, unseen
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.effects import effects
@@ -31,6 +32,8 @@ LOUD = 1.4
 """Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
 SHAPED = 0.05
 """Chance under noise of sums over time below which what is left has a shape."""
+ALIKE = 0.1
+"""Correlation of neighbours up to which they are: records that stand still are rounded alike."""
 LOOKED_AT = 3
 """Of the refits the best, of which this is asked."""
 AGAIN = 4
@@ -127,12 +130,21 @@ def all_far(before: Refit, trials: Sequence[Trial], near: float = NEAR) -> bool:
 
 
 def like_noise(refit: Refit) -> bool:
-    """Whether what a model leaves is without shape, and on the others no larger: somewhat loud, for noise is told from few rows."""
-    if refit.chi2 > LOUD * refit.rows or refit.correlation > 0.0 or misses(refit):
+    """Whether what a model leaves is without shape, though somewhat loud: noise is told from few rows.
+
+    Of the held-out data too, where more is left of them: their noise may be louder than that of the others.
+    """
+    seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
+    if seen > LOUD or refit.correlation > ALIKE or (now is not None and now**2 > LOUD * seen):
         return False
-    return shapeless(refit, 0)
+    if not shapeless(refit.nominal(), 0):
+        return False
+    if not misses(refit):
+        return True
+    held = of_held_out(refit.problem)
+    return held is not None and shapeless(Nominal(held, refit.theta[: len(held.free)], refit.noise), 0)
 
 
-def shapeless(refit: Refit, seed: int) -> bool:
+def shapeless(nominal: Nominal, seed: int) -> bool:
     """Whether sums over time of what a model leaves are what they are of noise."""
-    return all(b.p > SHAPED for b in adequacy(refit.nominal(), {}, bootstraps=100, seed=seed))
+    return all(b.p > SHAPED for b in adequacy(nominal, {}, bootstraps=100, seed=seed))

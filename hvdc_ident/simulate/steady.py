@@ -21,7 +21,7 @@ def fallback(
     structure: Structure, address: NDArray[np.int64], p: Array, u: Array, guess: Array, time: float = 0.0
 ) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
-    from hvdc_ident.simulate.machine import evaluate
+    from hvdc_ident.simulate.machine import bound, evaluate
     from hvdc_ident.simulate.rest import MODES, RESIDUAL, REST_JAC, REST_P
 
     s = structure.sizes
@@ -29,14 +29,15 @@ def fallback(
     n = inner + extra
     y, w, m = np.zeros(inner * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width)), np.zeros(max(s.ns, 1))
     w[0], w[1 : 1 + s.nu] = time, u
+    left, slopes = np.zeros(n), np.zeros(n * n)
+    calls = [bound(address[k], y, w, p, m, out) for k, out in ((MODES, m), (RESIDUAL, left), (REST_JAC, slopes))]
 
     def equations(v: Array) -> tuple[Array, Array]:
         y[:inner], w[1 + s.nu : 1 + s.nu + extra] = v[:inner], v[inner:]
-        r, jac = np.zeros(n), np.zeros(n * n)
-        evaluate(address[MODES], y, w, p, m, m)
-        evaluate(address[RESIDUAL], y, w, p, m, r)
-        evaluate(address[REST_JAC], y, w, p, m, jac)
-        return r, jac.reshape(n, n)
+        left[:], slopes[:] = 0.0, 0.0
+        for call in calls:
+            call()
+        return left.copy(), slopes.reshape(n, n).copy()
 
     near = _Region.of(structure, guess, extra)
     begin = np.concatenate([guess, np.zeros(extra)])
@@ -120,6 +121,7 @@ def _pseudo_transient(equations: Equations, v: Array, near: _Region, nx: int) ->
     mass = np.zeros(v.size)
     mass[:nx] = 1.0
     r, jac = equations(v)
+    before = float(np.linalg.norm(r / near.weights(jac, v)))
     h = 1e-4
     for _ in range(300):
         try:
@@ -128,11 +130,10 @@ def _pseudo_transient(equations: Equations, v: Array, near: _Region, nx: int) ->
             h *= 0.3
             continue
         r_new, jac_new = equations(v + step)
-        before = float(np.linalg.norm(r / near.weights(jac, v)))
         after = float(np.linalg.norm(r_new / near.weights(jac_new, v + step)))
         if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
-            v, r, jac = v + step, r_new, jac_new
             h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
+            v, r, jac, before = v + step, r_new, jac_new, after
             if after < ACCURACY * 1e-2:
                 break
         else:
