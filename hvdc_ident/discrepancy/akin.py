@@ -128,7 +128,8 @@ def bends(opened: Round) -> list[Pick]:
     columns = [scores.columns[k] for k in order if scores.size[k] > SEEN]
     at_one = [c for c in columns if len(found[c.candidate].at) == 1]
     every = [c for c in at_one if bent(found[c.candidate]) or by_level(found[c.candidate])]
-    chosen = every[: EFFORT // opened.before.rows]
+    # One after the other, for what is compiled for one size serves for all of its candidate.
+    chosen = sorted(every[: EFFORT // opened.before.rows], key=lambda c: c.candidate)
     return [Pick(c.candidate, c.probe, 1.0, opened.score_p(c.candidate)[0]) for c in chosen]
 
 

@@ -12,8 +12,8 @@ from numba import njit
 kernel = partial(njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 _FILES = (
-    "call", "driver", "entries", "exogenous", "kernel", "lanes", "linear", "memory", "outputs", "rest", "segments", "state",
-    "status", "steps", "switches", "tableaus", "unknowns",
+    "call", "driver", "entries", "exogenous", "kernel", "lanes", "linear", "memory", "outputs", "patient", "rest",
+    "segments", "state", "status", "steps", "switches", "tableaus", "unknowns",
 )  # fmt: skip
 
 

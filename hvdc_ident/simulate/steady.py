@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.simulate.structure import ACCURACY, TINY, Structure
 from hvdc_ident.trajectory import Array
 
-Equations = Callable[[Array], tuple[Array, Array]]
-ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
 CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
 
 
@@ -21,7 +18,9 @@ def fallback(
     structure: Structure, address: NDArray[np.int64], p: Array, u: Array, guess: Array, time: float = 0.0
 ) -> tuple[Array, Array]:
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
-    from hvdc_ident.simulate.machine import bound, evaluate
+    # Compiled when it is needed first: who never needs it does not wait for the compiler.
+    from hvdc_ident.simulate.machine import evaluate
+    from hvdc_ident.simulate.patient import follow, nearest
     from hvdc_ident.simulate.rest import MODES, RESIDUAL, REST_JAC, REST_P
 
     s = structure.sizes
@@ -29,24 +28,26 @@ def fallback(
     n = inner + extra
     y, w, m = np.zeros(inner * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width)), np.zeros(max(s.ns, 1))
     w[0], w[1 : 1 + s.nu] = time, u
-    left, slopes = np.zeros(n), np.zeros(n * n)
-    calls = [bound(address[k], y, w, p, m, out) for k, out in ((MODES, m), (RESIDUAL, left), (REST_JAC, slopes))]
 
     def equations(v: Array) -> tuple[Array, Array]:
         y[:inner], w[1 + s.nu : 1 + s.nu + extra] = v[:inner], v[inner:]
-        left[:], slopes[:] = 0.0, 0.0
-        for call in calls:
-            call()
-        return left.copy(), slopes.reshape(n, n).copy()
+        r, jac = np.zeros(n), np.zeros(n * n)
+        evaluate(address[MODES], y, w, p, m, m)
+        evaluate(address[RESIDUAL], y, w, p, m, r)
+        evaluate(address[REST_JAC], y, w, p, m, jac)
+        return r, jac.reshape(n, n)
 
     near = _Region.of(structure, guess, extra)
     begin = np.concatenate([guess, np.zeros(extra)])
+    model = (y, w, np.ascontiguousarray(p, dtype=float), m, near.size)
     with np.errstate(all="ignore"):
         # The rest next to the guess comes first; where there are several, following the model may end at a far one.
-        v = _least_squares(equations, begin, near)
+        v = begin.copy()
+        nearest(address, inner, s.nu, *model, v)
         if not near.is_rest(*equations(v), v):
-            v = _pseudo_transient(equations, begin, near, s.nx)
-            v = _least_squares(equations, v, near)
+            v = begin.copy()
+            follow(address, inner, s.nu, s.nx, *model, v)
+            nearest(address, inner, s.nu, *model, v)
         r, jac = equations(v)
         if not near.is_rest(r, jac, v):
             raise _refused(structure, near, r, jac, v)
@@ -80,7 +81,7 @@ class _Region:
 
     def weights(self, jac: Array, v: Array) -> Array:
         """What each equation's residual is measured by."""
-        return _positive(np.abs(jac) @ np.clip(np.abs(v), 1e-3, self.size))
+        return _positive(np.abs(jac) @ np.clip(np.abs(v), TINY, self.size))
 
     def shares(self, r: Array, jac: Array, v: Array) -> Array:
         """The scaled residuals, less what rounding alone leaves."""
@@ -114,55 +115,6 @@ def _refused(structure: Structure, near: _Region, r: Array, jac: Array, v: Array
         got=got,
         hint="check the input levels and limits, give states a `guess` near the solution, or a `start`",
     )
-
-
-def _pseudo_transient(equations: Equations, v: Array, near: _Region, nx: int) -> Array:
-    """Implicit Euler steps whose length grows as the residual falls: follows the model to its rest."""
-    mass = np.zeros(v.size)
-    mass[:nx] = 1.0
-    r, jac = equations(v)
-    before = float(np.linalg.norm(r / near.weights(jac, v)))
-    h = 1e-4
-    for _ in range(300):
-        try:
-            step = np.linalg.solve(np.diag(mass / h) - jac, r)
-        except np.linalg.LinAlgError:
-            h *= 0.3
-            continue
-        r_new, jac_new = equations(v + step)
-        after = float(np.linalg.norm(r_new / near.weights(jac_new, v + step)))
-        if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
-            h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
-            v, r, jac, before = v + step, r_new, jac_new, after
-            if after < ACCURACY * 1e-2:
-                break
-        else:
-            h *= 0.2
-            if h < 1e-12:
-                break
-    return v
-
-
-def _least_squares(equations: Equations, v: Array, near: _Region) -> Array:
-    """Newton steps of least norm, for a Jacobian that is singular where a state does not matter."""
-    for _ in range(50):
-        r, jac = equations(v)
-        if not (np.isfinite(r).all() and np.isfinite(jac).all()):
-            return v
-        weight = near.weights(jac, v)
-        step = np.linalg.lstsq(jac / weight[:, None], -r / weight, rcond=1e-12)[0]
-        before, damping = float(np.linalg.norm(r / weight)), 1.0
-        while damping > 1e-4:
-            r_new = equations(v + damping * step)[0]
-            if np.linalg.norm(r_new / weight) < before or before < 1e-14:
-                break
-            damping /= 2
-        else:
-            return v
-        v = v + damping * step
-        if np.abs(step).max(initial=0.0) < 1e-14:
-            break
-    return v
 
 
 def _equation(structure: Structure, index: int) -> str:

@@ -22,6 +22,8 @@ from hvdc_ident.simulate.elimination import Elimination, eliminate, solve_text
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function, Row, function_text
 
+ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
+TINY = 1e-3  # the least that an unknown counts for, where it tells by what an equation's residual is measured
 # The order in which the integrators take the addresses.
 NAMES = (
     "f",

@@ -1,0 +1,120 @@
+"""The two ways to a steady state that Newton's method does not find, compiled: steps of least norm, and following the model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hvdc_ident.simulate.call import call
+from hvdc_ident.simulate.kernel import kernel, stamp
+from hvdc_ident.simulate.linear import lu, solve
+from hvdc_ident.simulate.rest import REST_JAC, residual
+from hvdc_ident.simulate.structure import ACCURACY, TINY
+
+
+@kernel()
+def equations(address, y, w, wd, p, m, inner, first, v, r, jac):  # type: ignore[no-untyped-def]
+    """Writes the rest residual at the unknowns v into r (n,), and its Jacobian into jac (n, n)."""
+    r[:] = 0.0
+    jac[:] = 0.0
+    residual(address, y, w, wd, p, m, v.size, inner, first, v, r)
+    call(address[REST_JAC], y, y, w, wd, p, m, jac)
+
+
+@kernel()
+def measures(jac, v, size, weight):  # type: ignore[no-untyped-def]
+    """Writes what each equation's residual is measured by, size (n,) being the most that an unknown counts for."""
+    for i in range(v.size):
+        total = 0.0
+        for j in range(v.size):
+            total += abs(jac[i, j]) * min(max(abs(v[j]), TINY), size[j])
+        weight[i] = total if total > 0.0 else 1.0
+
+
+@kernel()
+def norm(r, weight):  # type: ignore[no-untyped-def]
+    """The residual's norm, each equation by its own measure."""
+    total = 0.0
+    for i in range(r.size):
+        total += (r[i] / weight[i]) ** 2
+    return np.sqrt(total)
+
+
+def _entries(stamp):  # type: ignore[no-untyped-def]
+    """What Python calls, for the present state of the kernels' files."""
+
+    @njit(cache=True, error_model="numpy")
+    def follow(address, inner, nu, nx, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
+        """Moves v (n,) by implicit Euler steps whose length grows as the residual falls: follows the model to its rest."""
+        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  the stamp is used so that the cache knows of it
+        r, jac, ahead, jac_ahead = np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
+        matrix, pivots, step, trial, weight = (
+            np.zeros((n, n)),
+            np.zeros(n, np.int64),
+            np.zeros(n),
+            np.zeros(n),
+            np.zeros(n),
+        )
+        equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
+        measures(jac, v, size, weight)
+        before, h = norm(r, weight), 1e-4
+        for _ in range(300):
+            for i in range(n):
+                for j in range(n):
+                    matrix[i, j] = -jac[i, j]
+                if i < nx:
+                    matrix[i, i] += 1.0 / h
+                step[i] = r[i]
+            if not lu(matrix, pivots):
+                h *= 0.3
+                continue
+            solve(matrix, pivots, step)
+            for i in range(n):
+                trial[i] = v[i] + step[i]
+            equations(address, y, w, wd, p, m, inner, 1 + nu, trial, ahead, jac_ahead)
+            measures(jac_ahead, trial, size, weight)
+            after = norm(ahead, weight)
+            if after < np.inf and (after < 1.5 * before or h < 1e-9):
+                h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
+                v[:], r[:], jac[:], before = trial, ahead, jac_ahead, after
+                if after < 1e-2 * ACCURACY:
+                    break
+            else:
+                h *= 0.2
+                if h < 1e-12:
+                    break
+
+    @njit(cache=True, error_model="numpy")
+    def nearest(address, inner, nu, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
+        """Moves v (n,) by Newton steps of least norm, for a Jacobian that is singular where a state does not matter."""
+        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841
+        r, jac, ahead, jac_ahead = np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
+        matrix, right, trial, weight = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
+        for _ in range(50):
+            equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
+            if not (np.isfinite(r).all() and np.isfinite(jac).all()):
+                return
+            measures(jac, v, size, weight)
+            for i in range(n):
+                for j in range(n):
+                    matrix[i, j] = jac[i, j] / weight[i]
+                right[i] = -r[i] / weight[i]
+            step = np.linalg.lstsq(matrix, right, 1e-12)[0]
+            before, damping, better = norm(r, weight), 1.0, False
+            while damping > 1e-4 and not better:
+                for i in range(n):
+                    trial[i] = v[i] + damping * step[i]
+                equations(address, y, w, wd, p, m, inner, 1 + nu, trial, ahead, jac_ahead)
+                better = norm(ahead, weight) < before or before < 1e-14
+                if not better:
+                    damping /= 2
+            if not better:
+                return
+            v[:] = trial
+            if np.abs(step).max() < 1e-14:
+                return
+
+    return follow, nearest
+
+
+follow, nearest = _entries(stamp())
