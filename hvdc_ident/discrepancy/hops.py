@@ -33,6 +33,8 @@ LEVELS = 15.0
 """Over the signal's range: fewer are looked for all over, for any number of them may come near."""
 OF_LEVELS = 12
 """Sizes from which is refitted then."""
+AMONG = 3
+"""Times as many, the best on the fitted data, among which the held-out ones choose."""
 CLOSE = 1.3
 """The same as WIDTH for the closest look."""
 PHASE = 0.2
@@ -122,9 +124,10 @@ def _begins(here: Refit, grid: Array, teeth: int) -> list[Array]:
         return []
     at = _size(here)[0]
     left = _Left.of(here, at)
-    rough = np.array([left(s) for s in grid])
+    rough = np.array([left.fitted(float(s)) for s in grid])
     padded = np.concatenate([[np.inf], rough, [np.inf]])
-    best = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
+    least = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
+    best = sorted(least[: AMONG * teeth], key=lambda k: rough[k] + left.unseen(float(grid[k])))
     begins, given = [], as_given(here)
     for k in best[:teeth]:
         beside = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)], 2 * BETWEEN + 1)
@@ -158,12 +161,28 @@ class _Left:
 
     def __call__(self, size: float) -> float:
         """Infinite for a size that could not be run."""
-        theta = self.refit.theta.copy()
-        theta[self.at] = size
+        return self.fitted(size) + self.unseen(size)
+
+    def fitted(self, size: float) -> float:
+        """What is left of the fitted data; infinite for a size that could not be run."""
         try:
-            r = np.concatenate([b.residual for b in self.problem.blocks(theta, derivatives=False)])
-            further = self.held.blocks(theta[: len(self.held.free)], derivatives=False) if self.held else ()
+            r = np.concatenate([b.residual for b in self.problem.blocks(self._at(size), derivatives=False)])
         except SimulationError:
             return np.inf
-        unseen = sum(float(b.residual @ b.residual) for b in further if b.output in self.problem.outputs)
-        return float(r @ r - np.sum((self.others.T @ r) ** 2)) + unseen
+        return float(r @ r - np.sum((self.others.T @ r) ** 2))
+
+    def unseen(self, size: float) -> float:
+        """What is left of the held-out data; 0 where there are none, infinite for a size that could not be run."""
+        if self.held is None:
+            return 0.0
+        try:
+            further = self.held.blocks(self._at(size)[: len(self.held.free)], derivatives=False)
+        except SimulationError:
+            return np.inf
+        return sum(float(b.residual @ b.residual) for b in further if b.output in self.problem.outputs)
+
+    def _at(self, size: float) -> Array:
+        """The unknowns with another size of the last effect."""
+        theta = self.refit.theta.copy()
+        theta[self.at] = size
+        return theta

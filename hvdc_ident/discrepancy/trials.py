@@ -22,7 +22,7 @@ from hvdc_ident.errors import HvdcIdentError
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4, second=20)
 """For many candidates: a short sprint, and another for the best."""
-LONGER = Race(sprint=12, reach=0.4, second=20)
+LONGER = Race(sprint=6, reach=0.4, second=80)
 """For those that begin far from where they end."""
 PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
