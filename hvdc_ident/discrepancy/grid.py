@@ -12,7 +12,7 @@ FEWEST = 600
 """Fewer instants over a record are filled up."""
 AFTER = np.geomspace(2e-5, 2e-2, 22)
 """Where instants are put after a jump, s: what a missing lag or delay does happens there."""
-AROUND = AFTER[7:18:3]
+AROUND = AFTER[10:17:6]
 """The same after a corner, where less happens at once: an input that was recorded has one at every row."""
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import TRUE, experiments, model
+from cases import TIME, TRUE, experiments, model
 from scipy.signal import StateSpace, lsim
 
-from hvdc_ident import simulate
+from hvdc_ident import Experiment, InputSignal, simulate
+from hvdc_ident.discrepancy.block import block
 from hvdc_ident.discrepancy.grid import instants
 from hvdc_ident.discrepancy.response import along
+from hvdc_ident.frozen import FrozenMap
 
 
 def _closed_loop() -> StateSpace:
@@ -57,6 +59,31 @@ def test_the_grid_has_every_row_and_both_sides_of_a_jump() -> None:
     assert (np.diff(time) >= 0).all()
     assert np.array_equal(time[rows >= 0], e.time)
     assert np.count_nonzero(np.isclose(time, 0.2, atol=1e-12)) == 2
+
+
+def recorded() -> Experiment:
+    """Fifteen sines in the reference, known at the record's rows."""
+    values = 1.0 + 0.05 * sum(np.sin(f * TIME) for f in np.geomspace(4.0, 120.0, 15))
+    return Experiment(
+        "recorded",
+        TIME,
+        FrozenMap({"ref": InputSignal.corners(list(zip(TIME, values, strict=True)))}),
+        measured=experiments()[0].measured,
+    )
+
+
+@pytest.mark.parametrize("place", ["wm", "torque", "err"])
+def test_an_input_known_at_every_row_needs_few_instants_more(place: str) -> None:
+    """After a corner less happens at once than after a jump: a short lag is met all the same."""
+    e, short = recorded(), 1.6e-3
+    path = along(model(), e, {})
+    assert path.time.size < 5.5 * TIME.size
+    u = path.signal(place)[:, None]
+    d = block("lag", ("T",), False).run({"own_T": np.array([short])}, path.time, u, None) - u
+    _, y = path.answer([place], d[None])
+    with_it = model().with_effects([{"effect": "lag", "at": place, "parameters": {"T": short}}])
+    exact = simulate(with_it, e).trajectory.values - simulate(model(), e).trajectory.values
+    assert np.abs(y[:, :, 0].T - exact).max() < 0.05 * np.abs(exact).max()
 
 
 def test_a_card_with_other_values_runs_with_its_own() -> None:

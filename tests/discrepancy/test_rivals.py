@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.objections import objections
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
-from hvdc_ident.discrepancy.trials import excess, like_noise
+from hvdc_ident.discrepancy.trials import excess, like_noise, misses
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 
@@ -64,6 +64,16 @@ def test_somewhat_louder_noise_is_noise_and_a_shape_is_not(lag: float, loud: flo
     told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
     refit = plain([replace(e, noise=told) for e in experiments(lag=lag)])
     assert excess(refit) == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
+    assert like_noise(refit) == expected
+
+
+@pytest.mark.parametrize(("lag", "loud", "expected"), [(0.0, 1.12, True), (0.001, 1.0, False)])
+def test_held_out_records_may_be_somewhat_louder_and_may_have_no_shape(lag: float, loud: float, expected: bool) -> None:
+    own, other = experiments(), experiments(lag=lag)
+    told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
+    held = [replace(o, noise=told) for o in other if o.role == "holdout"]
+    refit = plain([*(e for e in own if e.role == "fit"), *held])
+    assert misses(refit), "by its size alone it would not be noise"
     assert like_noise(refit) == expected
 
 
