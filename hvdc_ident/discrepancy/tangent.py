@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.model.definition import Model
 from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, Function
 from hvdc_ident.trajectory import Array
 
@@ -102,24 +102,9 @@ class Tangent:
         return Partials(*parts)
 
 
-@lru_cache(maxsize=8)
-def _tangent(key: _Key) -> Tangent:
-    return Tangent(key.model, key.outputs)
-
-
-@dataclass(frozen=True)
-class _Key:
-    structure: tuple
-    outputs: tuple[str, ...]
-    model: Model
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and (self.structure, self.outputs) == (other.structure, other.outputs)
-
-    def __hash__(self) -> int:
-        return hash((self.structure, self.outputs))
+_tangent = by_structure(Tangent, room=8)
 
 
 def tangent(model: Model, outputs: tuple[str, ...]) -> Tangent:
     """The tangent of a model's structure for some outputs, compiled once."""
-    return _tangent(_Key(model.structure, outputs, model))
+    return _tangent(model, outputs)

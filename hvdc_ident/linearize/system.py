@@ -18,6 +18,7 @@ from hvdc_ident.errors import ModelError
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.model.definition import Model
+from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, Function
 from hvdc_ident.simulate.structure import Structure
 
@@ -227,29 +228,8 @@ class System:
         return np.array([v.imag for v in values]).reshape(size.main, size.columns) / 1e-30
 
 
-@dataclass(frozen=True)
-class _Key:
-    """What decides the machine code: the equations, not the values."""
-
-    structure: tuple[Any, ...]
-    outputs: tuple[str, ...]
-    model: Model
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self.outputs == other.outputs and self.structure == other.structure
-
-    def __hash__(self) -> int:
-        return hash((self.structure, self.outputs))
-
-
-@lru_cache(maxsize=32)
-def _system(key: _Key) -> System:
-    return System(key.model, key.outputs)
-
-
-@lru_cache(maxsize=64)
-def _by_identity(model: Model, outputs: tuple[str, ...]) -> System:
-    return _system(_Key(model.structure, outputs, model))
+_system = by_structure(System, room=32)
+_by_identity = lru_cache(maxsize=64)(_system)
 
 
 def system(model: Model, outputs: Sequence[str] | None = None) -> System:

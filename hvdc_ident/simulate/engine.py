@@ -15,6 +15,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.integrators import integrators
+from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.result import Simulation, Statistics
 from hvdc_ident.simulate.status import HINTS
@@ -301,36 +302,12 @@ def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[
     return np.array(u), breaks, pointer, times, values
 
 
-@lru_cache(maxsize=32)
-def _engine(key: _Key) -> Engine:
-    return Engine(key.model, key.sensitivities, key.outputs)
-
-
-@dataclass(frozen=True)
-class _Key:
-    """What decides the machine code: the equations, not the values."""
-
-    structure: tuple[Any, ...]
-    sensitivities: tuple[str, ...]
-    outputs: tuple[str, ...]
-    model: Model
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and (self.structure, self.sensitivities, self.outputs) == (
-            other.structure,
-            other.sensitivities,
-            other.outputs,
-        )
-
-    def __hash__(self) -> int:
-        return hash((self.structure, self.sensitivities, self.outputs))
+_engine = by_structure(Engine, room=32)
 
 
 def engine(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
     """The engine of a model's structure, compiled at the first call and kept for later ones (the last 32)."""
-    return _engine(
-        _Key(model.structure, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs), model)
-    )
+    return _engine(model, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs))
 
 
 @lru_cache(maxsize=256)

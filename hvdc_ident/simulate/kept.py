@@ -1,0 +1,36 @@
+"""What is compiled for a model's equations, kept for every model that has the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, TypeVar
+
+from hvdc_ident.model.definition import Model
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class _Key:
+    """What decides the machine code: the equations and the other arguments, not the values of parameters and inputs."""
+
+    model: Model
+    others: tuple[Any, ...]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self.others == other.others and self.model.structure == other.model.structure
+
+    def __hash__(self) -> int:
+        return hash((self.model.structure, self.others))
+
+
+def by_structure(make: Callable[..., T], room: int) -> Callable[..., T]:
+    """The maker, called with a model and hashable arguments, with its last `room` results kept."""
+
+    @lru_cache(maxsize=room)
+    def kept(key: _Key) -> T:
+        return make(key.model, *key.others)
+
+    return lambda model, *others: kept(_Key(model, others))
