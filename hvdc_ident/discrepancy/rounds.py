@@ -5,29 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.looks import looked
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.scores import Scores, runs, scored, signature_rows
-from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, behinds, best_of, neighbours, others, shortlist
-from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.discrepancy.scores import Scores, runs, scored
+from hvdc_ident.discrepancy.select import Ruler, Trial, behinds, best_of
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.discrepancy.tones import tones
-from hvdc_ident.discrepancy.trials import HEAT, LONGER, all_far, best_each, by_cost, excess, once_more, refitted
+from hvdc_ident.discrepancy.trials import all_far, excess, once_more, refitted
 
-LOOKED_AT = 80
-"""Candidates, the best by score, whose signatures are compared with each other."""
-WIDER = 80
-"""Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
 NEARLY = 0.1
 """Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
-CLOSE = 0.01
-"""Share of what the model before leaves beyond noise that a refit may leave for a closer look to be saved."""
 
 
 def one_round(search: Search, before: Refit, number: int) -> Round:
@@ -58,7 +51,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     if p > options.significance:
         nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
         return _met(search, nothing, nominal) if number == 1 and (excess(before) or p < NEARLY) else nothing
-    return _refitted(search, replace(opened, significant=True), nominal, number, picks)
+    return closed(search, *looked(search, replace(opened, significant=True), nominal, number, picks), number)
 
 
 def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
@@ -71,44 +64,6 @@ def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
     if all_far(opened.before, trials):
         trials = once_more(search, seen, trials, "round 1: once more")
     return closed(search, replace(seen, significant=True, why=""), trials, 1)
-
-
-def _refitted(search: Search, opened: Round, nominal: Nominal, number: int, picks: tuple[Pick, ...]) -> Round:
-    options, before, found, scores = search.options, opened.before, opened.candidates, opened.scores
-    threshold = scores.threshold(0.5)  # what noise reaches every other time is not worth a look
-    looked = [p for p in picks[:LOOKED_AT] if p.score > threshold]
-    rows = signature_rows(nominal, found, opened.paths, [Column(p.candidate, p.probe) for p in looked])
-    chosen, same = shortlist(looked, found, rows, options)
-    opened = replace(opened, same=same)
-    trials = refitted(search, opened, chosen, f"round {number}: refits")
-    tried = [t.pick.candidate for t in trials] + [p.candidate for twins in same.values() for p in twins]
-    sound = by_cost(trials)
-    best = [found[t.pick.candidate] for t in sound[:2]]
-    more = neighbours(looked, found, tried, best, max(options.refits // 3, 2))
-    trials += refitted(search, opened, more, f"round {number}: refits beside the best", trials)
-    trials += elsewhere(search, opened, picks, trials, number)
-    forms = other_forms(opened, trials, before.chi2)
-    trials = best_each([*trials, *refitted(search, opened, forms, f"round {number}: in another form", trials, HEAT)])
-    kin = as_late(opened, trials)
-    trials = with_begun(search, opened, trials, kin, number)
-    trials += elsewhere(search, opened, picks, trials, number)
-    # Beside an effect that is there already a closer look costs more than it has been seen to find.
-    if number == 1:
-        far, leading = all_far(before, trials, CLOSE), leaders(opened, trials)
-        opened, extra = closer_look(search, opened, nominal, number, lambda c: far or is_akin(c, leading))
-        closer = refitted(search, opened, extra, f"round {number}: refits of the closer look", trials)
-        trials = best_each([*trials, *closer])
-    if number == 1 and all_far(before, trials):
-        tried += [t.pick.candidate for t in trials]
-        wide = others(picks, scores, found, tried, WIDER)
-        trials += refitted(search, opened, wide, f"round {number}: the other candidates", trials, HEAT)
-        trials = with_begun(search, opened, trials, [p for p in as_late(opened, trials) if p not in kin], number)
-    if number == 1 and all_far(before, trials):
-        trials += refitted(search, opened, bends(opened), f"round {number}: from every size", trials, LONGER)
-        trials = best_each(trials)
-    if number == 1 and all_far(before, trials):
-        trials = once_more(search, opened, trials, f"round {number}: once more")
-    return closed(search, opened, trials, number)
 
 
 def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> Round:

@@ -1,0 +1,165 @@
+"""The looks of a round, one after the other: what is refitted, each beside what those before it found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
+from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.scores import signature_rows
+from hvdc_ident.discrepancy.select import Pick, Trial, neighbours, others, shortlist
+from hvdc_ident.discrepancy.signatures import Column
+from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.discrepancy.trials import HEAT, LONGER, all_far, best_each, by_cost, once_more, refitted
+
+LOOKED_AT = 80
+"""Candidates, the best by score, whose signatures are compared with each other."""
+WIDER = 80
+"""Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
+CLOSE = 0.01
+"""Share of what the model before leaves beyond noise that a refit may leave for a closer look to be saved."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """How a round stands between two looks.
+
+    opened: the round with its scores; nominal: the model before. picks: each candidate at its best size; best: those of
+    the best scores. trials: the refits so far. late: the other kinds of delay that were begun.
+    """
+
+    search: Search
+    opened: Round
+    nominal: Nominal
+    number: int
+    picks: tuple[Pick, ...]
+    best: tuple[Pick, ...]
+    trials: tuple[Trial, ...] = ()
+    late: tuple[Pick, ...] = ()
+
+    def text(self, look: str) -> str:
+        """What whoever watches is told of a look."""
+        return f"round {self.number}: {look}"
+
+    def refits(self, picks: Sequence[Pick], look: str) -> list[Trial]:
+        """Some picks refitted beside those so far."""
+        return refitted(self.search, self.opened, picks, self.text(look), self.trials)
+
+    def heats(self, picks: Sequence[Pick], look: str) -> list[Trial]:
+        """The same for many picks: in short sprints."""
+        return refitted(self.search, self.opened, picks, self.text(look), self.trials, HEAT)
+
+    def with_more(self, trials: Sequence[Trial]) -> Stand:
+        """The stand with further refits."""
+        return replace(self, trials=(*self.trials, *trials))
+
+    def with_best(self, trials: Sequence[Trial] = ()) -> Stand:
+        """The stand with further refits, of each candidate the best."""
+        return replace(self, trials=tuple(best_each([*self.trials, *trials])))
+
+    @property
+    def tried(self) -> list[int]:
+        """Candidates that were refitted, or whose twins were."""
+        twins = [p.candidate for same in self.opened.same.values() for p in same]
+        return [*(t.pick.candidate for t in self.trials), *twins]
+
+    @property
+    def far(self) -> bool:
+        """Whether no refit comes near the noise."""
+        return all_far(self.opened.before, self.trials)
+
+
+Look = Callable[[Stand], Stand]
+
+
+def looked(
+    search: Search, opened: Round, nominal: Nominal, number: int, picks: tuple[Pick, ...]
+) -> tuple[Round, tuple[Trial, ...]]:
+    """The round and its refits, after all the looks that are worth their time."""
+    threshold = opened.scores.threshold(0.5)  # what noise reaches every other time is not worth a look
+    best = tuple(p for p in picks[:LOOKED_AT] if p.score > threshold)
+    stand = Stand(search, opened, nominal, number, picks, best)
+    for look in ALWAYS:
+        stand = look(stand)
+    # Beside an effect that is there already the others cost more than they have been seen to find.
+    for look in AT_FIRST if number == 1 else ():
+        stand = look(stand)
+    for look in WHERE_FAR if number == 1 else ():
+        if not stand.far:
+            break
+        stand = look(stand)
+    return stand.opened, stand.trials
+
+
+def _shortlisted(stand: Stand) -> Stand:
+    """The best by score, one of each that leave the same trace."""
+    opened = stand.opened
+    columns = [Column(p.candidate, p.probe) for p in stand.best]
+    rows = signature_rows(stand.nominal, opened.candidates, opened.paths, columns)
+    chosen, same = shortlist(stand.best, opened.candidates, rows, stand.search.options)
+    stand = replace(stand, opened=replace(opened, same=same))
+    return stand.with_more(stand.refits(chosen, "refits"))
+
+
+def _beside(stand: Stand) -> Stand:
+    """The effects and places of the two best."""
+    found = stand.opened.candidates
+    two = [found[t.pick.candidate] for t in by_cost(stand.trials)[:2]]
+    more = neighbours(stand.best, found, stand.tried, two, max(stand.search.options.refits // 3, 2))
+    return stand.with_more(stand.refits(more, "refits beside the best"))
+
+
+def _elsewhere(stand: Stand) -> Stand:
+    """The best effects at other places."""
+    return stand.with_more(elsewhere(stand.search, stand.opened, stand.picks, stand.trials, stand.number))
+
+
+def _other_forms(stand: Stand) -> Stand:
+    """The best in another form."""
+    forms = other_forms(stand.opened, stand.trials, stand.opened.before.chi2)
+    return stand.with_best(stand.heats(forms, "in another form"))
+
+
+def _as_late(stand: Stand) -> Stand:
+    """Other kinds of delay, as late as the best; those not that were begun before."""
+    kin = as_late(stand.opened, stand.trials)
+    new = [p for p in kin if p not in stand.late]
+    begun = with_begun(stand.search, stand.opened, stand.trials, new, stand.number)
+    return replace(stand, trials=tuple(begun), late=(*stand.late, *new))
+
+
+def _closer(stand: Stand) -> Stand:
+    """Sizes that a closer look finds: everywhere where nothing explains the data, else at what is akin to the best."""
+    far, leading = all_far(stand.opened.before, stand.trials, CLOSE), leaders(stand.opened, stand.trials)
+    opened, extra = closer_look(
+        stand.search, stand.opened, stand.nominal, stand.number, lambda c: far or is_akin(c, leading)
+    )
+    stand = replace(stand, opened=opened)
+    return stand.with_best(stand.refits(extra, "refits of the closer look"))
+
+
+def _the_others(stand: Stand) -> Stand:
+    """A candidate for every effect and place that was not tried."""
+    wide = others(stand.picks, stand.opened.scores, stand.opened.candidates, stand.tried, WIDER)
+    return _as_late(stand.with_more(stand.heats(wide, "the other candidates")))
+
+
+def _from_every_size(stand: Stand) -> Stand:
+    """What bends its signal, from every size probed."""
+    text = stand.text("from every size")
+    return stand.with_best(refitted(stand.search, stand.opened, bends(stand.opened), text, stand.trials, LONGER))
+
+
+def _once_more(stand: Stand) -> Stand:
+    """Sizes that have to be met, beside the gains that refits came to."""
+    again = once_more(stand.search, stand.opened, stand.trials, stand.text("once more"))
+    return replace(stand, trials=tuple(again))
+
+
+ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _elsewhere, _other_forms, _as_late, _elsewhere)
+AT_FIRST: tuple[Look, ...] = (_closer,)
+"""In the first round."""
+WHERE_FAR: tuple[Look, ...] = (_the_others, _from_every_size, _once_more)
+"""In the first round, as long as nothing comes near the noise."""
