@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from hvdc_ident.discrepancy.refit import Placed, Refit
+from hvdc_ident.discrepancy.begin import Placed
+from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.result import Found, Size
 from hvdc_ident.effects import effects
 from hvdc_ident.frozen import FrozenMap

@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.library import Term, along
-from hvdc_ident.discrepancy.refit import Job, Placed, Refit
+from hvdc_ident.discrepancy.refit import Job, Refit
 from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hvdc_ident.discrepancy.begin import Placed, added, moved
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.refit import Job, Placed, Refit, added, moved
+from hvdc_ident.discrepancy.refit import Job, Refit
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.trajectory import Array

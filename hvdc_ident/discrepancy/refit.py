@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.noise import Noise
 from hvdc_ident.discrepancy.nominal import Nominal, orthonormal
-from hvdc_ident.discrepancy.signatures import is_linear, kind_of
-from hvdc_ident.effects import EffectUse, clearance, effects
+from hvdc_ident.effects import clearance, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
@@ -22,35 +21,14 @@ from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
-PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
-"""Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
 GLANCE = 6
 """Evaluations of a further start, which goes on only where it is better by then than the first at its end."""
-FAR = 5.0
-"""Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little."""
-EXACT = 1e3
-"""The same for an effect in proportion to its size, whose score at one size is that at every."""
-ROOM = 3.0
-"""Times the size asked for: how far a refit may go."""
 SCANNED = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
-
-
-@dataclass(frozen=True)
-class Placed:
-    """An effect in a model: its candidate, its use, and by its own parameter names those of the model."""
-
-    candidate: Candidate
-    use: EffectUse
-    names: FrozenMap[str]
-    bounds: FrozenMap[tuple[float, float]]
-    start: FrozenMap[float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,83 +129,6 @@ def find(job: Job) -> Found:
 def found_by(refit: Refit) -> Found:
     """What a refit came to, without what it was given."""
     return Found(**{f.name: getattr(refit, f.name) for f in fields(Found)})
-
-
-def added(
-    model: AnyModel, problem: Problem, candidate: Candidate, probe: int, factor: float
-) -> tuple[AnyModel, Problem, Placed, Array]:
-    """The model and problem with one more effect, and where it starts: the probe, or the size the score asks for.
-
-    Raises ModelError where the effect cannot be put there.
-    """
-    candidate = reaching(candidate, probe, factor)
-    chosen = candidate.probes[probe]
-    values = moved(candidate, probe, factor)
-    use = candidate.use(replace(chosen, values=FrozenMap(values)))
-    before = set(model.parameters)
-    larger = model.with_effects([use])
-    new = [n for n in larger.parameters if n not in before]
-    present = [
-        n
-        for n in effects()[candidate.effect].parameters
-        if n not in candidate.named and not _absent(candidate, n, values)
-    ]
-    names = dict(zip(present, new, strict=True))
-    bounds = {n: b for n, b in chosen.free.items() if n in names}
-    free = tuple(Free(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    unsettled = problem.unsettled or effects()[candidate.effect].restless
-    more = replace(
-        problem, simulator=ModelSimulator(larger, PATIENCE), free=(*problem.free, *free), unsettled=unsettled
-    )
-    placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
-    return larger, more, placed, np.array([f.start for f in free])
-
-
-def _absent(candidate: Candidate, name: str, values: Mapping[str, float]) -> bool:
-    q = effects()[candidate.effect].parameters[name]
-    return q.optional and values[name] == q.neutral
-
-
-def reaching(candidate: Candidate, probe: int, factor: float) -> Candidate:
-    """The candidate with room in the probe's bounds for the size that a score asks for, where it is in proportion to that.
-
-    What a slot carries by itself is no measure of what is added there: a friction that hardly moves may be kicked hard.
-    """
-    chosen, entry = candidate.probes[probe], effects()[candidate.effect]
-    if not np.isfinite(factor) or abs(factor) <= 1.0 or not is_linear(kind_of(candidate, probe)):
-        return candidate
-    free = dict(chosen.free)
-    for n in (n for n in free if entry.parameters[n].neutral == 0.0):
-        asked, (low, high) = ROOM * min(abs(factor), EXACT) * abs(chosen.values[n]), free[n]
-        q = entry.parameters[n]
-        free[n] = (max(min(low, -asked), q.min) if low < 0 else low, min(max(high, asked), q.max))
-    wider = replace(chosen, free=FrozenMap(free))
-    return replace(candidate, probes=(*candidate.probes[:probe], wider, *candidate.probes[probe + 1 :]))
-
-
-def moved(candidate: Candidate, probe: int, factor: float) -> dict[str, float]:
-    """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
-    values, free = candidate.probes[probe].values, candidate.probes[probe].free
-    entry, found = effects()[candidate.effect], dict(values)
-    most = EXACT if is_linear(kind_of(candidate, probe)) else FAR
-    size = float(np.clip(abs(factor), 1.0 / most, most)) if np.isfinite(factor) and factor else 1.0
-    if factor < 0 and "phase" in found:
-        found["phase"] += np.pi if found["phase"] <= 0 else -np.pi
-    sign = -1.0 if factor < 0 and "phase" not in found else 1.0
-    for n, q in entry.parameters.items():
-        if q.neutral is None or n not in free or (q.optional and values[n] == q.neutral):
-            continue
-        neutral = values[q.neutral] if isinstance(q.neutral, str) else float(q.neutral)
-        if np.isinf(neutral):
-            # A delay is in proportion to 1/wn; where a bend begins is in proportion to nothing.
-            if entry.late is not None and factor > 0:
-                found[n] = values[n] / size
-            continue
-        found[n] = neutral + sign * size * (values[n] - neutral)
-    for n, (low, high) in free.items():
-        margin = 1e-3 * (high - low) if low <= 0 else 0.0
-        found[n] = float(np.clip(found[n], low + margin if margin else low * 1.001, high - 1e-3 * (high - low)))
-    return found
 
 
 def run(job: Job) -> Refit:

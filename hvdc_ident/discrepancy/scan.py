@@ -16,12 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.block import block, parameter
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.inversion import Inversion
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.refit import Refit, added
+from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.response import Along
 from hvdc_ident.discrepancy.scores import Path, Scores, two_sided
 from hvdc_ident.discrepancy.signatures import Column, is_linear, kind_of

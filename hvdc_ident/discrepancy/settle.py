@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.begin import PATIENCE, Placed
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import PATIENCE, Job, Placed, Refit, run
+from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import closed, one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
 from hvdc_ident.discrepancy.state import Round, Search

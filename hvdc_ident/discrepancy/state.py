@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Placed, Refit
+from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.scores import Path, Scores
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial
 from hvdc_ident.fit.executor import Executor, Progress

@@ -13,10 +13,11 @@ import pytest
 from hvdc_ident import simulate as package
 from hvdc_ident.discrepancy import Options
 from hvdc_ident.discrepancy.akin import bends
+from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.refit import Job, Refit, added, judged, run
+from hvdc_ident.discrepancy.refit import Job, Refit, judged, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.discrepancy.trials import LONGER, refitted
