@@ -67,21 +67,12 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
             f"Something is missing; the best of the catalogue ({labels}) explains only {explained / excess:.0%} of the gap.",
             tests,
         )
-    was, now = unseen(first), unseen(last)
     # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
     if all(b.p > REFUTED_P for b in tests):
         floor = max(floor, last.chi2 / last.rows)
-    least = (1.0 + options.holdout_share) * np.sqrt(floor)
-    # What is left may be of no interest, and told from the noise it is no more then.
-    if was is not None and now is not None and min(was, now) > least and not silent(first, last):
-        told = (was**2 - now**2) / (was**2 - floor)
-        if told < PREDICTED:
-            return Judgement(
-                "unnameable",
-                f"Something is missing; with {labels} the fitted records are explained but of the held-out gap only "
-                f"{max(told, 0.0):.0%}: the form is not the right one.",
-                tests,
-            )
+    told = _predicted(first, last, floor, options)
+    if told < PREDICTED:
+        return _half_told(labels, [rivals(r, options, search.tries("droop")) for r in outcome.kept], tests, told)
     sets, better = _sets(search, outcome)
     if better is not None:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
@@ -121,11 +112,39 @@ def _named(
     left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
     if worst.excess <= options.refuted * explained:
         return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
-    # Where all that explain most of it are of one kind, that kind is told, and none of them is to be believed.
-    if others and all(_one_kind(g) for g in sets) and worst.excess < (1.0 - DOMINANT) * explained:
+    if _all_of_one_kind(sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
+
+
+def _predicted(first: Refit, last: Refit, floor: float, options: Options) -> float:
+    """The share of the held-out gap that is explained; 1 where that gap is none, or what is left of it of no interest.
+
+    floor: the mean square that noise leaves.
+    """
+    was, now = unseen(first), unseen(last)
+    least = (1.0 + options.holdout_share) * np.sqrt(floor)
+    if was is None or now is None or min(was, now) <= least or silent(first, last):
+        return 1.0
+    return float((was**2 - now**2) / (was**2 - floor))
+
+
+def _half_told(labels: str, sets: Sequence[tuple[Rival, ...]], tests: tuple[Binned, ...], told: float) -> Judgement:
+    """The verdict where held-out data tell that what was put in is not all of it; told: the share of their gap it explains."""
+    only = f"only {max(told, 0.0):.0%} of the held-out gap"
+    if told >= DOMINANT and _all_of_one_kind(sets):
+        others = max(len(g) for g in sets) - 1
+        like = f"{labels}, or one of {others} others" if others > 1 else f"{labels}, or another one"
+        text = f"Missing: something like {like}. None is all of it: they explain {only}."
+        return Judgement("ambiguous", text, tests, tuple(sets))
+    text = f"Something is missing; with {labels} the fitted records are explained but {only} is: the form is not the right one."
+    return Judgement("unnameable", text, tests)
+
+
+def _all_of_one_kind(sets: Sequence[tuple[Rival, ...]]) -> bool:
+    """Whether all that explain most of a gap are of one kind: it is told then, though none of them is to be believed."""
+    return max(len(g) for g in sets) > 1 and all(_one_kind(g) for g in sets)
 
 
 def _one_kind(group: Sequence[Rival]) -> bool:

@@ -15,8 +15,10 @@ from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.objections import objections
 from hvdc_ident.discrepancy.refit import Refit, run
+from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
 from hvdc_ident.discrepancy.trials import excess, like_noise, misses
+from hvdc_ident.discrepancy.verdict import _half_told
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 
@@ -131,3 +133,18 @@ def test_a_parameter_more_is_no_refutation_where_several_explain_the_data() -> N
     assert Options().set_bic < behind["second-order"] < Options().set_bic + np.log(1800)
     alone = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm"])
     assert alone.verdict == "named" and not alone.ambiguity
+
+
+def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_them() -> None:
+    """What the catalogue lacks may still be of one kind: by how long it delays is known, and that it is not all."""
+    lag, delay = (Rival(e, ("wm",), 0.0, FrozenMap({"T": 0.01})) for e in ("lag", "delay"))
+    bend = Rival("saturation", ("wm",), 0.0, FrozenMap({"level": 1.0}))
+    told = {
+        (told, group): _half_told("lag at wm", [group], (), told)
+        for told in (0.4, 0.7)
+        for group in ((lag, delay), (lag, bend), (lag,))
+    }
+    assert {k for k, v in told.items() if v.verdict == "ambiguous"} == {(0.7, (lag, delay))}
+    assert told[0.7, (lag, delay)].sets == ((lag, delay),)
+    assert "only 70% of the held-out gap" in told[0.7, (lag, delay)].text
+    assert {v.verdict for v in told.values()} == {"ambiguous", "unnameable"}
