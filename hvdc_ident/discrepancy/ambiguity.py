@@ -10,11 +10,16 @@ import numpy as np
 
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.select import Trial, at_edge, behinds, best_gain, best_of
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.discrepancy.state import Round
+from hvdc_ident.effects import effects
 from hvdc_ident.frozen import FrozenMap
+
+NEEDED = 4.0
+"""Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
 
 
 def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, ...]:
@@ -44,6 +49,7 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
             same = Rival(other.effect, other.at, behind, FrozenMap(), other.source, refitted=False)
             group += [same, *_as_droop(same, signed, droop)]
     group += _unfitted(found, best_gain(found.trials), options, droop)
+    group += _at_rest(found, group)
     each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
     for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
         each.setdefault((r.effect, r.at, r.source), r)
@@ -53,14 +59,25 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
 def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) -> tuple[Rival, ...]:
     """The winner with the formulas outside the catalogue that are within delta BIC of it; () where one is further ahead of it.
 
-    formulas: refitted in the winner's stead.
+    formulas: refitted in the winner's stead. One that explains as much with a parameter more, and would not without any of
+    its own, is not refuted by the price of that: of a product around its operating point a gain makes a coupling.
     """
-    assert found.winner is not None
+    assert found.winner is not None and found.ruler is not None
     own, *behind = behinds([found.winner, *formulas])
     if own > options.set_bic:
         return ()
-    near = [(b, t) for b, t in zip(behind, formulas, strict=True) if b <= options.set_bic]
+    price = float(np.log(found.ruler.effective))
+    free = [t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit) for t in formulas]
+    limits = [options.set_bic + (price if f else 0.0) for f in free]
+    near = [(b, t) for b, t, limit in zip(behind, formulas, limits, strict=True) if b <= limit]
     return tuple(sorted((_rival(found.winner, own), *(_rival(t, b) for b, t in near)), key=lambda r: r.delta_bic))
+
+
+def _all_needed(refit: Refit) -> bool:
+    """Whether every parameter of the last effect is clearly off 0."""
+    sizes, names = refit.sizes(refit.placed[-1]), refit.placed[-1].names
+    stds = {n: refit.std.get(names[n]) for n in sizes}
+    return all(std is not None and abs(sizes[n]) > NEEDED * std for n, std in stds.items())
 
 
 def _rival(trial: Trial, behind: float) -> Rival:
@@ -85,6 +102,21 @@ def _unfitted(found: Round, best: float, options: Options, droop: bool) -> list[
             rival = Rival(c.effect, c.at, max(behind, 0.0), FrozenMap(), c.source, refitted=False)
             group += [rival, *_as_droop(rival, p.factor * float(probe.values.get("k", 0.0)), droop)]
     return group
+
+
+def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
+    """What bends a signal that never moves does what a gain does there, and leaves no trace of its own to be scored by.
+
+    A limit, a saturation and a deadband take away; levels may add too.
+    """
+    gains = {r.at: r for r in group if r.effect == "gain"}
+    likes: list[Rival] = []
+    for c in found.candidates:
+        entry, gain = effects()[c.effect], gains.get(c.at)
+        bends = c.still and entry.late is None and entry.states == "none" and not entry.needs_source
+        if gain is not None and bends and (entry.scanned or gain.parameters.get("k", 0.0) < 1.0):
+            likes.append(Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False))
+    return likes
 
 
 def _as_droop(rival: Rival, k: float, droop: bool) -> list[Rival]:

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pytest
-from cases import FREE, TRUE, experiments, model
+from cases import FREE, SIGMA, TRUE, experiments, model
+from refits import beside, plain
 
+from hvdc_ident import Experiment, InputSignal, Model, simulate
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
+from hvdc_ident.discrepancy.ambiguity import formula_rivals
+from hvdc_ident.discrepancy.formula import formula_job
+from hvdc_ident.discrepancy.library import Term
+from hvdc_ident.discrepancy.refit import run
+from hvdc_ident.discrepancy.select import Pick, Ruler, Trial
+from hvdc_ident.discrepancy.state import Round
+from hvdc_ident.frozen import FrozenMap
 
 
 def bent(third: float, level: float, options: Options | None = None) -> Diagnosis:
@@ -52,3 +65,44 @@ def test_no_formula_is_tried_where_none_is_asked_for() -> None:
     found = bent(-0.25, math.inf, Options(fallback=False))
     assert found.verdict == "named"
     assert found.effects[0].effect == "saturation"
+
+
+def shown(changed: Model, still: str) -> tuple[Experiment, ...]:
+    """Records of a changed drive, with noise, in which one input stands still and the other moves."""
+    random, found = np.random.default_rng(3), []
+    rest = {"ref": 1.0, "load": 0.3}
+    for e, change in zip(experiments(), (0.3, -0.25, 0.2), strict=True):
+        moves = {n: InputSignal.step(0.3, v, v + change * (n != still)) for n, v in rest.items()}
+        e = replace(e, inputs=FrozenMap(moves))
+        clean = simulate(changed, e.with_(measured=None), TRUE, outputs=tuple(SIGMA)).trajectory
+        noisy = clean.values + random.standard_normal(clean.values.shape) * list(SIGMA.values())
+        found.append(replace(e, measured=replace(clean, values=noisy)))
+    return tuple(found)
+
+
+def test_a_formula_with_a_parameter_more_is_a_rival_where_it_needs_all_of_them() -> None:
+    """A product near its operating point is a coupling and a gain: the price of that gain does not refute it."""
+    before = plain(shown(model(), still="ref"))
+    terms = [Term("load*w", ("load", "w"), "xy"), Term("w", ("w",), "x")]
+    refit = run(formula_job(before, "outputs.w", terms, np.array([0.01, 0.01])))
+    coupling = beside(before, "coupling", "outputs.w", {"k": 0.01}, {"k": (-1.0, 1.0)}, source="load")
+    winner = Trial(Pick(0, 0, 1.0, 1.0), run(coupling), 100.0)
+    found = cast(Round, SimpleNamespace(winner=winner, ruler=Ruler(1800, 1800.0, 1.0)))
+    for std, gain, members in ((1e-3, 93.0, 2), (10.0, 93.0, 1), (1e-3, 80.0, 1)):
+        last = refit.placed[-1]
+        spread = FrozenMap({last.names[n]: std * abs(v) for n, v in refit.sizes(last).items()})
+        formula = Trial(winner.pick, replace(refit, std=spread), gain)
+        assert len(formula_rivals(found, [formula], Options())) == members
+
+
+def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> None:
+    clipped = {"effect": "limit", "at": "load", "parameters": {"level": 0.25}}
+    bends = ("gain", "limit", "saturation", "deadband")
+    found = diagnose(
+        model(), shown(model().with_effects([clipped]), still="load"), FREE, effects=bends, places=["load"]
+    )
+    assert found.verdict == "ambiguous"
+    assert {r.effect for r in found.ambiguity[0]} == set(bends)
+    more = {"effect": "gain", "at": "load", "parameters": {"k": 1.2}}
+    found = diagnose(model(), shown(model().with_effects([more]), still="load"), FREE, effects=bends, places=["load"])
+    assert found.verdict == "named" and not found.ambiguity, "none of them adds"
