@@ -80,6 +80,11 @@ class InputSignal:
         return np.where(right == 0, self.values[0], self.values[i] + share * (self.values[j] - self.values[i]))
 
     @property
+    def jumps(self) -> Array:
+        """(k,) instants at which the value changes at once, s."""
+        return np.asarray(self.times[1:][(np.diff(self.times) == 0) & (np.diff(self.values) != 0)])
+
+    @property
     def is_constant(self) -> bool:
         """Whether the signal never changes."""
         return bool((self.values == self.values[0]).all())

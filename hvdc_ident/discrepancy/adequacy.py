@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,8 +95,3 @@ def _level_bins(nominal: Nominal, by_experiment: Mapping[str, Array]) -> NDArray
         level = np.searchsorted(edges, v)
         found.append((outputs.index(b.output) * 3 + rising) * (edges.size + 1) + level)
     return np.concatenate(found).astype(np.intp)
-
-
-def worst(tests: Sequence[Binned]) -> Binned | None:
-    """The binning that is least like noise."""
-    return min(tests, key=lambda b: (b.p, -b.excess), default=None)

@@ -6,8 +6,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit
@@ -33,7 +31,7 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
     alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
-    price = 0.0 if alone else float(np.log(found.ruler.effective))
+    price = 0.0 if alone else found.ruler.price
     group: list[Rival] = []
     for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
         more = trial.refit.count - found.winner.refit.count == 1
@@ -66,9 +64,8 @@ def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) ->
     own, *behind = behinds([found.winner, *formulas])
     if own > options.set_bic:
         return ()
-    price = float(np.log(found.ruler.effective))
-    free = [t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit) for t in formulas]
-    limits = [options.set_bic + (price if f else 0.0) for f in free]
+    one_more = [t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit) for t in formulas]
+    limits = [options.set_bic + (found.ruler.price if more else 0.0) for more in one_more]
     near = [(b, t) for b, t, limit in zip(behind, formulas, limits, strict=True) if b <= limit]
     return tuple(sorted((_rival(found.winner, own), *(_rival(t, b) for b, t in near)), key=lambda r: r.delta_bic))
 

@@ -25,7 +25,7 @@ def instants(experiment: Experiment) -> tuple[Array, NDArray[np.int64]]:
     inner = [rows[:-1] + k / pieces * np.diff(rows) for k in range(1, pieces)]
     inputs = experiment.inputs.values()
     breaks = np.unique([b for s in inputs for b in s.breaks.tolist() if begin < b < end])
-    jumps = np.intersect1d(breaks, [t for s in inputs for t in s.times[1:][np.diff(s.times) == 0].tolist()])
+    jumps = np.intersect1d(breaks, [t for s in inputs for t in s.jumps.tolist()])
     after = [b + (AFTER if b in jumps else AROUND) for b in breaks]
     inside = np.concatenate([np.empty(0), *after])
     every = np.unique(np.concatenate([rows, *inner, inside[inside < end], breaks]))

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.closer import closer_look
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.scores import signature_rows
 from hvdc_ident.discrepancy.select import Pick, Trial, neighbours, others, shortlist
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search
-from hvdc_ident.discrepancy.trials import HEAT, LONGER, all_far, best_each, by_cost, once_more, refitted
+from hvdc_ident.discrepancy.trials import HEAT, LONGER, RACE, all_far, best_each, by_cost, once_more, refitted
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
@@ -43,19 +44,15 @@ class Stand:
         """What whoever watches is told of a look."""
         return f"round {self.number}: {look}"
 
-    def refits(self, picks: Sequence[Pick], look: str) -> list[Trial]:
-        """Some picks refitted beside those so far."""
-        return refitted(self.search, self.opened, picks, self.text(look), self.trials)
-
-    def heats(self, picks: Sequence[Pick], look: str) -> list[Trial]:
-        """The same for many picks: in short sprints."""
-        return refitted(self.search, self.opened, picks, self.text(look), self.trials, HEAT)
+    def refits(self, picks: Sequence[Pick], look: str, race: Race = RACE) -> list[Trial]:
+        """Some picks refitted in a race with those so far."""
+        return refitted(self.search, self.opened, picks, self.text(look), self.trials, race)
 
     def with_more(self, trials: Sequence[Trial]) -> Stand:
         """The stand with further refits."""
         return replace(self, trials=(*self.trials, *trials))
 
-    def with_best(self, trials: Sequence[Trial] = ()) -> Stand:
+    def with_best(self, trials: Sequence[Trial]) -> Stand:
         """The stand with further refits, of each candidate the best."""
         return replace(self, trials=tuple(best_each([*self.trials, *trials])))
 
@@ -119,7 +116,7 @@ def _elsewhere(stand: Stand) -> Stand:
 def _other_forms(stand: Stand) -> Stand:
     """The best in another form."""
     forms = other_forms(stand.opened, stand.trials, stand.opened.before.chi2)
-    return stand.with_best(stand.heats(forms, "in another form"))
+    return stand.with_best(stand.refits(forms, "in another form", HEAT))
 
 
 def _as_late(stand: Stand) -> Stand:
@@ -143,13 +140,12 @@ def _closer(stand: Stand) -> Stand:
 def _the_others(stand: Stand) -> Stand:
     """A candidate for every effect and place that was not tried."""
     wide = others(stand.picks, stand.opened.scores, stand.opened.candidates, stand.tried, WIDER)
-    return _as_late(stand.with_more(stand.heats(wide, "the other candidates")))
+    return _as_late(stand.with_more(stand.refits(wide, "the other candidates", HEAT)))
 
 
 def _from_every_size(stand: Stand) -> Stand:
     """What bends its signal, from every size probed."""
-    text = stand.text("from every size")
-    return stand.with_best(refitted(stand.search, stand.opened, bends(stand.opened), text, stand.trials, LONGER))
+    return stand.with_best(stand.refits(bends(stand.opened), "from every size", LONGER))
 
 
 def _once_more(stand: Stand) -> Stand:

@@ -164,9 +164,7 @@ def off_jumps(experiment: Experiment) -> Experiment:
     time = experiment.time
     steps = np.diff(time)
     near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    jumps = [
-        t for s in experiment.inputs.values() for t in s.times[1:][(np.diff(s.times) == 0) & (np.diff(s.values) != 0)]
-    ]
+    jumps = [t for s in experiment.inputs.values() for t in s.jumps.tolist()]
     on = np.zeros(time.size, dtype=bool)
     for t in jumps:
         on |= np.abs(time - t) <= near

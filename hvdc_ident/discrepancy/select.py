@@ -196,7 +196,12 @@ class Ruler:
     def gain(self, before: float, after: float, more: int) -> float:
         """The fall of BIC from one chi2 to another with `more` parameters more."""
         share = self.effective / self.rows
-        return (before - after) * share / self.scale - more * float(np.log(self.effective))
+        return (before - after) * share / self.scale - more * self.price
+
+    @property
+    def price(self) -> float:
+        """What one parameter more takes of it."""
+        return float(np.log(self.effective))
 
 
 def clear(refit: Refit, which: int) -> bool:

@@ -32,8 +32,8 @@ LOUD = 1.4
 """Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
 SHAPED = 0.05
 """Chance under noise of sums over time below which what is left has a shape."""
-ALIKE = 0.1
-"""Correlation of neighbours up to which they are: records that stand still are rounded alike."""
+FAINT = 0.1
+"""Correlation of neighbours up to which nothing is made of it: records that stand still are rounded alike."""
 LOOKED_AT = 3
 """Of the refits the best, of which this is asked."""
 AGAIN = 4
@@ -135,7 +135,7 @@ def like_noise(refit: Refit) -> bool:
     Of the held-out data too, where more is left of them: their noise may be louder than that of the others.
     """
     seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
-    if seen > LOUD or refit.correlation > ALIKE or (now is not None and now**2 > LOUD * seen):
+    if seen > LOUD or refit.correlation > FAINT or (now is not None and now**2 > LOUD * seen):
         return False
     if not shapeless(refit.nominal(), 0):
         return False

@@ -70,41 +70,44 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
     if all(b.p > REFUTED_P for b in tests):
         floor = max(floor, last.chi2 / last.rows)
+    sets = tuple(rivals(r, options, search.tries("droop")) for r in outcome.kept)
     told = _predicted(first, last, floor, options)
     if told < PREDICTED:
-        return _half_told(labels, [rivals(r, options, search.tries("droop")) for r in outcome.kept], tests, told)
-    sets, better = _sets(search, outcome)
+        return _half_told(labels, sets, tests, told)
+    sets, better = _with_formulas(search, outcome, sets)
     if better is not None:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better)
     return _named(labels, sets, tests, explained, options)
 
 
-def _sets(search: Search, outcome: Outcome) -> tuple[tuple[tuple[Rival, ...], ...], Trial | None]:
+def _with_formulas(
+    search: Search, outcome: Outcome, sets: tuple[tuple[Rival, ...], ...]
+) -> tuple[tuple[tuple[Rival, ...], ...], Trial | None]:
     """By effect that was put in, it and what cannot be told from it; and a formula that explains more than one of them does.
 
-    Formulas are tried where the catalogue has no rival, before a name is said, unless no form outside it is asked for.
+    sets: by the catalogue alone. Formulas are tried where it has no rival, before a name is said, unless no form outside it
+    is asked for.
     """
     options = search.options
-    sets = [rivals(r, options, search.tries("droop")) for r in outcome.kept]
     if not options.fallback or any(len(g) > 1 for g in sets):
-        return tuple(sets), None
-    for k, found in enumerate(outcome.kept):
+        return sets, None
+    wider: list[tuple[Rival, ...]] = []
+    for found in outcome.kept:
         formulas = beyond(search, found)
         near = formula_rivals(found, formulas, options)
         if not near:
             return (), max(formulas, key=lambda t: t.told)
-        sets[k] = near
-    return tuple(sets), None
+        wider.append(near)
+    return tuple(wider), None
 
 
 def _named(
     labels: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...], explained: float, options: Options
 ) -> Judgement:
     """Named or ambiguous; or unnameable where what is left is no noise in the region that the effect was put there for."""
-    others = max(len(g) for g in sets) - 1
-    rest = f"one of {others} others" if others > 1 else "another one"
-    like = f"{labels}, or {rest} that these data cannot tell from it" if others else labels
+    others = _or_others(sets)
+    like = f"{labels}{others} that these data cannot tell from it" if others else labels
     kind: Verdict = "ambiguous" if others else "named"
     worst = max((b for b in tests if b.p <= REFUTED_P), key=lambda b: b.excess, default=None)
     if worst is None:
@@ -130,19 +133,23 @@ def _predicted(first: Refit, last: Refit, floor: float, options: Options) -> flo
     return float((was**2 - now**2) / (was**2 - floor))
 
 
-def _half_told(labels: str, sets: Sequence[tuple[Rival, ...]], tests: tuple[Binned, ...], told: float) -> Judgement:
+def _or_others(sets: tuple[tuple[Rival, ...], ...]) -> str:
+    """How many beside what was put in explain the data, as a sentence goes on; empty where none does."""
+    others = max(len(g) for g in sets) - 1
+    return f", or one of {others} others" if others > 1 else ", or another one" if others else ""
+
+
+def _half_told(labels: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...], told: float) -> Judgement:
     """The verdict where held-out data tell that what was put in is not all of it; told: the share of their gap it explains."""
     only = f"only {max(told, 0.0):.0%} of the held-out gap"
     if told >= DOMINANT and _all_of_one_kind(sets):
-        others = max(len(g) for g in sets) - 1
-        like = f"{labels}, or one of {others} others" if others > 1 else f"{labels}, or another one"
-        text = f"Missing: something like {like}. None is all of it: they explain {only}."
-        return Judgement("ambiguous", text, tests, tuple(sets))
+        text = f"Missing: something like {labels}{_or_others(sets)}. None is all of it: they explain {only}."
+        return Judgement("ambiguous", text, tests, sets)
     text = f"Something is missing; with {labels} the fitted records are explained but {only} is: the form is not the right one."
     return Judgement("unnameable", text, tests)
 
 
-def _all_of_one_kind(sets: Sequence[tuple[Rival, ...]]) -> bool:
+def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
     """Whether all that explain most of a gap are of one kind: it is told then, though none of them is to be believed."""
     return max(len(g) for g in sets) > 1 and all(_one_kind(g) for g in sets)
 

@@ -307,16 +307,5 @@ _GENERATED = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
 
 def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
     """Calls one generated function from Python."""
-    y, w, p, m = (np.ascontiguousarray(a, dtype=float) for a in (y, w, p, m))
-    bound(address, y, w, p, m, out)()
-
-
-def bound(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> Callable[[], None]:
-    """The generated function with its arrays, contiguous and of floats: to be called again after writing into them."""
-    arrays = (y, y, w, np.zeros_like(w), p, m, out)
-    function, places = _GENERATED(int(address)), [a.ctypes.data for a in arrays]
-
-    def call(_kept: tuple[Array, ...] = arrays) -> None:
-        function(*places)
-
-    return call
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, np.zeros_like(w), p, m)]
+    _GENERATED(int(address))(*(a.ctypes.data for a in arrays), out.ctypes.data)

@@ -14,9 +14,7 @@ from hvdc_ident.simulate.structure import ACCURACY, TINY
 
 @kernel()
 def equations(address, y, w, wd, p, m, inner, first, v, r, jac):  # type: ignore[no-untyped-def]
-    """Writes the rest residual at the unknowns v into r (n,), and its Jacobian into jac (n, n)."""
-    r[:] = 0.0
-    jac[:] = 0.0
+    """Writes the rest residual at the unknowns v into r (n,), and its Jacobian into jac (n, n), zeros where that has none."""
     residual(address, y, w, wd, p, m, v.size, inner, first, v, r)
     call(address[REST_JAC], y, y, w, wd, p, m, jac)
 
@@ -47,14 +45,8 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
     def follow(address, inner, nu, nx, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
         """Moves v (n,) by implicit Euler steps whose length grows as the residual falls: follows the model to its rest."""
         kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  the stamp is used so that the cache knows of it
-        r, jac, ahead, jac_ahead = np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
-        matrix, pivots, step, trial, weight = (
-            np.zeros((n, n)),
-            np.zeros(n, np.int64),
-            np.zeros(n),
-            np.zeros(n),
-            np.zeros(n),
-        )
+        r, ahead, step, trial, weight = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        jac, jac_ahead, matrix, pivots = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n, np.int64)
         equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
         measures(jac, v, size, weight)
         before, h = norm(r, weight), 1e-4
@@ -87,9 +79,9 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
     @njit(cache=True, error_model="numpy")
     def nearest(address, inner, nu, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
         """Moves v (n,) by Newton steps of least norm, for a Jacobian that is singular where a state does not matter."""
-        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841
-        r, jac, ahead, jac_ahead = np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
-        matrix, right, trial, weight = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
+        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  as above
+        r, ahead, right, trial, weight = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        jac, matrix = np.zeros((n, n)), np.zeros((n, n))
         for _ in range(50):
             equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
             if not (np.isfinite(r).all() and np.isfinite(jac).all()):
@@ -104,7 +96,7 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
             while damping > 1e-4 and not better:
                 for i in range(n):
                     trial[i] = v[i] + damping * step[i]
-                equations(address, y, w, wd, p, m, inner, 1 + nu, trial, ahead, jac_ahead)
+                residual(address, y, w, wd, p, m, n, inner, 1 + nu, trial, ahead)
                 better = norm(ahead, weight) < before or before < 1e-14
                 if not better:
                     damping /= 2

@@ -140,7 +140,7 @@ def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_t
     lag, delay = (Rival(e, ("wm",), 0.0, FrozenMap({"T": 0.01})) for e in ("lag", "delay"))
     bend = Rival("saturation", ("wm",), 0.0, FrozenMap({"level": 1.0}))
     told = {
-        (told, group): _half_told("lag at wm", [group], (), told)
+        (told, group): _half_told("lag at wm", (group,), (), told)
         for told in (0.4, 0.7)
         for group in ((lag, delay), (lag, bend), (lag,))
     }
