@@ -114,11 +114,24 @@ def _named(
         return Judgement(kind, f"Missing: {like}.", tests, sets)
     left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
     if worst.excess <= options.refuted * explained:
+        if len(sets) > 1 and not others:
+            return _stand_in(labels, left, sets, tests)
         return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
     if _all_of_one_kind(sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
+
+
+def _stand_in(labels: str, left: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...]) -> Judgement:
+    """Ambiguous, though nothing else explains as much: what several effects leave in structure tells against all of them.
+
+    A relay looks like a coupling with a backlash, a sum of two effects does not leave anything.
+    """
+    text = f"Missing: something like {labels} beside each other; {left}, so they may stand for something that is none of them."
+    names = dict.fromkeys(group[0].effect for group in sets)
+    advice = {"text": "Each of them by itself. " + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names)}
+    return Judgement("ambiguous", text, tests, sets, experiment=advice)
 
 
 def _predicted(first: Refit, last: Refit, floor: float, options: Options) -> float:

@@ -117,6 +117,8 @@ def _consistent(found: dict[str, Any]) -> str:
     if names:
         more = f" and {len(names) - 5} more" if len(names) > 5 else ""
         first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}.{_in_common(found)}"
+    elif verdict == "ambiguous" and not rivals:
+        first += " They may stand for something that is none of them: it takes several, and still something is left."
     else:
         first += " No other effect of the catalogue, and no other place, explains the recordings as well."
     if not (found.get("remaining") or {}).get("adequate", True):

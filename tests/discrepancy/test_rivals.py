@@ -12,13 +12,14 @@ from refits import beside, plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy.adequacy import Binned
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.objections import objections
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
 from hvdc_ident.discrepancy.trials import excess, like_noise, misses
-from hvdc_ident.discrepancy.verdict import _half_told
+from hvdc_ident.discrepancy.verdict import _half_told, _named
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 
@@ -148,3 +149,22 @@ def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_t
     assert told[0.7, (lag, delay)].sets == ((lag, delay),)
     assert "only 70% of the held-out gap" in told[0.7, (lag, delay)].text
     assert {v.verdict for v in told.values()} == {"ambiguous", "unnameable"}
+
+
+@pytest.mark.parametrize(
+    ("effects", "p", "statistic", "verdict"),
+    [
+        (("coupling", "backlash"), 0.5, 40.0, "named"),
+        (("coupling", "backlash"), 0.005, 90.0, "ambiguous"),
+        (("coupling",), 0.005, 90.0, "named"),
+        (("coupling", "backlash"), 0.005, 190.0, "unnameable"),
+    ],
+)
+def test_several_effects_that_leave_structure_are_not_named(
+    effects: tuple[str, ...], p: float, statistic: float, verdict: str
+) -> None:
+    """What is in no catalogue is told as several effects beside each other: a relay as a coupling with a backlash."""
+    sets = tuple((Rival(e, ("wm",), 0.0, FrozenMap({"k": 0.01})),) for e in effects)
+    told = _named(" and ".join(effects), sets, (Binned("time", statistic, 40.0, p),), 1000.0, Options())
+    assert told.verdict == verdict
+    assert bool(told.experiment) == (verdict == "ambiguous")

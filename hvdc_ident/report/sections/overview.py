@@ -77,6 +77,8 @@ def _missing(results: Results) -> str:
     what = "; and ".join(text(str(e["text"]).rstrip(".")) for e in effects)
     rivals = max((len(group) - 1 for group in found.get("ambiguity") or []), default=0)
     others = f", or one of {rivals} others" if rivals > 1 else ", or another effect" if rivals else ""
+    if not rivals and found["verdict"] == "ambiguous":
+        others = ", or something that looks like them"
     return f"What the model lacks: {what}{others}{_shrunk(found.get('gap') or {})}."
 
 
