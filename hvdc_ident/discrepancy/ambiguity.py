@@ -19,6 +19,9 @@ from hvdc_ident.frozen import FrozenMap
 NEEDED = 4.0
 """Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
 
+MISSED = 0.15
+"""Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
+
 
 def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, ...]:
     """The winner and every candidate within delta BIC of it, the best first; those with its very signature too.
@@ -30,14 +33,16 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
     sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
     alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
-    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
-    price = 0.0 if alone else found.ruler.price
+    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price;
+    # nor is another form at the same place where the data would not show what the parameter does.
+    weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
+    here = found.candidates[found.winner.pick.candidate].at
     group: list[Rival] = []
     for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
-        more = trial.refit.count - found.winner.refit.count == 1
-        if not good or behind > options.set_bic + (price if more else 0.0):
-            continue
         c = found.candidates[trial.pick.candidate]
+        more = trial.refit.count - found.winner.refit.count == 1 and (not alone or (weak and c.at == here))
+        if not good or behind > options.set_bic + (found.ruler.price if more else 0.0):
+            continue
         sizes = trial.refit.sizes(trial.refit.placed[-1])
         group.append(Rival(c.effect, c.at, behind, FrozenMap(sizes), c.source))
         signed = sizes.get("k", 0.0)

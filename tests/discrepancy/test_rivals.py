@@ -14,7 +14,7 @@ from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.adequacy import Binned
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.objections import objections
+from hvdc_ident.discrepancy.objections import as_recorded, objections
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
@@ -114,6 +114,17 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
     assert "held-out data speak against it" in told[0.05]
 
 
+def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
+    before = plain(experiments(offset=0.008, noise="ar"))
+    refit = run(beside(before, "offset", "drag", {"c": -0.008}, {"c": (-0.1, 0.1)}))
+    assert before.holdout is not None and refit.holdout is not None
+    assert 0.0 < before.holdout - refit.holdout < Options().holdout_share, "whitened there is hardly anything to see"
+    recorded = [as_recorded(r, role) for role in ("fit", "holdout") for r in (before, refit)]
+    assert recorded[0] > 1.5 * recorded[1] and recorded[2] > 1.5 * recorded[3]
+    trial = Trial(Pick(0, 0, 1.0, 500.0), refit, before.chi2 - refit.chi2)
+    assert objections(before, trial, 0.005, Options(), {}, first=True) == ""
+
+
 def test_where_the_model_does_not_run_at_a_size_it_begins_at_a_spare_one(before: Refit) -> None:
     job = beside(before, "limit", "torque", {"level": 1e-4}, {"level": (1e-5, 10.0)})  # cannot carry the drag
     assert run(job).failure
@@ -134,6 +145,19 @@ def test_a_parameter_more_is_no_refutation_where_several_explain_the_data() -> N
     assert Options().set_bic < behind["second-order"] < Options().set_bic + np.log(1800)
     alone = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm"])
     assert alone.verdict == "named" and not alone.ambiguity
+
+
+def test_a_form_with_a_parameter_more_is_no_less_likely_where_the_evidence_is_weak() -> None:
+    looked_for, clear = ("lag", "lead-lag"), experiments(lag=0.012)
+    assert diagnose(model(), clear, FREE, effects=looked_for, places=["wm"]).verdict == "named"
+    random, loud = np.random.default_rng(1), FrozenMap({n: 10.0 * s for n, s in SIGMA.items()})
+    weak = []
+    for e in clear:
+        assert e.measured is not None
+        y = e.measured.values + 10.0 * random.standard_normal(e.measured.values.shape) * list(SIGMA.values())
+        weak.append(replace(e, measured=replace(e.measured, values=y), noise=loud))
+    found = diagnose(model(), weak, FREE, effects=looked_for, places=["wm"])
+    assert [{r.effect for r in group} for group in found.ambiguity] == [{"lag", "lead-lag"}]
 
 
 def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_them() -> None:
