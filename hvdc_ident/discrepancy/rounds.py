@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.scores import Scores, runs, scored
 from hvdc_ident.discrepancy.select import Ruler, Trial, behinds, best_of
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.discrepancy.tones import tones
-from hvdc_ident.discrepancy.trials import all_far, excess, once_more, refitted
+from hvdc_ident.discrepancy.trials import all_far, excess, like_noise, once_more, refitted
 
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
@@ -50,7 +50,8 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     p = scores.p(picks[0].score)
     if p > options.significance:
         nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
-        return _met(search, nothing, nominal) if number == 1 and (excess(before) or p < NEARLY) else nothing
+        worth = p < NEARLY or (excess(before) and not like_noise(before))
+        return _met(search, nothing, nominal) if number == 1 and worth else nothing
     return closed(search, *looked(search, replace(opened, significant=True), nominal, number, picks), number)
 
 

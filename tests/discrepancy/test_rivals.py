@@ -114,6 +114,16 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
     assert "held-out data speak against it" in told[0.05]
 
 
+def test_somewhat_louder_noise_is_not_looked_at_more_closely() -> None:
+    told = FrozenMap({n: s / 1.1 for n, s in SIGMA.items()})
+    records = [replace(e, noise=told) for e in experiments(seed=2)]
+    assert excess(plain(records)), "by its size alone it would be"
+    looks: list[str] = []
+    found = diagnose(model(), records, FREE, progress=lambda _done, _total, text: looks.append(text))
+    assert found.verdict == "no-evidence"
+    assert any("scores of" in look for look in looks) and not any("closer look" in look for look in looks)
+
+
 def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
     before = plain(experiments(offset=0.008, noise="ar"))
     refit = run(beside(before, "offset", "drag", {"c": -0.008}, {"c": (-0.1, 0.1)}))
