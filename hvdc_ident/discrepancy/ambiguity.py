@@ -15,6 +15,7 @@ from hvdc_ident.discrepancy.signatures import is_linear, kind_of
 from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.effects import effects
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
 
 NEEDED = 4.0
 """Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
@@ -53,6 +54,7 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
             group += [same, *_as_droop(same, signed, droop)]
     group += _unfitted(found, best_gain(found.trials), options, droop)
     group += _at_rest(found, group)
+    group += _as_loss(found, group)
     each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
     for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
         each.setdefault((r.effect, r.at, r.source), r)
@@ -119,6 +121,21 @@ def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
         if gain is not None and bends and (entry.scanned or gain.parameters.get("k", 0.0) < 1.0):
             likes.append(Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False))
     return likes
+
+
+def _as_loss(found: Round, group: Sequence[Rival]) -> list[Rival]:
+    """Conductances under their other name: a loss by the magnitude of a signal that keeps its sign."""
+    known = {(c.at, c.source) for c in found.candidates if c.effect == "loss"}
+    leaks = [r for r in group if r.effect == "conductance" and (r.at, r.source) in known]
+    return [
+        replace(r, effect="loss", parameters=FrozenMap(), refitted=False)
+        for r in leaks
+        if all(r.source in p.slots and _keeps_sign(p.signal(r.source)) for p in found.paths.values())
+    ]
+
+
+def _keeps_sign(signal: Array) -> bool:
+    return bool((signal > 0.0).all() or (signal < 0.0).all())
 
 
 def _as_droop(rival: Rival, k: float, droop: bool) -> list[Rival]:

@@ -13,12 +13,14 @@ from hvdc_ident.discrepancy.scores import signature_rows
 from hvdc_ident.discrepancy.select import Pick, Trial, neighbours, others, shortlist
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search
-from hvdc_ident.discrepancy.trials import HEAT, LONGER, RACE, all_far, best_each, by_cost, once_more, refitted
+from hvdc_ident.discrepancy.trials import HEAT, LONGER, RACE, all_far, best_each, by_cost, on_bound, once_more, refitted
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
 WIDER = 80
 """Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
+TWINS = 16
+"""Candidates at most that are refitted though their traces are another's."""
 CLOSE = 0.01
 """Share of what the model before leaves beyond noise that a refit may leave for a closer look to be saved."""
 
@@ -108,6 +110,18 @@ def _beside(stand: Stand) -> Stand:
     return stand.with_more(stand.refits(more, "refits beside the best"))
 
 
+def _twins(stand: Stand) -> Stand:
+    """Those that leave the same trace as one whose refit ended on a bound.
+
+    A trace is one of small sizes. With gains that are free the speed's feedback times k is the set-point's over k: within
+    bounds only one of them may reach what is there.
+    """
+    held = [t.pick.candidate for t in by_cost(stand.trials) if on_bound(t.refit)]
+    refitted_already = {t.pick.candidate for t in stand.trials}
+    alike = [p for k in held for p in stand.opened.same.get(k, ()) if p.candidate not in refitted_already]
+    return stand.with_more(stand.refits(alike[:TWINS], "refits of what looks like it"))
+
+
 def _elsewhere(stand: Stand) -> Stand:
     """The best effects at other places."""
     return stand.with_more(elsewhere(stand.search, stand.opened, stand.picks, stand.trials, stand.number))
@@ -154,7 +168,7 @@ def _once_more(stand: Stand) -> Stand:
     return replace(stand, trials=tuple(again))
 
 
-ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _elsewhere, _other_forms, _as_late, _elsewhere)
+ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _twins, _elsewhere, _other_forms, _as_late, _elsewhere)
 AT_FIRST: tuple[Look, ...] = (_closer,)
 """In the first round."""
 WHERE_FAR: tuple[Look, ...] = (_the_others, _from_every_size, _once_more)

@@ -104,6 +104,14 @@ def cost_of(trial: Trial) -> float:
     return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
 
+def on_bound(refit: Refit) -> bool:
+    """Whether an unknown of the fit ended on one of its bounds."""
+    return any(
+        v <= f.min or v >= f.max
+        for f, v in zip(refit.problem.free, refit.theta[: len(refit.problem.free)], strict=True)
+    )
+
+
 def excess(refit: Refit) -> bool:
     """Whether a model leaves more than noise, by size."""
     return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))

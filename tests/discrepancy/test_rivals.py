@@ -13,11 +13,14 @@ from refits import beside, plain
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.adequacy import Binned
+from hvdc_ident.discrepancy.ambiguity import _as_loss
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.objections import as_recorded, objections
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.result import Rival
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
+from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.discrepancy.trials import excess, like_noise, misses
 from hvdc_ident.discrepancy.verdict import _half_told, _named
 from hvdc_ident.effects import Probe
@@ -202,3 +205,16 @@ def test_several_effects_that_leave_structure_are_not_named(
     told = _named(" and ".join(effects), sets, (Binned("time", statistic, 40.0, p),), 1000.0, Options())
     assert told.verdict == verdict
     assert bool(told.experiment) == (verdict == "ambiguous")
+
+
+def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
+    """b |w| is b w as long as the drive does not turn; the load's sign changes."""
+    found = one_round(
+        Search(("conductance", "loss"), ("torque",), FrozenMap(), Options(bootstraps=100), seed=0),
+        plain(experiments()),
+        1,
+    )
+    leaks = [Rival("conductance", ("torque",), 0.5, source=s) for s in ("w", "load")]
+    assert [(r.effect, r.at, r.source, r.delta_bic, r.refitted) for r in _as_loss(found, leaks)] == [
+        ("loss", ("torque",), "w", 0.5, False)
+    ]

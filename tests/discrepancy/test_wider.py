@@ -12,15 +12,17 @@ from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, mo
 from refits import beside, plain
 from scipy.integrate import solve_ivp
 
-from hvdc_ident import Experiment, InputSignal, Trajectory
+from hvdc_ident import Experiment, InputSignal, Trajectory, simulate
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.akin import as_late, with_begun
 from hvdc_ident.discrepancy.hops import hop
 from hvdc_ident.discrepancy.jobs import as_given
+from hvdc_ident.discrepancy.looks import Stand, _twins
 from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, clear
 from hvdc_ident.discrepancy.state import Search
+from hvdc_ident.discrepancy.trials import on_bound, refitted
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -159,6 +161,32 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     assert opened.candidates[best.pick.candidate].effect == "window-mean"
     assert best.refit.values["window_mean_ref_T"] == pytest.approx(WINDOW, rel=0.02)
     assert best.refit.chi2 < late.chi2
+
+
+def test_what_looks_like_a_refit_that_ended_on_a_bound_is_refitted_too() -> None:
+    """A controller that hardly sees its set-point: small, it leaves the trace of feedback times k; large, gains would be off bounds."""
+    deaf = model().with_effects(
+        [{"effect": "coupling", "at": ["err"], "parameters": {"k": -0.9}, "from": "ref"}],
+    )
+    random = np.random.default_rng(0)
+    recorded = [
+        replace(e, measured=noisy(simulate(deaf, e, outputs=tuple(SIGMA)).trajectory.values, random))
+        for e in experiments()
+    ]
+    search = Search(("coupling",), ("wm", "err"), FrozenMap(), Options(bootstraps=100), seed=0)
+    first = plain(recorded)
+    found = one_round(search, first, 1)
+    places = {(c.at, c.source): k for k, c in enumerate(found.candidates)}
+    seen, told = places[("wm",), "w"], places[("err",), "ref"]
+    opened = replace(found, same={seen: [Pick(told, 0, 1.0, 1.0)]})
+    trials = refitted(search, opened, [Pick(seen, 0, 1.0, 1.0)], "the feedback")
+    assert on_bound(trials[0].refit)
+    stand = Stand(search, opened, first.nominal(), 1, (), (), tuple(trials))
+    _, more = _twins(stand).trials
+    assert more.pick.candidate == told
+    assert more.refit.chi2 < 1.2 * more.refit.rows < trials[0].refit.chi2
+    inside = replace(trials[0], refit=replace(trials[0].refit, theta=more.refit.theta))
+    assert not on_bound(inside.refit) and _twins(replace(stand, trials=(inside,))).trials == (inside,)
 
 
 def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> None:
