@@ -127,10 +127,11 @@ def _as_loss(found: Round, group: Sequence[Rival]) -> list[Rival]:
     """Conductances under their other name: a loss by the magnitude of a signal that keeps its sign."""
     known = {(c.at, c.source) for c in found.candidates if c.effect == "loss"}
     leaks = [r for r in group if r.effect == "conductance" and (r.at, r.source) in known]
+    paths = found.answers().values() if leaks else ()
     return [
         replace(r, effect="loss", parameters=FrozenMap(), refitted=False)
         for r in leaks
-        if all(r.source in p.slots and _keeps_sign(p.signal(r.source)) for p in found.paths.values())
+        if all(r.source in p.slots and _keeps_sign(p.signal(r.source)) for p in paths)
     ]
 
 

@@ -6,13 +6,16 @@ name for it takes a form for told that the data do not tell.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from hvdc_ident.discrepancy.candidates import additive, source_signals
 from hvdc_ident.discrepancy.formula import at_run, formula_job
 from hvdc_ident.discrepancy.hidden import regression
 from hvdc_ident.discrepancy.library import Term, terms
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Job
+from hvdc_ident.discrepancy.refit import Job, Refit
 from hvdc_ident.discrepancy.rounds import gained
+from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.select import Trial
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.discrepancy.trials import PRICE
@@ -48,8 +51,9 @@ def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
 
 def _jobs(found: Round, place: str, source: str) -> list[Job]:
     """The formulas that by regression leave least for what their coefficients cost."""
-    library, formulas = _formulas(found, place.removeprefix("outputs."), source)
-    regressed = regression(found.before.nominal(), found.paths, place, [at_run(t) for t in library])
+    paths = found.answers()
+    library, formulas = _formulas(found.before, paths, place.removeprefix("outputs."), source)
+    regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
     ranked = []
     for formula in formulas:
         coefficients, gain = regressed.solved(formula)
@@ -65,10 +69,12 @@ def _jobs(found: Round, place: str, source: str) -> list[Job]:
     return jobs
 
 
-def _formulas(found: Round, own: str, source: str) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
+def _formulas(
+    before: Refit, paths: Mapping[str, Path], own: str, source: str
+) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
     """A library, the slot's own signal first in it, and formulas as places in that: powers, magnitudes and products of the
     signal with what is brought in, or with any; each also beside a gain."""
-    others = (source,) if source else source_signals(found.before.model, slot_signals(found.paths))
+    others = (source,) if source else source_signals(before.model, slot_signals(paths))
     library = terms([own, *(s for s in others if s != own)])
     near = [k for k, t in enumerate(library) if t.form != "x" and (own in t.signals or source in t.signals)]
     return library, [*((k,) for k in near), *((k, 0) for k in near)]

@@ -59,15 +59,15 @@ class Fallback:
 
 def fallback(search: Search, first: Refit, outcome: Outcome) -> Fallback:
     """A term found from the data and refitted by full simulation; where none is stable, a disturbance or a curve."""
-    nominal, r = first.nominal(), outcome.rounds[0]
-    places = _places(search, first, r.paths)
-    signals = source_signals(first.model, slot_signals(r.paths))
+    nominal, paths = first.nominal(), outcome.rounds[0].answers()
+    places = _places(search, first, paths)
+    signals = source_signals(first.model, slot_signals(paths))
     price = search.options.named_bic + float(np.log(nominal.residual.size))
     ranked = []
     for k, place in enumerate(places):
         search.tell(k, len(places), f"hidden input at {place}")
         library = terms([place, *(s for s in signals if s != place)] if not _is_output(first, place) else signals)
-        found = regression(nominal, r.paths, place, [at_run(t) for t in library])
+        found = regression(nominal, paths, place, [at_run(t) for t in library])
         chosen = found.selected(MOST, price)
         if chosen:
             coefficients, gain = found.solved(chosen)
@@ -83,7 +83,7 @@ def fallback(search: Search, first: Refit, outcome: Outcome) -> Fallback:
                 tried.append((made.refit.chi2 + len(chosen) * price, made))
     if tried:
         return min(tried, key=lambda item: item[0])[1]
-    return _curve(search, first, outcome, [p for _, p, *_ in ranked] or places)
+    return _curve(search, first, paths, [p for _, p, *_ in ranked] or places)
 
 
 def _is_output(first: Refit, place: str) -> bool:
@@ -165,9 +165,9 @@ def formula_found(refit: Refit, gain: float, stability: float | None = None) -> 
     )  # fmt: skip
 
 
-def _curve(search: Search, first: Refit, outcome: Outcome, places: Sequence[str]) -> Fallback:
+def _curve(search: Search, first: Refit, paths: Mapping[str, Path], places: Sequence[str]) -> Fallback:
     """The hidden input over time or over a signal, whichever explains more for its number of knots."""
-    nominal, paths = first.nominal(), outcome.rounds[0].paths
+    nominal = first.nominal()
     rows = float(np.log(nominal.residual.size))
     best: tuple[float, str, str, Array, Regression, Array] | None = None
     signals = source_signals(first.model, slot_signals(paths))

@@ -28,9 +28,13 @@ class Outcome:
 
 def forward(search: Search, first: Refit) -> Outcome:
     """The effects that are added one after the other, each with all others refitted, until nothing is worth adding."""
-    here, rounds, kept = first, [], []
+    rounds: list[Round] = []
+    kept: list[Round] = []
+    here = first
     notes: tuple[str, ...] = ()
     for number in range(1, search.options.most + 1):
+        if kept:
+            rounds[-1] = kept[-1] = kept[-1].light()
         try:
             found = one_round(search, here, number)
         except SimulationError as error:

@@ -52,7 +52,8 @@ def settled(
             del kept[k]
             continue
         try:
-            kept[k], winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
+            again, winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
+            kept[k] = again.light()
             here = _in_place(winner.refit, k)
         except SimulationError as error:  # refitted it runs, as far as a refit needs it to
             notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")

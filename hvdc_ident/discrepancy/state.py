@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.scores import Path, Scores
+from hvdc_ident.discrepancy.scores import Path, Scores, runs
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial
 from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
@@ -57,6 +57,14 @@ class Round:
     why: str
     significant: bool
     ruler: Ruler | None
+
+    def answers(self) -> Mapping[str, Path]:
+        """How the model answers at its slots, by experiment: worked out again where the round has let go of that."""
+        return self.paths or runs(self.before.model, self.before.nominal())
+
+    def light(self) -> Round:
+        """The round without those answers, which are hundreds of MiB of a large model."""
+        return replace(self, paths={})
 
     def score_p(self, candidate: int) -> tuple[float, float, int]:
         """The best score of a candidate, its p, and the column it stands in (-1: none)."""

@@ -13,6 +13,8 @@ from hvdc_ident.discrepancy import settle
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.scores import runs
+from hvdc_ident.discrepancy.search import forward
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, clear
 from hvdc_ident.discrepancy.settle import _last, job_of, settled
 from hvdc_ident.discrepancy.state import Round, Search
@@ -117,3 +119,15 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
     found = one_round(search, two, 2)
     assert {c.at[0] for c in found.candidates} >= {"wm", "wm_before_second_order", "torque"}
     assert not {*inner} & {p for c in found.candidates for p in (*c.at, c.source)}
+
+
+def test_rounds_that_are_over_let_go_of_the_answers_and_have_them_again() -> None:
+    recorded = experiments(lag=0.03, offset=0.3)
+    first = plain(recorded)
+    search = Search(("lag", "offset"), ("wm", "drag"), FrozenMap(), Options(bootstraps=100), seed=0)
+    outcome = forward(search, first)
+    assert len(outcome.kept) == 2 and not any(r.paths for r in outcome.kept)
+    again, anew = outcome.rounds[0].answers(), runs(first.model, first.nominal())
+    assert again.keys() == anew.keys() == {"fit-1", "fit-2"}
+    for name, path in anew.items():
+        np.testing.assert_array_equal(again[name].signal("wm"), path.signal("wm"))
