@@ -35,13 +35,16 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
     alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price;
-    # nor is another form at the same place where the data would not show what the parameter does.
+    # nor is another form at the same place where the data would not show what the parameter does, nor another kind of
+    # delay there, but for one that the winner is a case of.
     weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
-    here = found.candidates[found.winner.pick.candidate].at
+    best = found.candidates[found.winner.pick.candidate]
     group: list[Rival] = []
     for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
         c = found.candidates[trial.pick.candidate]
-        more = trial.refit.count - found.winner.refit.count == 1 and (not alone or (weak and c.at == here))
+        more = trial.refit.count - found.winner.refit.count == 1 and (
+            not alone or (c.at == best.at and (weak or _other_delay(best.effect, c.effect)))
+        )
         if not good or behind > options.set_bic + (found.ruler.price if more else 0.0):
             continue
         sizes = trial.refit.sizes(trial.refit.placed[-1])
@@ -59,6 +62,12 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
         each.setdefault((r.effect, r.at, r.source), r)
     return tuple(each.values())
+
+
+def _other_delay(one: str, other: str) -> bool:
+    """Whether both are kinds of delay and the first is no special case of the other."""
+    known = effects()
+    return known[one].late is not None and known[other].late is not None and one not in known[other].widens
 
 
 def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) -> tuple[Rival, ...]:

@@ -163,7 +163,8 @@ class Effect:
     with coefficients of the user's own names. resistance: the parameter for which a resistance of the model stands in.
     restless: whether it moves the model by itself, so that a record of it does not begin at rest. late: by how long, s, it
     delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common. quick: the
-    same y of u as the equations, in numpy, where those are too many to be evaluated for thousands of sizes.
+    same y of u as the equations, in numpy, where those are too many to be evaluated for thousands of sizes. widens: effects
+    that it turns into where one of its parameters ends: what they explain it explains as well, at the price of that.
     """
 
     name: str
@@ -182,6 +183,7 @@ class Effect:
     restless: bool = False
     late: Callable[[Mapping[str, float]], float] | None = None
     quick: Callable[[Array, Mapping[str, Array]], Array] | None = None
+    widens: tuple[str, ...] = ()
 
     def late_by(self, values: Mapping[str, float]) -> float | None:
         """By how long it delays a slow signal with these values, s; None for what is no delay of any kind."""

@@ -29,6 +29,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     late=lambda p: p["T2"] - p["T1"],
+    widens=("lag",),
     sentence="{at} passes a lead-lag with T1 = {T1} and T2 = {T2}",
     excited_by="a step through the slot, recorded at several samples per time constant",
     example=FrozenMap({"T1": 0.003, "T2": 0.001}),

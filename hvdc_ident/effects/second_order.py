@@ -35,6 +35,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     late=lambda p: 2 * p["zeta"] / p["wn"],
+    widens=("lag",),
     sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}, {late} late",
     excited_by="a step through the slot, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.5}),

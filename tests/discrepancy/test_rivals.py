@@ -173,6 +173,20 @@ def test_a_form_with_a_parameter_more_is_no_less_likely_where_the_evidence_is_we
     assert [{r.effect for r in group} for group in found.ambiguity] == [{"lag", "lead-lag"}]
 
 
+def test_another_kind_of_delay_is_not_refuted_by_the_price_of_a_parameter() -> None:
+    """A window is no special case of two lags: where both explain as much, fewer parameters are no evidence."""
+    there = model().with_effects([{"effect": "second-order", "at": ["wm"], "parameters": {"wn": 700.0, "zeta": 0.82}}])
+    random, recorded = np.random.default_rng(0), []
+    for e in experiments():
+        clean = simulate(there, e, outputs=tuple(SIGMA)).trajectory
+        y = clean.values + random.standard_normal(clean.values.shape) * list(SIGMA.values())
+        recorded.append(replace(e, measured=replace(clean, values=y)))
+    found = diagnose(model(), recorded, FREE, effects=["window-mean", "second-order"], places=["wm"])
+    (group,) = found.ambiguity
+    assert [r.effect for r in group] == ["window-mean", "second-order"]
+    assert Options().set_bic < group[1].delta_bic < np.log(1800) + 1.0
+
+
 def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_them() -> None:
     """What the catalogue lacks may still be of one kind: by how long it delays is known, and that it is not all."""
     lag, delay = (Rival(e, ("wm",), 0.0, FrozenMap({"T": 0.01})) for e in ("lag", "delay"))

@@ -165,6 +165,26 @@ def test_it_changes_what_it_sits_on_and_survives_a_card(name):
     assert np.abs(mine - plain).max() > 1e-5
 
 
+WIDER = {
+    ("lead-lag", "lag"): ({"T1": 1e-9, "T2": 0.02}, {"T": 0.02}),
+    ("second-order", "lag"): ({"wn": 1e3, "zeta": 10.0}, {"T": 0.02}),
+}
+"""Values at which an effect is the one that it widens, to a few per cent."""
+
+
+def test_an_effect_turns_into_those_that_it_widens():
+    assert {(n, other) for n, e in effects().items() for other in e.widens} == set(WIDER)
+    plant = load_model("vsc-hvdc-link")
+    moved = experiment("step", np.linspace(0.0, 0.4, 201), {"Vdcref1": InputSignal.step(0.05, 1.0, 1.01)})
+    plain = simulate(plant, moved)["Irorder1"]
+    for (wide, narrow), values in WIDER.items():
+        runs = [
+            simulate(plant.with_effects([{"effect": e, "at": ["Vdc1_m"], "parameters": v}]), moved)["Irorder1"]
+            for e, v in zip((wide, narrow), values, strict=True)
+        ]
+        assert np.abs(runs[0] - runs[1]).max() < 0.05 * np.abs(runs[1] - plain).max()
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_it_describes_itself(name):
     effect = effects()[name]
