@@ -91,14 +91,14 @@ def _judged(
     one, two = couple
     ruler = Ruler.of(both)
     whole = gained(Trial(two, both, 0.0), before, ruler)
-    if against(search, before, whole, found.scores, first=True):
+    if against(search, before, whole, found, first=True):
         return None
     halves = _halves(search, before, found, couple)
     if len(halves) < 2:
         return None
     alone = min(halves, key=lambda h: h.chi2)
     trial = Trial(two, both, ruler.gain(alone.chi2, both.chi2, both.count - alone.count))
-    if against(search, alone, trial, found.scores, first=True):
+    if against(search, alone, trial, found, first=True):
         return None
     first = Trial(one, halves[0], ruler.gain(before.chi2, halves[0].chi2, halves[0].count - before.count))
     left = replace(found, trials=(first,), winner=first, ruler=ruler, same={}, why="")

@@ -11,7 +11,7 @@ from hvdc_ident.discrepancy.looks import looked
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.scores import Scores, runs, scored
+from hvdc_ident.discrepancy.scores import runs, scored
 from hvdc_ident.discrepancy.select import Ruler, Trial, behinds, best_of
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.discrepancy.tones import tones
@@ -79,7 +79,7 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
     ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
-    refused = {id(t): against(search, before, t, opened.scores, first=number == 1) for t in level}
+    refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
     winner = next((t for t in level if not refused[id(t)]), None)
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
@@ -92,8 +92,12 @@ def gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
     return replace(own, evidence=evidence(before, own, ruler.effective / ruler.rows / ruler.scale))
 
 
-def against(search: Search, before: Refit, trial: Trial, scores: Scores, *, first: bool) -> str:
-    """What speaks against naming a trial's effect; empty where nothing does."""
-    # A candidate whose answer no expansion gave was scored by its refit.
-    score = trial.pick.score or REFIT_SCORE * (before.chi2 - trial.refit.chi2)
-    return objections(before, trial, scores.p(score), search.options, search.material, first=first)
+def against(search: Search, before: Refit, trial: Trial, opened: Round, *, first: bool) -> str:
+    """What speaks against naming a trial's effect; empty where nothing does. opened: the round whose scores it has.
+
+    A refit may end at another size than it began at, so the candidate's best score counts; one whose answer no expansion
+    gave is scored by its refit.
+    """
+    best = max(trial.pick.score, opened.score_p(trial.pick.candidate)[0])
+    score = best or REFIT_SCORE * (before.chi2 - trial.refit.chi2)
+    return objections(before, trial, opened.scores.p(score), search.options, search.material, first=first)

@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.objections import as_recorded, objections
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.rounds import against, one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.discrepancy.trials import excess, like_noise, misses
@@ -232,3 +232,12 @@ def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
     assert [(r.effect, r.at, r.source, r.delta_bic, r.refitted) for r in _as_loss(found, leaks)] == [
         ("loss", ("torque",), "w", 0.5, False)
     ]
+
+
+def test_a_refit_that_began_at_a_poor_size_is_judged_by_its_candidates_best_score() -> None:
+    search = Search(("lag",), ("wm",), FrozenMap(), Options(bootstraps=100), seed=0)
+    found = one_round(search, plain(experiments(lag=0.03)), 1)
+    assert found.winner is not None
+    poor = replace(found.winner, pick=replace(found.winner.pick, score=1e-3))
+    assert found.scores.p(poor.pick.score) > 0.5
+    assert against(search, found.before, poor, found, first=True) == ""
