@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -29,17 +29,15 @@ from hvdc_ident.discrepancy import diagnose  # noqa: E402
 from hvdc_ident.study.executors.local import LocalPool  # noqa: E402
 
 
-def cases(part: str, seed: int, least: float, count: int, numbers: Sequence[int]) -> list[Case]:
-    """The first cases of a part that there are, or those of some numbers."""
-    found: list[Case] = []
+def cases(part: str, seed: int, least: float, count: int, numbers: Sequence[int]) -> Iterator[Case]:
+    """The first cases of a part that there are, or those of some numbers, each made when it is asked for."""
+    found = 0
     for design in designs(part, seed):
-        wanted = (
-            design.number in numbers if numbers else (design.size >= least or part == "clean") and len(found) < count
-        )
+        wanted = design.number in numbers if numbers else (design.size >= least or part == "clean") and found < count
         case = made(design, seed) if wanted else None
         if case is not None:
-            found.append(case)
-    return found
+            found += 1
+            yield case
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
