@@ -17,33 +17,31 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
+from diagnose import Watch
 
-STUDY = Path(__file__).resolve().parents[1] / "studies" / "hidden_effects"
-sys.path.insert(0, str(STUDY))
+from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.study.executors.local import LocalPool
 
-from diagnose import Watch  # noqa: E402
-from hidden.cases import Case, designs, made  # noqa: E402
-from hidden.diagnosing import experiments_of, free_of, model_of  # noqa: E402
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies" / "hidden_effects"))
 
-from hvdc_ident.discrepancy import diagnose  # noqa: E402
-from hvdc_ident.study.executors.local import LocalPool  # noqa: E402
+from hidden.cases import PARTS, Case, designs, made
+from hidden.diagnosing import experiments_of, free_of, model_of
+from run import pending
 
 
 def cases(part: str, seed: int, least: float, count: int, numbers: Sequence[int]) -> Iterator[Case]:
-    """The first cases of a part that there are, or those of some numbers, each made when it is asked for."""
-    found = 0
-    for design in designs(part, seed):
-        wanted = design.number in numbers if numbers else (design.size >= least or part == "clean") and found < count
-        case = made(design, seed) if wanted else None
+    """The first cases of a part, or those of some numbers, each made when it is asked for; those that no place holds are not."""
+    named = [d for d in designs(part, seed) if d.number in numbers]
+    for design in named if numbers else pending([part], seed, count, set(), least=least):
+        case = made(design, seed)
         if case is not None:
-            found += 1
             yield case
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--part", default="single")
+    parser.add_argument("--part", choices=list(PARTS), default="single")
     parser.add_argument("--cases", type=int, default=20)
     parser.add_argument("--numbers", type=int, nargs="+", default=[], help="these cases of the part instead")
     parser.add_argument("--least", type=float, default=10.0)
@@ -70,6 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             longest = sorted(watch.spent.items(), key=lambda s: -s[1][0])[:4]
             where = ", ".join(f"{phase} {seconds:.1f}" for phase, (seconds, _) in longest)
             print(f"{walls[-1]:7.1f} s  {case.design.name} {told.verdict}: {where}", flush=True)
+    if not walls:
+        parser.error("there is no such case: no number of the part, or no place holds one")
     for phase, seconds in sorted(spent.items(), key=lambda s: -s[1]):
         print(f"{seconds:8.1f} s  {phase}")
     low, middle, high = np.quantile(walls, [0.0, 0.5, 0.95])

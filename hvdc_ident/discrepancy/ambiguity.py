@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.explain import advice
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit
@@ -19,7 +20,6 @@ from hvdc_ident.trajectory import Array
 
 NEEDED = 4.0
 """Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
-
 MISSED = 0.15
 """Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
 
@@ -33,19 +33,14 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     behind_by = behinds(found.trials)
     # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
     sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
+    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
     alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
-    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price;
-    # nor is another form at the same place where the data would not show what the parameter does, nor another kind of
-    # delay there, but for one that the winner is a case of.
-    weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
-    best = found.candidates[found.winner.pick.candidate]
     group: list[Rival] = []
     for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
         c = found.candidates[trial.pick.candidate]
-        more = trial.refit.count - found.winner.refit.count == 1 and (
-            not alone or (c.at == best.at and (weak or _other_delay(best.effect, c.effect)))
-        )
-        if not good or behind > options.set_bic + (found.ruler.price if more else 0.0):
+        one_more = trial.refit.count - found.winner.refit.count == 1
+        spared = one_more and (not alone or _as_likely(found, c, options))
+        if not good or behind > options.set_bic + (found.ruler.price if spared else 0.0):
             continue
         sizes = trial.refit.sizes(trial.refit.placed[-1])
         group.append(Rival(c.effect, c.at, behind, FrozenMap(sizes), c.source))
@@ -64,10 +59,16 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     return tuple(each.values())
 
 
-def _other_delay(one: str, other: str) -> bool:
-    """Whether both are kinds of delay and the first is no special case of the other."""
-    known = effects()
-    return known[one].late is not None and known[other].late is not None and one not in known[other].widens
+def _as_likely(found: Round, other: Candidate, options: Options) -> bool:
+    """Whether a form with a parameter more is not refuted by its price though the winner is alone: at the same place, where
+    the data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
+    """
+    assert found.winner is not None and found.ruler is not None
+    best = found.candidates[found.winner.pick.candidate]
+    one, two = effects()[best.effect], effects()[other.effect]
+    weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
+    delays = one.late is not None and two.late is not None and one.name not in two.widens
+    return other.at == best.at and (weak or delays)
 
 
 def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) -> tuple[Rival, ...]:

@@ -63,6 +63,6 @@ def as_given(refit: Refit) -> Array | None:
     theta, far = refit.theta.copy(), False
     for k in gains:
         f = refit.problem.free[k]
-        far = far or abs(theta[k] - f.start) > BIASED * abs(f.start) or theta[k] in (f.min, f.max)
+        far = far or abs(theta[k] - f.start) > BIASED * abs(f.start) or f.on_bound(theta[k])
         theta[k] = f.start
     return theta if far else None

@@ -45,10 +45,9 @@ def objections(
         # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
         # nothing to say, and the fitted ones show the size. Whitening hides a slow gap in slow noise, so the records as
         # they are may show it too.
-        shown = not material and any(
-            material_gap(*gap, options.holdout_share, None, None)
-            for gap in (fitted, *((as_recorded(before, r), as_recorded(refit, r)) for r in ("fit", "holdout")))
-        )
+        then, since = as_recorded(before), as_recorded(refit)
+        gaps = (fitted, *((then.get(role), since.get(role)) for role in ("fit", "holdout")))
+        shown = not material and any(material_gap(*gap, options.holdout_share, None, None) for gap in gaps)
         if not (shown and ((was**2 - now**2) * unseen_rows(refit) > AGREED or silent(before, refit))):
             return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
     if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
@@ -78,16 +77,16 @@ def silent(before: Refit, after: Refit) -> bool:
     return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < SILENT
 
 
-def as_recorded(refit: Refit, role: str) -> float | None:
-    """The misfit of the records of a role in standard deviations of their noise, pooled and not whitened; None without any."""
+def as_recorded(refit: Refit) -> dict[str, float]:
+    """By role of the experiments their misfit in standard deviations of the noise, pooled and not whitened."""
     roles = {e.name: e.role for e in refit.problem.experiments}
-    found = [
-        (rmse / std) ** 2
-        for output, row in refit.problem.rmse(refit.theta).items()
-        for name, rmse in row.items()
-        if roles[name] == role and rmse is not None and (std := refit.noise[output].std)
-    ]
-    return float(np.sqrt(np.mean(found))) if found else None
+    squares: dict[str, list[float]] = {}
+    for output, row in refit.problem.rmse(refit.theta).items():
+        std = refit.noise[output].std
+        for name, rmse in row.items():
+            if rmse is not None and std:
+                squares.setdefault(roles[name], []).append((rmse / std) ** 2)
+    return {role: float(np.sqrt(np.mean(found))) for role, found in squares.items()}
 
 
 def worst(refit: Refit) -> dict[str, float]:

@@ -106,10 +106,8 @@ def cost_of(trial: Trial) -> float:
 
 def on_bound(refit: Refit) -> bool:
     """Whether an unknown of the fit ended on one of its bounds."""
-    return any(
-        v <= f.min or v >= f.max
-        for f, v in zip(refit.problem.free, refit.theta[: len(refit.problem.free)], strict=True)
-    )
+    free = refit.problem.free
+    return any(f.on_bound(v) for f, v in zip(free, refit.theta[: len(free)], strict=True))
 
 
 def excess(refit: Refit) -> bool:

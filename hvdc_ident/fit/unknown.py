@@ -47,6 +47,10 @@ class Free:
         fields = {"start": parameter.value, "min": parameter.min, "max": parameter.max, "scale": parameter.scale}
         return cls(name, **{**fields, **changes})
 
+    def on_bound(self, value: float) -> bool:
+        """Whether a value stands on one of the bounds."""
+        return value <= self.min or value >= self.max
+
     @property
     def log(self) -> bool:
         """Whether the unknown is scaled by its logarithm."""

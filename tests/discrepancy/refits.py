@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from cases import FREE, model
+from cases import FREE, SIGMA, TRUE, model
 
-from hvdc_ident import Experiment
+from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.nominal import nominal
@@ -21,6 +22,16 @@ def plain(records: Sequence[Experiment]) -> Refit:
     """The drive without any effect, refitted to the records."""
     start, _ = nominal(ModelSimulator(model()), records, FREE, {}, None, starts=1, seed=0, executor=None)
     return judged(Refit(model(), (), start.problem, start.noise, start.theta))
+
+
+def answered(drive: Model, records: Sequence[Experiment], seed: int) -> tuple[Experiment, ...]:
+    """The experiments with what some drive, a changed one say, answers to them, and white noise."""
+    random, found = np.random.default_rng(seed), []
+    for e in records:
+        clean = simulate(drive, e, TRUE, outputs=tuple(SIGMA)).trajectory
+        noisy = clean.values + random.standard_normal(clean.values.shape) * list(SIGMA.values())
+        found.append(replace(e, measured=replace(clean, values=noisy)))
+    return tuple(found)
 
 
 def beside(

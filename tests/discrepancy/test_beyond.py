@@ -9,10 +9,10 @@ from typing import cast
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, TRUE, experiments, model
-from refits import beside, plain
+from cases import FREE, TRUE, experiments, model
+from refits import answered, beside, plain
 
-from hvdc_ident import Experiment, InputSignal, Model, simulate
+from hvdc_ident import Experiment, InputSignal, Model
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
 from hvdc_ident.discrepancy.ambiguity import formula_rivals
 from hvdc_ident.discrepancy.formula import formula_job
@@ -69,15 +69,11 @@ def test_no_formula_is_tried_where_none_is_asked_for() -> None:
 
 def shown(changed: Model, still: str) -> tuple[Experiment, ...]:
     """Records of a changed drive, with noise, in which one input stands still and the other moves."""
-    random, found = np.random.default_rng(3), []
-    rest = {"ref": 1.0, "load": 0.3}
+    rest, moved = {"ref": 1.0, "load": 0.3}, []
     for e, change in zip(experiments(), (0.3, -0.25, 0.2), strict=True):
         moves = {n: InputSignal.step(0.3, v, v + change * (n != still)) for n, v in rest.items()}
-        e = replace(e, inputs=FrozenMap(moves))
-        clean = simulate(changed, e.with_(measured=None), TRUE, outputs=tuple(SIGMA)).trajectory
-        noisy = clean.values + random.standard_normal(clean.values.shape) * list(SIGMA.values())
-        found.append(replace(e, measured=replace(clean, values=noisy)))
-    return tuple(found)
+        moved.append(replace(e, inputs=FrozenMap(moves)))
+    return answered(changed, moved, seed=3)
 
 
 def test_a_formula_with_a_parameter_more_is_a_rival_where_it_needs_all_of_them() -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import FREE, SIGMA, TRUE, experiments, model
-from refits import beside, plain
+from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Options, diagnose
@@ -132,7 +132,7 @@ def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
     refit = run(beside(before, "offset", "drag", {"c": -0.008}, {"c": (-0.1, 0.1)}))
     assert before.holdout is not None and refit.holdout is not None
     assert 0.0 < before.holdout - refit.holdout < Options().holdout_share, "whitened there is hardly anything to see"
-    recorded = [as_recorded(r, role) for role in ("fit", "holdout") for r in (before, refit)]
+    recorded = [as_recorded(r)[role] for role in ("fit", "holdout") for r in (before, refit)]
     assert recorded[0] > 1.5 * recorded[1] and recorded[2] > 1.5 * recorded[3]
     trial = Trial(Pick(0, 0, 1.0, 500.0), refit, before.chi2 - refit.chi2)
     assert objections(before, trial, 0.005, Options(), {}, first=True) == ""
@@ -176,11 +176,7 @@ def test_a_form_with_a_parameter_more_is_no_less_likely_where_the_evidence_is_we
 def test_another_kind_of_delay_is_not_refuted_by_the_price_of_a_parameter() -> None:
     """A window is no special case of two lags: where both explain as much, fewer parameters are no evidence."""
     there = model().with_effects([{"effect": "second-order", "at": ["wm"], "parameters": {"wn": 700.0, "zeta": 0.82}}])
-    random, recorded = np.random.default_rng(0), []
-    for e in experiments():
-        clean = simulate(there, e, outputs=tuple(SIGMA)).trajectory
-        y = clean.values + random.standard_normal(clean.values.shape) * list(SIGMA.values())
-        recorded.append(replace(e, measured=replace(clean, values=y)))
+    recorded = answered(there, experiments(), seed=0)
     found = diagnose(model(), recorded, FREE, effects=["window-mean", "second-order"], places=["wm"])
     (group,) = found.ambiguity
     assert [r.effect for r in group] == ["window-mean", "second-order"]

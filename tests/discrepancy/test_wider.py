@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, model
-from refits import beside, plain
+from refits import answered, beside, plain
 from scipy.integrate import solve_ivp
 
-from hvdc_ident import Experiment, InputSignal, Trajectory, simulate
+from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.akin import as_late, with_begun
 from hvdc_ident.discrepancy.hops import hop
@@ -168,11 +168,7 @@ def test_what_looks_like_a_refit_that_ended_on_a_bound_is_refitted_too() -> None
     deaf = model().with_effects(
         [{"effect": "coupling", "at": ["err"], "parameters": {"k": -0.9}, "from": "ref"}],
     )
-    random = np.random.default_rng(0)
-    recorded = [
-        replace(e, measured=noisy(simulate(deaf, e, outputs=tuple(SIGMA)).trajectory.values, random))
-        for e in experiments()
-    ]
+    recorded = answered(deaf, experiments(), seed=0)
     search = Search(("coupling",), ("wm", "err"), FrozenMap(), Options(bootstraps=100), seed=0)
     first = plain(recorded)
     found = one_round(search, first, 1)
