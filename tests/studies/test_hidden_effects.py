@@ -31,7 +31,7 @@ from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))
 
-from hidden import cases, judging, noise, sizes
+from hidden import campaigns, cases, judging, noise, sizes
 from hidden.diagnosing import diagnosed, experiments_of, free_of, model_of
 from hidden.operators import CATALOGUE
 from hidden.plants import DRIVE, STATION
@@ -221,6 +221,28 @@ def test_a_unit_is_what_a_refit_leaves():
     assert sizes.units(base, odd[:, :, None], sigma, "white", everything)[0] == pytest.approx(5 / sizes.UNIT, rel=1e-3)
 
 
+def test_a_row_on_a_jump_has_no_size():
+    base = sizes.nominal("drive", "small", 1)
+    sigma = 0.01 * np.ptp(base.outputs[:, :2], axis=(0, 1))
+    (row,) = np.flatnonzero(sizes.on_jumps(base.runs[0]))
+    assert row == round(campaigns.EVENT / campaigns.INTERVAL)
+    assert not sizes.on_jumps(sizes.nominal("drive", "rich", 1).runs[1]).any(), "a multisine has corners and no jump"
+    odd = base.outputs[:, :2].copy()
+    odd[row, 0, 0] += 50 * sigma[0]
+    for kind in noise.KINDS:
+        assert sizes.units(base, odd[:, :, None], sigma, kind, (0, 1, 2))[0] < 1e-9
+
+
+def test_correlated_noise_is_white_across_a_row_left_out():
+    e = noise.added(np.random.default_rng(0), np.zeros((60_000, 1)), np.array([0.5]), "ar", 0)[:, :, None]
+    gone = np.arange(60_000)[:, None] % 3 == 1
+    white = noise.whitened(e, np.array([0.5]), "ar", gone)[:, :, 0]
+    assert not white[gone].any()
+    kept = white[~gone]
+    assert kept.std() == pytest.approx(1.0, abs=0.01)
+    assert abs(np.corrcoef(kept[1:], kept[:-1])[0, 1]) < 0.01
+
+
 @pytest.mark.parametrize("kind", [*noise.KINDS, *noise.WRONG])
 def test_noise_is_what_it_says(kind):
     rng = np.random.default_rng(0)
@@ -330,13 +352,19 @@ def refitted_plain(case):
     return judged(Refit(model, (), start.problem, start.noise, start.theta))
 
 
+def holding(case, hidden, excitation, variant, level, kind="white"):
+    """The station's case with another effect hidden, its campaign and its noise, which nothing tells."""
+    runs = sizes.nominal("station", excitation, variant).runs
+    clean = simulate(STATION, runs, [hidden])
+    sigma = level * np.ptp(clean, axis=(0, 1))
+    random = np.random.default_rng(0)
+    records = np.stack([noise.added(random, clean[:, k], sigma, kind, 50) for k in range(3)], axis=1)
+    return replace(case, hidden=(hidden,), runs=runs, records=records, clean=clean, sigma=sigma, told=None)
+
+
 def test_levels_are_met_that_a_loop_slides_between(large):
     """A line current in steps of 0.064: the dc voltage rests on edges, and the search begins from fewer, wider levels."""
-    runs = sizes.nominal("station", "rich", 0).runs
-    clean = simulate(STATION, runs, [Hidden("quantisation", "Iline", {"step": 0.0638})])
-    sigma = 1e-3 * np.ptp(clean, axis=(0, 1))
-    records = clean + sigma * np.random.default_rng(0).standard_normal(clean.shape)
-    case = replace(large, runs=runs, records=records, clean=clean, sigma=sigma, told=sigma)
+    case = holding(large, Hidden("quantisation", "Iline", {"step": 0.0638}), "rich", 0, 1e-3)
     model, before = model_of("station"), refitted_plain(case)
     probe = Probe("quantisation", FrozenMap({"step": 0.08}), FrozenMap({"step": (1e-3, 0.5)}))
     wider, problem, placed, begin = added(
@@ -348,10 +376,9 @@ def test_levels_are_met_that_a_loop_slides_between(large):
     assert found.chi2 < 0.05 * run(job).chi2
 
 
-def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere():
+def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
     """A rate limit at an integrator in its loop: slower it bends all, faster it does nothing, and no slope leads back."""
-    case = cases.made(cases.designs("single", 24)[175], 24)
-    assert case is not None and case.hidden[0].effect == "rate-limit" and case.hidden[0].at == "xi"
+    case = holding(large, Hidden("rate-limit", "xi", {"rate": 1.4}), "small", 3, 2e-3, "ar")
     before, options = refitted_plain(case), Options()
     search = Search(("rate-limit", "lag"), None, FrozenMap(), options, 0)
     found = one_round(search, before, 1)

@@ -13,7 +13,7 @@ from hidden.campaigns import summary
 from hidden.cases import Case
 from hidden.noise import whitened
 from hidden.plants import PLANTS
-from hidden.sizes import UNIT, WIDTH
+from hidden.sizes import UNIT, WIDTH, on_jumps
 from hvdc_ident import simulate
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse, effects
@@ -141,7 +141,10 @@ def _misfit(model: Any, experiments: Sequence[Experiment], case: Case, values: M
 
 
 def _apart(model: Any, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
-    """How far the model's answer to the three records lies from the hidden one without noise, in units; None where it cannot run."""
+    """How far the model's answer to the three records lies from the hidden one without noise, in units; None where it cannot run.
+
+    Rows on a jump of an input do not count: no record tells them.
+    """
     off = np.zeros_like(case.clean)
     for k, e in enumerate(experiments):
         try:
@@ -149,7 +152,8 @@ def _apart(model: Any, experiments: Sequence[Experiment], case: Case, values: Ma
         except HvdcIdentError:
             return None
         off[:, k, list(case.channels)] = run.trajectory.values - case.clean[:, k, list(case.channels)]
-    return float(np.linalg.norm(whitened(off, case.sigma, case.design.noise)) / UNIT)
+    gone = np.stack([on_jumps(run) for run in case.runs], axis=1)
+    return float(np.linalg.norm(whitened(off, case.sigma, case.design.noise, gone)) / UNIT)
 
 
 def _sindy(

@@ -34,12 +34,20 @@ def added(rng: np.random.Generator, clean: Array, sigma: Array, kind: str, event
     return clean + sigma * e
 
 
-def whitened(difference: Array, sigma: Array, kind: str) -> Array:
-    """A difference (rows, ..., outputs) in units of independent noise."""
+def whitened(difference: Array, sigma: Array, kind: str, gone: NDArray[np.bool_] | None = None) -> Array:
+    """A difference (rows, runs, ..., outputs) in units of independent noise. gone: (rows, runs), rows left out, which are 0.
+
+    What is correlated counts from the last row that is there.
+    """
     d = difference / sigma
     if kind == "ar":
-        d = d.copy()
-        d[1:] = (d[1:] - RHO * (difference / sigma)[:-1]) / np.sqrt(1.0 - RHO**2)
+        gone = np.zeros(d.shape[:2], dtype=bool) if gone is None else gone
+        for run in range(d.shape[1]):
+            rows = np.flatnonzero(~gone[:, run])
+            share = (RHO ** np.diff(rows)).reshape(-1, *[1] * (d.ndim - 2))
+            d[rows[1:], run] = (d[rows[1:], run] - share * d[rows[:-1], run]) / np.sqrt(1.0 - share**2)
     elif kind == "quantised":
         d = d / np.sqrt(1.0 + 12.0 * 0.25**2)
-    return d
+    if gone is not None:
+        d[gone] = 0.0
+    return np.asarray(d)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,12 @@ class Signal:
         span = times[high] - times[low]
         share = np.where(span > 0, (t - times[low]) / np.where(span > 0, span, 1.0), 0.0)
         return np.where(right == 0, values[0], values[low] + np.clip(share, 0, 1) * (values[high] - values[low]))
+
+    @property
+    def jumps(self) -> tuple[float, ...]:
+        """The times that stand twice."""
+        times = [t for t, _ in self.points]
+        return tuple(a for a, b in pairwise(times) if a == b)
 
 
 @dataclass(frozen=True)

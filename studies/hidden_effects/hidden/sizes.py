@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hidden.campaigns import campaign
+from hidden.campaigns import INTERVAL, ROWS, campaign
 from hidden.noise import whitened
 from hidden.operators import WITH_SOURCE
 from hidden.plants import PLANTS, Plant
@@ -182,17 +182,24 @@ def about(base: Nominal, at: str, source: str) -> About:
     )  # fmt: skip
 
 
+def on_jumps(run: Run) -> NDArray[np.bool_]:
+    """(rows,) whether a row lies on a jump of an input: no recording says which of its sides such a row shows."""
+    rows = [round(t / INTERVAL) for signal in run.inputs.values() for t in signal.jumps]
+    return np.isin(np.arange(ROWS), rows)
+
+
 def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Sequence[int]) -> Array:
     """(n,) the post-refit size of each answer, in units. answer: (rows, 2, n, outputs) of the fitted experiments.
 
     What the plant without effects, refitted, leaves of the answer. Where a linear step moves no parameter far it is
-    taken for the refit; else the refit is run, within the bounds a fit has.
+    taken for the refit; else the refit is run, within the bounds a fit has. Rows on a jump of an input do not count.
     """
     pick = list(channels)
+    gone = np.stack([on_jumps(run) for run in base.runs[:2]], axis=1)
 
     def residual(y: Array) -> Array:
         """(N, n) of outputs (rows, 2, n, outputs)."""
-        d = whitened(y, sigma, kind)[..., pick]
+        d = whitened(y, sigma, kind, gone)[..., pick]
         return np.asarray(d.transpose(0, 1, 3, 2).reshape(-1, y.shape[2]))
 
     logs = np.array([base.plant.parameters[p] for p in base.plant.fitted])[:, None]
