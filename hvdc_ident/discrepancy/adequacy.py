@@ -13,6 +13,10 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.trajectory import Array
 
 BINS = 8
+AFTER = 10
+"""Rows after a break of an input in which a quick answer to it is looked for."""
+LOUDER = 4.0
+"""Standard deviations by which they have to be louder than the others."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,26 @@ def adequacy(
     for name, by_experiment in signals.items():
         groups[f"level of {name}"] = _level_bins(nominal, by_experiment)
     return tuple(_binned(n, g, nominal.residual, noise) for n, g in groups.items() if g.max(initial=-1) >= 0)
+
+
+def loud_after_breaks(nominal: Nominal) -> bool:
+    """Whether what is left is louder in the first rows after a break of an input than in the others, by more than chance.
+
+    However loud the noise is, it knows nothing of the inputs; what answers within a few rows hardly shows in sums over more.
+    """
+    experiments = {e.name: e for e in nominal.problem.fitted_experiments}
+    near, squares = [], []
+    for b in nominal.blocks:
+        e = experiments[b.experiment]
+        breaks = [t for signal in e.inputs.values() for t in signal.breaks.tolist() if t > e.time[0]]
+        first = np.searchsorted(e.time[b.rows], breaks)
+        near.append(np.isin(np.arange(b.rows.size), np.add.outer(first, np.arange(AFTER))))
+        squares.append(b.squares)
+    at, power = np.concatenate(near), np.concatenate(squares)
+    if not at.any() or at.all():
+        return False
+    limit = 1.0 + LOUDER * float(np.sqrt(2.0 / np.count_nonzero(at)))
+    return bool(np.mean(power[at]) > limit * np.mean(power[~at]))
 
 
 def _binned(name: str, group: NDArray[np.intp], residual: Array, noise: Array) -> Binned:

@@ -20,6 +20,8 @@ from hvdc_ident.trajectory import Array
 
 NEEDED = 4.0
 """Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
+SLIGHT = 1e-3
+"""Share of what a form explains by which a formula may explain more and not refute it: of so much the noise is not known."""
 MISSED = 0.15
 """Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
 
@@ -72,17 +74,18 @@ def _as_likely(found: Round, other: Candidate, options: Options) -> bool:
 
 
 def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) -> tuple[Rival, ...]:
-    """The winner with the formulas outside the catalogue that are within delta BIC of it; () where one is further ahead of it.
+    """The winner with the formulas outside the catalogue that are near it in BIC; () where one is further ahead of it.
 
     formulas: refitted in the winner's stead. One that explains as much with a parameter more, and would not without any of
     its own, is not refuted by the price of that: of a product around its operating point a gain makes a coupling.
     """
     assert found.winner is not None and found.ruler is not None
     own, *behind = behinds([found.winner, *formulas])
-    if own > options.set_bic:
+    within = max(options.set_bic, SLIGHT * found.winner.told)
+    if own > within:
         return ()
     one_more = [t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit) for t in formulas]
-    limits = [options.set_bic + (found.ruler.price if more else 0.0) for more in one_more]
+    limits = [within + (found.ruler.price if more else 0.0) for more in one_more]
     near = [(b, t) for b, t, limit in zip(behind, formulas, limits, strict=True) if b <= limit]
     return tuple(sorted((_rival(found.winner, own), *(_rival(t, b) for b, t in near)), key=lambda r: r.delta_bic))
 

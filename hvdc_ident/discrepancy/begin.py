@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,24 +39,32 @@ class Placed:
 
 
 def added(
-    model: AnyModel, problem: Problem, candidate: Candidate, probe: int, factor: float
+    model: AnyModel,
+    problem: Problem,
+    candidate: Candidate,
+    probe: int,
+    factor: float,
+    made: dict[Hashable, AnyModel] | None = None,
 ) -> tuple[AnyModel, Problem, Placed, Array]:
     """The model and problem with one more effect, and where it starts: the probe, or the size the score asks for.
 
+    made: models made of this one before, to which this may add another: one of an effect serves for all its free sizes.
     Raises ModelError where the effect cannot be put there.
     """
     candidate = reaching(candidate, probe, factor)
     chosen = candidate.probes[probe]
     values = moved(candidate, probe, factor)
     use = candidate.use(replace(chosen, values=FrozenMap(values)))
-    before = set(model.parameters)
-    larger = model.with_effects([use])
-    new = [n for n in larger.parameters if n not in before]
     present = [
         n
         for n in effects()[candidate.effect].parameters
         if n not in candidate.named and not _absent(candidate, n, values)
     ]
+    settled = tuple((n, values[n]) for n in present if n not in chosen.free)
+    key = (candidate.effect, candidate.at, candidate.source, candidate.named, tuple(present), settled)
+    made = {} if made is None else made
+    larger = made[key] = made.get(key) or model.with_effects([use])
+    new = [n for n in larger.parameters if n not in model.parameters]
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
     free = tuple(Free(names[n], values[n], low, high) for n, (low, high) in bounds.items())

@@ -16,6 +16,7 @@ from hvdc_ident.discrepancy.scores import Path, runs
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.model.definition import Model
 
@@ -25,15 +26,17 @@ def closer_look(
 ) -> tuple[Round, tuple[Pick, ...]]:
     """The round with the sizes that a closer look found, and the picks to refit for them. wanted: what is looked at."""
     before, found, options = opened.before, opened.candidates, search.options
+    known = {(c.effect, c.at): k for k, c in enumerate(found)}
+    # Their many sizes are made for those alone that are to be looked at.
+    asked = [c for c in found if effects()[c.effect].scanned and _worth_a_scan(c) and wanted(c)]
     dense = candidates(
         before.model,
         slot_signals(opened.paths, before.placed),
         [a.time for a in opened.paths.values()],
-        search.effects,
-        search.places,
+        list(dict.fromkeys(c.effect for c in asked)),
+        list(dict.fromkeys(c.at for c in asked)),
         closer=True,
     )
-    known = {(c.effect, c.at): k for k, c in enumerate(found)}
     dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(c))
     if all(isinstance(p, Along) for p in opened.paths.values()):
         dense += tuple(widened(c) for c in found if not c.still and bent(c))

@@ -7,20 +7,29 @@ sizes around are run again, and the refit goes on from the best.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.objections import unseen_rows
-from hvdc_ident.discrepancy.refit import Found, Job, Refit, found_by, of_held_out, run, signal
+from hvdc_ident.discrepancy.race import done
+from hvdc_ident.discrepancy.refit import Job, Refit, judged, of_held_out, signal
 from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, by_level, sized
+from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import SlotSignal, effects, probes
-from hvdc_ident.errors import SimulationError
+from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.executor import mapped
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
+
+K = TypeVar("K", bound=Hashable)
+Data = Literal["fitted", "held out", "all"]
 
 HOPS = 3
 """Times that a better size is looked for."""
@@ -44,30 +53,65 @@ PATIENT = replace(QUICK, max_steps=5000, search=True)
 """A record that never rests crosses hundreds of levels."""
 BETTER = 0.02
 """Share by which chi2 has to fall for another hop."""
+COUNTS = 12
+"""Numbers of steps, on either side of the one there is, that a level may be from 0."""
+UNSURE = 3.0
+"""Standard deviations within which sizes are one to the fitted data."""
+PIECE = 30
+"""Sizes that are looked at in one go, wherever that is done."""
 
 
-def hop(job: Job) -> Found:
-    """What a refit comes to that looks for its last effect's size again, as long as that helps, and once very closely."""
-    here = run(job)
-    if here.failure:
-        return found_by(here)
+def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Refit]:
+    """What refits come to that look for their last effect's size again, as long as that helps, and once very closely.
+
+    All of them go from look to look together, for a look at one is many runs. texts: what whoever watches is told of each.
+    """
+    here = dict(enumerate(done(search, jobs, texts)))
+    stuck = {k: r for k, r in here.items() if r.failure}
+    here = {k: r for k, r in here.items() if not r.failure}
+
+    def further(refits: Mapping[int, Refit], grid: Callable[[Refit], Array], teeth: int = TEETH) -> dict[int, Refit]:
+        begins = _begins(
+            search, refits, {k: _grid(grid, r) for k, r in refits.items()}, teeth, grid is not _other_counts
+        )
+        return _further(search, jobs, texts, refits, begins)
+
+    counted = [k for k, r in here.items() if by_level(r.placed[-1].candidate)]
+    here |= further({k: here[k] for k in counted}, _levels, OF_LEVELS)
+    moving = here
+    for _ in range(HOPS):
+        there = further(moving, _around)
+        moving = {k: r for k, r in there.items() if _left(r) < (1.0 - BETTER) * _left(here[k])}
+        here = here | moving
+    here = further(here, _closely)
+    here |= further({k: here[k] for k in counted}, _other_counts)
+    found = stuck | _agreed(search, here)
+    return [found[k] for k in range(len(jobs))]
+
+
+def _further(
+    search: Search,
+    jobs: Sequence[Job],
+    texts: Sequence[str],
+    here: Mapping[int, Refit],
+    begins: Mapping[int, Sequence[Array]],
+) -> dict[int, Refit]:
+    """By job the best refit from where it begins, or the one there is."""
+    each = [(k, replace(jobs[k], begins=(b,), spare=())) for k, own in begins.items() for b in own]
+    ends = done(search, [job for _, job in each], [texts[k] for k, _ in each])
+    found = dict(here)
+    for (k, _), end in zip(each, ends, strict=True):
+        if not end.failure and _left(end) < _left(found[k]):
+            found[k] = end
+    return found
+
+
+def _grid(of: Callable[[Refit], Array], refit: Refit) -> Array:
+    """Sizes to look at; none where the refit runs and the slot's signal by itself does not: what is counted is not known then."""
     try:
-        if by_level(here.placed[-1].candidate):
-            here = _from(job, here, _levels(here), OF_LEVELS)
-        for _ in range(HOPS):
-            there = _from(job, here, _around(here))
-            if not _left(there) < (1.0 - BETTER) * _left(here):
-                break
-            here = there
-        return found_by(_from(job, here, _closely(here)))
-    except SimulationError:  # the refit runs, the slot's signal by itself does not: what is to be counted is not known
-        return found_by(here)
-
-
-def _from(job: Job, here: Refit, grid: Array, teeth: int = TEETH) -> Refit:
-    """The best refit from the best sizes of a grid, or the one there is."""
-    ends = [run(replace(job, begins=(begin,), spare=())) for begin in _begins(here, grid, teeth)]
-    return min((r for r in [here, *ends] if not r.failure), key=_left)
+        return of(refit)
+    except SimulationError:
+        return np.empty(0)
 
 
 def _left(refit: Refit) -> float:
@@ -99,6 +143,43 @@ def _closely(here: Refit) -> Array:
     return 1.0 / np.linspace(1.0 / min(high, own * CLOSE), 1.0 / max(low, own / CLOSE), count)
 
 
+def _other_counts(here: Refit) -> Array:
+    """Steps with which the level that the signal rests at stands where it does, as another number of steps from 0."""
+    _, own, low, high = _size(here)
+    rest = next(iter(signal(here, here.placed[-1].use.at[0]).values()))[0]
+    count = round(abs(float(rest)) / own)
+    if count <= 1:
+        return np.empty(0)
+    counts = np.arange(max(count - COUNTS, 1), count + COUNTS + 1)
+    sizes = own * count / counts
+    return np.sort(sizes[(sizes > low) & (sizes < high)])
+
+
+def _agreed(search: Search, refits: Mapping[int, Refit]) -> dict[int, Refit]:
+    """The refits, each at the size that suits all data best of those that the fitted ones do not tell apart.
+
+    Where a level or a sample falls on the other side of an edge a row jumps, whatever the standard deviation.
+    """
+    grids = {k: _within(r) for k, r in refits.items()}
+    left = _looked(search, refits, grids, "all")
+    found = dict(refits)
+    for k, r in refits.items():
+        if grids[k].size:
+            theta = r.theta.copy()
+            theta[_size(r)[0]] = grids[k][np.argmin(left[k])]
+            with suppress(HvdcIdentError):  # it stays where it runs
+                there = judged(replace(r, theta=theta))
+                found[k] = min(r, there, key=_left)
+    return found
+
+
+def _within(here: Refit) -> Array:
+    """Sizes within the uncertainty of the one there is; none where that is not known."""
+    _, own, low, high = _size(here)
+    std = here.std.get(here.placed[-1].names[sized(here.placed[-1].candidate)])
+    return np.empty(0) if not std else np.clip(own + std * np.linspace(-UNSURE, UNSURE, PIECE), low, high)
+
+
 def _size(here: Refit) -> tuple[int, float, float, float]:
     """Of the size that has to be met: its place among the unknowns, its value, its bounds."""
     placed = here.placed[-1]
@@ -118,25 +199,66 @@ def _held(here: Refit) -> float:
     return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
 
 
-def _begins(here: Refit, grid: Array, teeth: int) -> list[Array]:
-    """Unknowns with the best sizes of a grid, those the refit has and those that were given."""
-    if grid.size < 2:
-        return []
-    at = _size(here)[0]
-    left = _Left.of(here, at)
-    rough = np.array([left.fitted(float(s)) for s in grid])
-    padded = np.concatenate([[np.inf], rough, [np.inf]])
-    least = [k for k in np.argsort(rough) if np.isfinite(rough[k]) and rough[k] <= min(padded[k], padded[k + 2])]
-    best = sorted(least[: AMONG * teeth], key=lambda k: rough[k] + left.unseen(float(grid[k])))
-    begins, given = [], as_given(here)
-    for k in best[:teeth]:
-        beside = np.geomspace(grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)], 2 * BETWEEN + 1)
-        size = min(beside, key=left)
-        for theta in (here.theta, given):
+def _begins(
+    search: Search, here: Mapping[int, Refit], grids: Mapping[int, Array], teeth: int, between: bool
+) -> dict[int, list[Array]]:
+    """By job unknowns with the best sizes of a grid, those the refit has and those that were given.
+
+    between: whether the best may lie between sizes of the grid, so that of neighbours one is enough and they are looked
+    at closer; else each of the grid is the best of its kind.
+    """
+    asked = {k: g for k, g in grids.items() if g.size > 1}
+    rough = _looked(search, here, asked, "fitted")
+    tops = {}
+    for k, left in rough.items():
+        padded = np.concatenate([[np.inf], left, [np.inf]])
+        least = [
+            n
+            for n in np.argsort(left)
+            if np.isfinite(left[n]) and (not between or left[n] <= min(padded[n], padded[n + 2]))
+        ]
+        tops[k] = np.array(least[: AMONG * teeth], dtype=int)
+    unseen = _looked(search, here, {k: asked[k][n] for k, n in tops.items()}, "held out")
+    best = {k: n[np.argsort(rough[k][n] + unseen[k], kind="stable")][:teeth] for k, n in tops.items()}
+    beside = {(k, n): _beside(asked[k], n) if between else asked[k][[n]] for k, own in best.items() for n in own}
+    seen = _looked(search, {key: here[key[0]] for key in beside}, beside, "all") if between else {}
+    begins: dict[int, list[Array]] = {k: [] for k in asked}
+    for (k, n), sizes in beside.items():
+        for theta in (here[k].theta, as_given(here[k])):
             if theta is not None:
-                begins.append(theta.copy())
-                begins[-1][at] = size
+                begins[k].append(theta.copy())
+                begins[k][-1][_size(here[k])[0]] = sizes[np.argmin(seen[k, n])] if between else sizes[0]
     return begins
+
+
+def _beside(grid: Array, n: int) -> Array:
+    """Sizes from one neighbour of a grid's to the other."""
+    return np.geomspace(grid[max(n - 1, 0)], grid[min(n + 1, grid.size - 1)], 2 * BETWEEN + 1)
+
+
+def _looked(search: Search, here: Mapping[K, Refit], grids: Mapping[K, Array], what: Data) -> dict[K, Array]:
+    """By key what is left at each size of a grid, wherever that is worked out."""
+    cuts = {k: [g[n : n + PIECE] for n in range(0, g.size, PIECE)] for k, g in grids.items()}
+    pieces = [_Piece(here[k], c, what) for k, own in cuts.items() for c in own]
+    found = mapped(search.executor, _left_at, pieces)
+    return {k: np.concatenate([np.empty(0), *(next(found) for _ in own)]) for k, own in cuts.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Some sizes beside the unknowns of a refit, and the data of which is asked what they leave."""
+
+    refit: Refit
+    sizes: Array
+    what: Data
+
+
+def _left_at(piece: _Piece) -> Array:
+    """What is left at each size; infinite for one that could not be run."""
+    left = _Left.of(piece.refit, _size(piece.refit)[0])
+    asked: dict[Data, Callable[[float], float]] = {"fitted": left.fitted, "held out": left.unseen, "all": left}
+    of = asked[piece.what]
+    return np.array([of(float(s)) for s in piece.sizes])
 
 
 @dataclass(frozen=True, eq=False)

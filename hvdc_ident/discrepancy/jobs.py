@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
@@ -11,23 +11,29 @@ from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.refit import Job, Refit
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.trajectory import Array
 
 BIASED = 0.4
 """Share of its start value by which a gain has moved when it may have taken an effect's place."""
 
 
-def job(before: Refit, found: Sequence[Candidate], picks: Sequence[Pick]) -> Job:
+def job(
+    before: Refit, found: Sequence[Candidate], picks: Sequence[Pick], made: dict[Hashable, AnyModel] | None = None
+) -> Job:
     """The refit of a model with some more effects, from where their scores put them.
 
     Gains that have taken an effect's place hold the refit where they are: where one has moved far, or stands on a bound,
     another start is with the gains as they were given. A single effect, too, begins a second time where the score asks for a
     size far from the one probed, and is not right at every size; where a model does not run at its size, it begins at the
-    next of those probed. Raises ModelError where an effect cannot sit there.
+    next of those probed. made: models with the first of the picks, which may be used again, and are added to.
+    Raises ModelError where an effect cannot sit there.
     """
     model, problem, placed, sizes = before.model, before.problem, list(before.placed), []
-    for p in picks:
-        model, problem, one, start = added(model, problem, found[p.candidate], p.probe, p.factor)
+    for n, p in enumerate(picks):
+        model, problem, one, start = added(
+            model, problem, found[p.candidate], p.probe, p.factor, made if n == 0 else None
+        )
         placed.append(one)
         sizes.append(start)
     asked = np.concatenate(sizes)

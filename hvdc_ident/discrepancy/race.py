@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hvdc_ident.discrepancy.refit import Found, Job, Refit, find
+from hvdc_ident.discrepancy.refit import Job, Refit, find
 from hvdc_ident.fit.executor import mapped
 
 if TYPE_CHECKING:
@@ -58,11 +58,11 @@ def _on(
     return [better.get(k, r) for k, r in enumerate(refits)]
 
 
-def done(search: Search, jobs: Sequence[Job], texts: Sequence[str], how: Callable[[Job], Found] = find) -> list[Refit]:
+def done(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Refit]:
     """The jobs' refits, in their order, wherever they are done."""
     if jobs:
         search.tell(0, len(jobs), texts[0])
-    outcomes = mapped(search.executor, how, jobs)
+    outcomes = mapped(search.executor, find, jobs)
     refits = []
     for k, (job, outcome) in enumerate(zip(jobs, outcomes, strict=True)):
         search.tell(k + 1, len(jobs), texts[k])

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.flicker import told_again
 from hvdc_ident.discrepancy.looks import looked
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
@@ -19,6 +20,8 @@ from hvdc_ident.discrepancy.trials import all_far, excess, like_noise, once_more
 
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
+LEAST_SCORE = 0.1
+"""The same where there is one: the sizes that it is of may be none that the refit came to, as of a moving mean's zeros."""
 NEARLY = 0.1
 """Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
 
@@ -76,6 +79,8 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
         return replace(opened, failed=failed, why="no candidate could be refitted")
+    opened, sound = _told_again(search, opened, sound)
+    before = opened.before
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
     ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
@@ -83,6 +88,16 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     winner = next((t for t in level if not refused[id(t)]), None)
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
+
+
+def _told_again(search: Search, opened: Round, sound: Sequence[Trial]) -> tuple[Round, list[Trial]]:
+    """The round and its refits, by the noise of rounded records that the best refit leaves."""
+    before, refits = told_again(search.executor, opened.before, [t.refit for t in sound])
+    if before is opened.before:
+        return opened, list(sound)
+    scores = opened.scores.in_louder_noise(min(before.chi2 / opened.before.chi2, 1.0))
+    opened = replace(opened, before=before, scores=scores)
+    return opened, [replace(t, refit=r) for t, r in zip(sound, refits, strict=True)]
 
 
 def gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
@@ -96,8 +111,8 @@ def against(search: Search, before: Refit, trial: Trial, opened: Round, *, first
     """What speaks against naming a trial's effect; empty where nothing does. opened: the round whose scores it has.
 
     A refit may end at another size than it began at, so the candidate's best score counts; one whose answer no expansion
-    gave is scored by its refit.
+    gave is scored by its refit. Where a refit brings many times what scores do at the sizes tried, these were the wrong ones.
     """
-    best = max(trial.pick.score, opened.score_p(trial.pick.candidate)[0])
-    score = best or REFIT_SCORE * (before.chi2 - trial.refit.chi2)
+    best, fall = max(trial.pick.score, opened.score_p(trial.pick.candidate)[0]), before.chi2 - trial.refit.chi2
+    score = max(best, LEAST_SCORE * fall) if best else REFIT_SCORE * fall
     return objections(before, trial, opened.scores.p(score), search.options, search.material, first=first)

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.adequacy import adequacy
-from hvdc_ident.discrepancy.hops import hop
+from hvdc_ident.discrepancy.adequacy import adequacy, loud_after_breaks
+from hvdc_ident.discrepancy.hops import hopped
 from hvdc_ident.discrepancy.jobs import job
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import unseen_rows
-from hvdc_ident.discrepancy.race import Race, done
+from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Job, Refit, of_held_out, unseen
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.model.external import AnyModel
 
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4, second=20)
@@ -48,9 +49,10 @@ def refitted(
     """The picks refitted, in a race with each other and with those refitted earlier."""
     before, found = opened.before, opened.candidates
     jobs, of, trials = [], [], []
+    made: dict[Hashable, AnyModel] = {}
     for p in picks:
         try:
-            jobs.append(job(before, found, [p]))
+            jobs.append(job(before, found, [p], made))
             of.append(p)
         except HvdcIdentError as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
@@ -78,7 +80,7 @@ def once_more(
             chosen[effect].append(t)
     again = [t for group in chosen.values() for t in group]
     jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
-    refits = done(search, jobs, [f"{text}: {found[t.pick.candidate].label}" for t in again], hop)
+    refits = hopped(search, jobs, [f"{text}: {found[t.pick.candidate].label}" for t in again])
     better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
     return [better.get(id(t), t) for t in trials]
 
@@ -143,7 +145,8 @@ def like_noise(refit: Refit) -> bool:
     seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
     if seen > LOUD or refit.correlation > FAINT or (now is not None and now**2 > LOUD * seen):
         return False
-    if not shapeless(refit.nominal(), 0):
+    left = refit.nominal()
+    if loud_after_breaks(left) or not shapeless(left, 0):
         return False
     if not misses(refit):
         return True

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from hvdc_ident.discrepancy.adequacy import Binned, adequacy
+from hvdc_ident.discrepancy.adequacy import Binned, adequacy, loud_after_breaks
 from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.beyond import beyond
 from hvdc_ident.discrepancy.noise import FEWEST
@@ -78,7 +78,8 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     if better is not None:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better)
-    return _named(labels, sets, tests, explained, options)
+    found = _named(labels, sets, tests, explained, options)
+    return _in_doubt(found, labels) if found.verdict == "named" and loud_after_breaks(last.nominal()) else found
 
 
 def _with_formulas(
@@ -121,6 +122,16 @@ def _named(
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
+
+
+def _in_doubt(found: Judgement, labels: str) -> Judgement:
+    """Ambiguous, though nothing else that was tried explains as much: in the first rows after a break something quicker shows."""
+    text = (
+        f"Missing: something like {labels}; the first rows after the inputs' breaks are still louder than the others, so it "
+        f"may stand for a quicker form that is none of those tried."
+    )
+    advice = {"text": "The same steps, recorded ten times as densely for the first tenth of a second."}
+    return replace(found, verdict="ambiguous", text=text, experiment=advice)
 
 
 def _stand_in(labels: str, left: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...]) -> Judgement:

@@ -144,14 +144,14 @@ def residual_blocks(
         assert experiment.measured is not None
         misfit = experiment.measured[output][rows] - seen.values[output][rows]
         weight, time, where = sigma[output], experiment.time[rows], f"experiment '{experiment.name}'"
-        residual = treatment.applied(misfit / weight, time, output, where)
-        jacobian = treatment.applied(-seen.gradient[output][rows] / weight, time, output, where)
-        block = Block(experiment.name, output, rows, misfit, weight, residual, jacobian)
+        slopes = -seen.gradient[output][rows]
+        treated = treatment.applied(np.column_stack([misfit, slopes]) / weight, time, output, where)
+        block = Block(experiment.name, output, rows, misfit, weight, treated[:, 0].copy(), treated[:, 1:])
         rounding = treatment.rounded(output)
         if rounding is not None:
             residual, slope = rounding.residual(misfit)
-            jacobian = -seen.gradient[output][rows] * slope[:, None]
+            jacobian = slopes * slope[:, None]
             block = replace(block, residual=residual, jacobian=jacobian, slope=slope, spare=rounding.spare)
         blocks.append(block)
-        raw.append(-seen.gradient[output][rows, k : k + len(loose)])
+        raw.append(slopes[:, k : k + len(loose)])
     return freed(blocks, raw, slice(k, k + len(loose))) if loose else tuple(blocks)

@@ -26,15 +26,22 @@ UNEVEN = 0.02
 """Steps may differ from the median by this share."""
 
 
-def segments(time: Array, where: str) -> list[slice]:
+def segments(time: Array, where: str) -> tuple[slice, ...]:
     """The stretches of evenly spaced rows; a gap, or a second row at one instant, begins a new one.
 
     Raises StudyError where steps within a stretch differ: an AR model from row to row would then mean nothing.
     """
+    return _segments(np.asarray(time, dtype=float).tobytes(), where)
+
+
+@lru_cache(maxsize=256)
+def _segments(instants: bytes, where: str) -> tuple[slice, ...]:
+    """Those of the bytes of the instants: a fit asks for the same ones at every step."""
+    time = np.frombuffer(instants)
     steps = np.diff(time)
     positive = steps[steps > 0]
     if not positive.size:
-        return [slice(k, k + 1) for k in range(time.size)]
+        return tuple(slice(k, k + 1) for k in range(time.size))
     median = float(np.median(positive))
     cut = (steps <= 0) | (steps > GAP * median)
     inner = steps[~cut]
@@ -47,7 +54,7 @@ def segments(time: Array, where: str) -> list[slice]:
             hint="resample the record, or leave `whiten` out: intervals are then corrected for correlated samples",
         )
     ends = [0, *(np.flatnonzero(cut) + 1).tolist(), time.size]
-    return [slice(a, b) for a, b in pairwise(ends)]
+    return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
 def whitened(signal: Array, model: AR, parts: Sequence[slice] | None = None) -> Array:

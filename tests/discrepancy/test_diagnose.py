@@ -120,7 +120,8 @@ def test_forms_that_are_alike_and_not_all_of_it_are_a_set_that_says_so() -> None
     assert not found.remaining["adequate"]
     assert 0.02 < found.effects[0].parameters["T"].value < 0.06
     both = diagnose(model(), experiments(lag=0.05), FREE, effects=["delay"], places=["wm", "err", "torque"])
-    assert both.verdict == "named" and "It is not all of it" in both.text
+    assert both.verdict == "ambiguous" and "a quicker form" in both.text
+    assert "as densely" in both.separating_experiment["text"]
 
 
 def only(e: Experiment, *names: str) -> Experiment:

@@ -237,3 +237,16 @@ def test_a_refit_that_began_at_a_poor_size_is_judged_by_its_candidates_best_scor
     poor = replace(found.winner, pick=replace(found.winner.pick, score=1e-3))
     assert found.scores.p(poor.pick.score) > 0.5
     assert against(search, found.before, poor, found, first=True) == ""
+
+
+def test_a_refit_that_brings_many_times_what_scores_do_is_judged_by_that() -> None:
+    """The sizes tried of a moving mean may all lie near zeros that the records know nothing of."""
+    search = Search(("lag",), ("wm",), FrozenMap(), Options(bootstraps=100), seed=0)
+    found = one_round(search, plain(experiments(lag=0.03)), 1)
+    assert found.winner is not None
+    deaf = replace(found, scores=replace(found.scores, raw=1e-3 * found.scores.raw))
+    poor = replace(found.winner, pick=replace(found.winner.pick, score=1e-3))
+    assert deaf.score_p(poor.pick.candidate)[1] > 0.5
+    assert against(search, found.before, poor, deaf, first=True) == ""
+    little = replace(poor, refit=replace(poor.refit, chi2=found.before.chi2 - 20.0))
+    assert "its score is what noise gives" in against(search, found.before, little, deaf, first=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,18 +12,22 @@ from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, mo
 from refits import answered, beside, plain
 from scipy.integrate import solve_ivp
 
-from hvdc_ident import Experiment, InputSignal, Trajectory
+from hvdc_ident import Experiment, InputSignal, Trajectory, simulate
 from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy.adequacy import loud_after_breaks
 from hvdc_ident.discrepancy.akin import as_late, with_begun
-from hvdc_ident.discrepancy.hops import hop
-from hvdc_ident.discrepancy.jobs import as_given
+from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.hops import hopped
+from hvdc_ident.discrepancy.jobs import as_given, job
 from hvdc_ident.discrepancy.looks import Stand, _twins
 from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, clear
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.discrepancy.trials import on_bound, refitted
+from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.trajectory import Array
 
 PERIOD = 0.033
@@ -82,11 +86,51 @@ def sampled(inputs: dict[str, InputSignal]) -> Array:
 def test_a_period_is_met_that_no_slope_leads_to() -> None:
     job = beginning(plain(records(sampled)), "sample-hold", "wm", {"Ts": 0.039, "compute": 0.0})
     name = job.placed[0].names["Ts"]
-    stuck, found = run(job), hop(job)
+    search = Search("all", None, FrozenMap(), Options(), seed=0)
+    stuck, (refit,) = run(job), hopped(search, [job], [""])
     assert abs(stuck.values[name] / PERIOD - 1.0) > 0.1
-    refit = found.refit(job)
     assert refit.values[name] == pytest.approx(PERIOD, rel=2e-3)
     assert refit.chi2 == pytest.approx(refit.rows, rel=0.1)
+
+
+def test_a_level_that_stands_right_may_be_another_number_of_steps_from_nothing() -> None:
+    """The speed in steps of 0.01, resting at the hundredth: with steps of 1/99 its level stands there too, the others do not."""
+    rounded = []
+    for e in answered(model(), experiments(), seed=0):
+        assert e.measured is not None
+        clean = simulate(model(), e, TRUE, outputs=tuple(SIGMA)).trajectory
+        noise = e.measured.values - clean.values
+        stepped = np.column_stack([0.01 * np.round(clean["w"] / 0.01), clean["torque"]])
+        rounded.append(replace(e, measured=replace(e.measured, values=stepped + 0.3 * noise), noise=FrozenMap()))
+    job = beside(plain(rounded), "quantisation", "outputs.w", {"step": 1.0 / 99.0}, {"step": (1e-3, 0.1)})
+    search = Search("all", None, FrozenMap(), Options(), seed=0)
+    (refit,) = hopped(search, [job], [""])
+    assert refit.sizes(refit.placed[-1])["step"] == pytest.approx(0.01, rel=1e-4)
+    assert refit.chi2 < 0.2 * run(job).chi2
+
+
+def test_sizes_of_one_form_share_a_model() -> None:
+    before = plain(experiments(lag=0.03))
+    sizes = [Probe("lag", FrozenMap({"T": t}), FrozenMap({"T": (1e-3, 0.3)})) for t in (0.01, 0.05)]
+    made: dict[Hashable, AnyModel] = {}
+    jobs = [job(before, [Candidate("lag", ("wm",), tuple(sizes))], [Pick(0, k, 1.0, 1.0)], made) for k in (0, 1)]
+    assert jobs[0].model is jobs[1].model and len(made) == 1
+    ends = [run(j) for j in jobs]
+    assert ends[0].chi2 == pytest.approx(ends[1].chi2, rel=1e-6)
+
+
+def test_what_answers_within_a_few_rows_is_louder_after_breaks() -> None:
+    still = [plain(experiments(seed=seed)).nominal() for seed in range(5)]
+    assert not any(loud_after_breaks(n) for n in still)
+    there = model().with_effects([{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
+    quick = plain(answered(there, experiments(), seed=0)).nominal()
+    assert loud_after_breaks(quick)
+    # However loud everything is: only where it is loud counts.
+    louder = [
+        replace(n, noise=FrozenMap({o: replace(s, std=0.3 * (s.std or 0.0)) for o, s in n.noise.items()}))
+        for n in still
+    ]
+    assert not any(loud_after_breaks(n) for n in louder)
 
 
 def test_gains_that_moved_far_are_given_back_as_another_start() -> None:

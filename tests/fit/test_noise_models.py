@@ -55,12 +55,12 @@ def test_whitening_is_the_exact_likelihood_of_stationary_noise(model):
 
 def test_stretches_are_whitened_each_for_itself():
     x = RNG(1).standard_normal(20)
-    parts = [slice(0, 12), slice(12, 20)]
+    parts = (slice(0, 12), slice(12, 20))
     white = whitened(x, (0.7,), parts)
     assert white == pytest.approx(np.concatenate([whitened(x[:12], (0.7,)), whitened(x[12:], (0.7,))]))
     t = np.concatenate([np.arange(12.0), 20 + np.arange(8.0)])
     assert segments(t, "here") == parts
-    assert segments(np.array([0.0, 1.0, 1.0, 2.0]), "here") == [slice(0, 2), slice(2, 4)]
+    assert segments(np.array([0.0, 1.0, 1.0, 2.0]), "here") == (slice(0, 2), slice(2, 4))
 
 
 def test_uneven_rows_cannot_be_whitened():

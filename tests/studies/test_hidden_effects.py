@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy import Options
 from hvdc_ident.discrepancy.akin import bends
 from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.hops import hop
+from hvdc_ident.discrepancy.hops import hopped
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.refit import Job, Refit, judged, run
 from hvdc_ident.discrepancy.rounds import one_round
@@ -371,7 +371,7 @@ def test_levels_are_met_that_a_loop_slides_between(large):
         model, before.problem, Candidate("quantisation", ("Iline",), (probe,)), 0, 1.0
     )
     job = Job(wider, (placed,), problem, (np.concatenate([before.theta, begin]),), before.noise)
-    found = hop(job).refit(job)
+    found = hopped(Search("all", None, FrozenMap(), Options(), 0), [job], [""])[0]
     assert found.sizes(placed)["step"] == pytest.approx(0.0638, rel=1e-3)
     assert found.chi2 < 0.05 * run(job).chi2
 

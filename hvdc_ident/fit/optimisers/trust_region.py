@@ -100,11 +100,11 @@ class _Walk:
             self.failure = str(error)
             return False
         self.failure = ""
-        cost = 0.5 * float(r @ r)
+        with np.errstate(over="ignore"):  # what runs away is not better, and told of where it is the start
+            cost = 0.5 * float(r @ r)
+            bounded = bool(np.isfinite(np.linalg.norm(jacobian)))
         if not cost < better_than:
             return False
-        with np.errstate(over="ignore"):
-            bounded = bool(np.isfinite(np.linalg.norm(jacobian)))
         if not bounded:
             self.failure = "its sensitivities grow beyond all bounds"
             return False
