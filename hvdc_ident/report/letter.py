@@ -117,6 +117,11 @@ def _consistent(found: dict[str, Any]) -> str:
     if names:
         more = f" and {len(names) - 5} more" if len(names) > 5 else ""
         first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}.{_in_common(found)}"
+    elif verdict == "ambiguous" and not rivals and len(effects) == 1:
+        first += (
+            " It may stand for a quicker form that none of those tried is: right after the inputs' steps the recordings are"
+            " still off by more than elsewhere."
+        )
     elif verdict == "ambiguous" and not rivals:
         first += " They may stand for something that is none of them: it takes several, and still something is left."
     else:

@@ -100,7 +100,10 @@ def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp
     alone = diagnosis(ambiguity=[rivals[1:]], remaining={"adequate": True})
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, alone))).sentences
     assert "No other effect of the catalogue" in consistent and "not all" not in consistent
-    several = diagnosis(ambiguity=[], remaining={"adequate": False})
+    doubted = diagnosis(ambiguity=[], remaining={"adequate": True})
+    _, consistent, *_ = letter_of(Results(folder_with(tmp_path, doubted))).sentences
+    assert "a quicker form" in consistent and "No other effect" not in consistent
+    several = diagnosis(ambiguity=[], remaining={"adequate": False}, effects=2 * diagnosis()["effects"])
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, several))).sentences
     assert "something that is none of them" in consistent and "No other effect" not in consistent
 

@@ -78,7 +78,7 @@ def _missing(results: Results) -> str:
     rivals = max((len(group) - 1 for group in found.get("ambiguity") or []), default=0)
     others = f", or one of {rivals} others" if rivals > 1 else ", or another effect" if rivals else ""
     if not rivals and found["verdict"] == "ambiguous":
-        others = ", or something that looks like them"
+        others = f", or something that looks like {'it' if len(effects) == 1 else 'them'}"
     return f"What the model lacks: {what}{others}{_shrunk(found.get('gap') or {})}."
 
 
