@@ -2,7 +2,8 @@
 
 No slope leads from one period of a sampler to another, and gains that are biased by what is missing point a scan at the
 wrong one. Once they have been refitted they are nearer to the truth: with their answers taken out to first order the
-sizes around are run again, and the refit goes on from the best.
+sizes around are run again, and the refit goes on from the best; of a quantiser's steps those, too, with which its level
+stands where it did as another number of steps. Among sizes that the fitted data do not tell apart all data choose.
 """
 
 from __future__ import annotations
@@ -61,6 +62,23 @@ PIECE = 30
 """Sizes that are looked at in one go, wherever that is done."""
 
 
+@dataclass(frozen=True)
+class _Sweep:
+    """Sizes to look at. teeth: how many of the best are refitted from. between: whether the best may lie between them, so
+    that of neighbours one is enough and it is looked at closer; else each is the best of its kind."""
+
+    sizes: Callable[[Refit], Array]
+    teeth: int = TEETH
+    between: bool = True
+
+    def of(self, refit: Refit) -> Array:
+        """They; none where the refit runs and the slot's signal by itself does not: what is counted is not known then."""
+        try:
+            return self.sizes(refit)
+        except SimulationError:
+            return np.empty(0)
+
+
 def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Refit]:
     """What refits come to that look for their last effect's size again, as long as that helps, and once very closely.
 
@@ -70,21 +88,18 @@ def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Re
     stuck = {k: r for k, r in here.items() if r.failure}
     here = {k: r for k, r in here.items() if not r.failure}
 
-    def further(refits: Mapping[int, Refit], grid: Callable[[Refit], Array], teeth: int = TEETH) -> dict[int, Refit]:
-        begins = _begins(
-            search, refits, {k: _grid(grid, r) for k, r in refits.items()}, teeth, grid is not _other_counts
-        )
-        return _further(search, jobs, texts, refits, begins)
+    def further(refits: Mapping[int, Refit], sweep: _Sweep) -> dict[int, Refit]:
+        return _further(search, jobs, texts, refits, _begins(search, refits, sweep))
 
     counted = [k for k, r in here.items() if by_level(r.placed[-1].candidate)]
-    here |= further({k: here[k] for k in counted}, _levels, OF_LEVELS)
+    here |= further({k: here[k] for k in counted}, _Sweep(_levels, OF_LEVELS))
     moving = here
     for _ in range(HOPS):
-        there = further(moving, _around)
+        there = further(moving, _Sweep(_around))
         moving = {k: r for k, r in there.items() if _left(r) < (1.0 - BETTER) * _left(here[k])}
         here = here | moving
-    here = further(here, _closely)
-    here |= further({k: here[k] for k in counted}, _other_counts)
+    here = further(here, _Sweep(_closely))
+    here |= further({k: here[k] for k in counted}, _Sweep(_other_counts, between=False))
     found = stuck | _agreed(search, here)
     return [found[k] for k in range(len(jobs))]
 
@@ -104,14 +119,6 @@ def _further(
         if not end.failure and _left(end) < _left(found[k]):
             found[k] = end
     return found
-
-
-def _grid(of: Callable[[Refit], Array], refit: Refit) -> Array:
-    """Sizes to look at; none where the refit runs and the slot's signal by itself does not: what is counted is not known then."""
-    try:
-        return of(refit)
-    except SimulationError:
-        return np.empty(0)
 
 
 def _left(refit: Refit) -> float:
@@ -199,15 +206,9 @@ def _held(here: Refit) -> float:
     return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
 
 
-def _begins(
-    search: Search, here: Mapping[int, Refit], grids: Mapping[int, Array], teeth: int, between: bool
-) -> dict[int, list[Array]]:
-    """By job unknowns with the best sizes of a grid, those the refit has and those that were given.
-
-    between: whether the best may lie between sizes of the grid, so that of neighbours one is enough and they are looked
-    at closer; else each of the grid is the best of its kind.
-    """
-    asked = {k: g for k, g in grids.items() if g.size > 1}
+def _begins(search: Search, here: Mapping[int, Refit], sweep: _Sweep) -> dict[int, list[Array]]:
+    """By job unknowns with the best sizes of a sweep, those the refit has and those that were given."""
+    asked = {k: g for k, r in here.items() if (g := sweep.of(r)).size > 1}
     rough = _looked(search, here, asked, "fitted")
     tops = {}
     for k, left in rough.items():
@@ -215,19 +216,19 @@ def _begins(
         least = [
             n
             for n in np.argsort(left)
-            if np.isfinite(left[n]) and (not between or left[n] <= min(padded[n], padded[n + 2]))
+            if np.isfinite(left[n]) and (not sweep.between or left[n] <= min(padded[n], padded[n + 2]))
         ]
-        tops[k] = np.array(least[: AMONG * teeth], dtype=int)
+        tops[k] = np.array(least[: AMONG * sweep.teeth], dtype=int)
     unseen = _looked(search, here, {k: asked[k][n] for k, n in tops.items()}, "held out")
-    best = {k: n[np.argsort(rough[k][n] + unseen[k], kind="stable")][:teeth] for k, n in tops.items()}
-    beside = {(k, n): _beside(asked[k], n) if between else asked[k][[n]] for k, own in best.items() for n in own}
-    seen = _looked(search, {key: here[key[0]] for key in beside}, beside, "all") if between else {}
+    best = {k: n[np.argsort(rough[k][n] + unseen[k], kind="stable")][: sweep.teeth] for k, n in tops.items()}
+    beside = {(k, n): _beside(asked[k], n) if sweep.between else asked[k][[n]] for k, own in best.items() for n in own}
+    seen = _looked(search, {key: here[key[0]] for key in beside}, beside, "all") if sweep.between else {}
     begins: dict[int, list[Array]] = {k: [] for k in asked}
     for (k, n), sizes in beside.items():
         for theta in (here[k].theta, as_given(here[k])):
             if theta is not None:
                 begins[k].append(theta.copy())
-                begins[k][-1][_size(here[k])[0]] = sizes[np.argmin(seen[k, n])] if between else sizes[0]
+                begins[k][-1][_size(here[k])[0]] = sizes[np.argmin(seen[k, n])] if sweep.between else sizes[0]
     return begins
 
 
