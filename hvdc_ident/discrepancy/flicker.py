@@ -22,6 +22,9 @@ WORTH = 1.1
 MOST = float(np.exp(2.0 * FLICKER))
 """Times at most: more is a gap and no noise."""
 
+WITHIN = 1.0 - 1e-9
+"""Share of the noise that hides the rounding at most: the record stays one that is rounded."""
+
 
 def told_again(executor: Executor | None, before: Refit, refits: Sequence[Refit]) -> tuple[Refit, list[Refit]]:
     """The model before and the refits, all judged by the noise that the best of these leaves, where that is louder."""
@@ -44,7 +47,7 @@ def _louder(best: Refit) -> dict[str, Noise]:
     found = {}
     for output, rounding in best.problem.rounding.items():
         misfit = np.concatenate([b.misfit for b in blocks if b.output == output])
-        below = min(noise_below(misfit, rounding.step), MOST * rounding.noise, COARSE * rounding.step)
+        below = min(noise_below(misfit, rounding.step), MOST * rounding.noise, WITHIN * COARSE * rounding.step)
         if below > WORTH * rounding.noise:
             std = float(np.hypot(below, rounding.step / np.sqrt(12.0)))
             found[output] = replace(best.noise[output], std=std)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
@@ -221,15 +222,24 @@ def _begins(search: Search, here: Mapping[int, Refit], sweep: _Sweep) -> dict[in
         tops[k] = np.array(least[: AMONG * sweep.teeth], dtype=int)
     unseen = _looked(search, here, {k: asked[k][n] for k, n in tops.items()}, "held out")
     best = {k: n[np.argsort(rough[k][n] + unseen[k], kind="stable")][: sweep.teeth] for k, n in tops.items()}
-    beside = {(k, n): _beside(asked[k], n) if sweep.between else asked[k][[n]] for k, own in best.items() for n in own}
-    seen = _looked(search, {key: here[key[0]] for key in beside}, beside, "all") if sweep.between else {}
+    sizes = _between(search, here, asked, best) if sweep.between else {k: asked[k][n] for k, n in best.items()}
     begins: dict[int, list[Array]] = {k: [] for k in asked}
-    for (k, n), sizes in beside.items():
-        for theta in (here[k].theta, as_given(here[k])):
-            if theta is not None:
-                begins[k].append(theta.copy())
-                begins[k][-1][_size(here[k])[0]] = sizes[np.argmin(seen[k, n])] if sweep.between else sizes[0]
+    for k, own in sizes.items():
+        for size in own:
+            for theta in (here[k].theta, as_given(here[k])):
+                if theta is not None:
+                    begins[k].append(theta.copy())
+                    begins[k][-1][_size(here[k])[0]] = size
     return begins
+
+
+def _between(
+    search: Search, here: Mapping[int, Refit], grids: Mapping[int, Array], best: Mapping[int, NDArray[np.intp]]
+) -> dict[int, list[float]]:
+    """By job the best size between the neighbours of each of the best of its grid."""
+    beside = {(k, n): _beside(grids[k], n) for k, own in best.items() for n in own}
+    left = _looked(search, {key: here[key[0]] for key in beside}, beside, "all")
+    return {k: [float(beside[k, n][np.argmin(left[k, n])]) for n in own] for k, own in best.items()}
 
 
 def _beside(grid: Array, n: int) -> Array:

@@ -69,12 +69,7 @@ class Noise:
     @property
     def rounding(self) -> Rounding | None:
         """How the record is rounded, where white noise does not hide it."""
-        coarse = (
-            self.step > 0
-            and self.std is not None
-            and not self.model
-            and self.below <= COARSE * self.step * (1.0 + 1e-9)
-        )
+        coarse = self.step > 0 and self.std is not None and not self.model and self.below < COARSE * self.step
         return Rounding(self.step, max(self.below, FINEST * self.step)) if coarse else None
 
 

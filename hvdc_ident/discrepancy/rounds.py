@@ -75,12 +75,11 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
 
     Ranked by what the fitted and the held-out data say together.
     """
-    before, found = opened.before, opened.candidates
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
         return replace(opened, failed=failed, why="no candidate could be refitted")
     opened, sound = _told_again(search, opened, sound)
-    before = opened.before
+    before, found = opened.before, opened.candidates
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
     ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]

@@ -13,6 +13,7 @@ from hvdc_ident.discrepancy.adequacy import Binned, adequacy, loud_after_breaks
 from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.beyond import beyond
 from hvdc_ident.discrepancy.noise import FEWEST
+from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import silent, worst
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
@@ -54,11 +55,12 @@ class Judgement:
 def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     """The verdict on a search that has ended."""
     options, last = search.options, outcome.refit
-    tests = adequacy(last.nominal(), _signals(last), bootstraps=options.bootstraps, seed=search.seed)
+    left = last.nominal()
+    tests = adequacy(left, _signals(last), bootstraps=options.bootstraps, seed=search.seed)
     if not outcome.kept:
         return _nothing(search, first, outcome, tests)
     explained = first.chi2 - last.chi2
-    floor = noise_left(last)
+    floor = noise_left(left)
     excess = max(first.chi2 - floor * first.rows, explained)
     labels = ", ".join(p.candidate.label for p in last.placed)
     if explained < DOMINANT * excess:
@@ -79,7 +81,7 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better)
     found = _named(labels, sets, tests, explained, options)
-    return _in_doubt(found, labels) if found.verdict == "named" and loud_after_breaks(last.nominal()) else found
+    return _in_doubt(found, labels) if found.verdict == "named" and loud_after_breaks(left) else found
 
 
 def _with_formulas(
@@ -183,16 +185,16 @@ def _one_kind(group: Sequence[Rival]) -> bool:
     return len({r.effect for r in group}) == 1 or all(effects()[r.effect].late is not None for r in group)
 
 
-def noise_left(last: Refit) -> float:
+def noise_left(left: Nominal) -> float:
     """The mean square that noise alone leaves in whitened residuals, from the rows before the events; at least 1.
 
     It is 1 where the noise is as supposed. AR coefficients from few rows are not: with a standard deviation that is
     given, a coefficient that is wrong by a tenth makes of whitened noise half or three times its size.
     """
-    experiments = {e.name: e for e in last.problem.fitted_experiments}
+    experiments = {e.name: e for e in left.problem.fitted_experiments}
     rows: dict[str, int] = {}
     quiet: dict[str, list[Array]] = {}
-    for b in last.nominal().blocks:
+    for b in left.blocks:
         e = experiments[b.experiment]
         event = e.event if e.event is not None else event_time(e.inputs)
         rows[b.output] = rows.get(b.output, 0) + b.residual.size

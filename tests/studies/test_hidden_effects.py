@@ -224,9 +224,9 @@ def test_a_unit_is_what_a_refit_leaves():
 def test_a_row_on_a_jump_has_no_size():
     base = sizes.nominal("drive", "small", 1)
     sigma = 0.01 * np.ptp(base.outputs[:, :2], axis=(0, 1))
-    (row,) = np.flatnonzero(sizes.on_jumps(base.runs[0]))
+    (row,) = np.flatnonzero(sizes.on_jumps(base.runs[:1]))
     assert row == round(campaigns.EVENT / campaigns.INTERVAL)
-    assert not sizes.on_jumps(sizes.nominal("drive", "rich", 1).runs[1]).any(), "a multisine has corners and no jump"
+    assert not sizes.on_jumps(sizes.nominal("drive", "rich", 1).runs[1:2]).any(), "a multisine has corners and no jump"
     odd = base.outputs[:, :2].copy()
     odd[row, 0, 0] += 50 * sigma[0]
     for kind in noise.KINDS:

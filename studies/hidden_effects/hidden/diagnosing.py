@@ -152,8 +152,7 @@ def _apart(model: Any, experiments: Sequence[Experiment], case: Case, values: Ma
         except HvdcIdentError:
             return None
         off[:, k, list(case.channels)] = run.trajectory.values - case.clean[:, k, list(case.channels)]
-    gone = np.stack([on_jumps(run) for run in case.runs], axis=1)
-    return float(np.linalg.norm(whitened(off, case.sigma, case.design.noise, gone)) / UNIT)
+    return float(np.linalg.norm(whitened(off, case.sigma, case.design.noise, on_jumps(case.runs))) / UNIT)
 
 
 def _sindy(

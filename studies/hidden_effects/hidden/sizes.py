@@ -182,10 +182,10 @@ def about(base: Nominal, at: str, source: str) -> About:
     )  # fmt: skip
 
 
-def on_jumps(run: Run) -> NDArray[np.bool_]:
-    """(rows,) whether a row lies on a jump of an input: no recording says which of its sides such a row shows."""
-    rows = [round(t / INTERVAL) for signal in run.inputs.values() for t in signal.jumps]
-    return np.isin(np.arange(ROWS), rows)
+def on_jumps(runs: Sequence[Run]) -> NDArray[np.bool_]:
+    """(rows, runs) whether a row lies on a jump of an input: no recording says which of its sides such a row shows."""
+    rows = [[round(t / INTERVAL) for signal in run.inputs.values() for t in signal.jumps] for run in runs]
+    return np.stack([np.isin(np.arange(ROWS), own) for own in rows], axis=1)
 
 
 def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Sequence[int]) -> Array:
@@ -195,7 +195,7 @@ def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Seque
     taken for the refit; else the refit is run, within the bounds a fit has. Rows on a jump of an input do not count.
     """
     pick = list(channels)
-    gone = np.stack([on_jumps(run) for run in base.runs[:2]], axis=1)
+    gone = on_jumps(base.runs[:2])
 
     def residual(y: Array) -> Array:
         """(N, n) of outputs (rows, 2, n, outputs)."""
