@@ -20,6 +20,8 @@ from hvdc_ident.trajectory import Array
 
 WIDE = 20.0
 """Times its start value: how large a coefficient may become."""
+LESS = (0.3, 0.1)
+"""Shares of its start value to begin from where the model does not run with it: a power that is too large runs away."""
 
 
 def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients: Array) -> Job:
@@ -45,8 +47,11 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
         FrozenMap(values),
     )
     k = len(before.problem.free)
-    begin = np.concatenate([before.theta[:k], list(values.values()), before.theta[k:]])
-    return Job(model, (*before.placed, placed), problem, (begin,), before.noise)
+    begin, *spare = (
+        np.concatenate([before.theta[:k], [share * v for v in values.values()], before.theta[k:]])
+        for share in (1.0, *LESS)
+    )
+    return Job(model, (*before.placed, placed), problem, (begin,), before.noise, spare=tuple(spare))
 
 
 def filled(placed: Placed, refit: Refit) -> str:
