@@ -33,7 +33,7 @@ sys.path.insert(0, str(STUDIES / "hidden_effects"))
 
 from hidden import campaigns, cases, judging, noise, sizes
 from hidden.diagnosing import diagnosed, experiments_of, free_of, model_of
-from hidden.operators import CATALOGUE
+from hidden.operators import CATALOGUE, OUTSIDE
 from hidden.plants import DRIVE, STATION
 from hidden.reporting import report
 from hidden.simulator import STEP, Hidden, Run, Signal, simulate
@@ -94,6 +94,25 @@ def test_both_simulators_agree(name):
     effect = np.abs(mine - plain).max(axis=0)
     assert effect.max() > 2e-3
     assert (np.abs(mine - theirs).max(axis=0) < share * effect + 2e-7).all()
+
+
+AT_REST = TOGETHER | {
+    "cubic": ("Pm", "", {"k": 0.2}, 0.0),
+    "notch": ("Pm", "", {"k": 0.3, "wn": 40.0}, 0.0),
+    "product": ("Pm", "Vdc", {"k": 2.0}, 0.0),
+    "relay": ("Pm", "Vdc", {"k": 0.05, "centre": 0.98, "width": 0.1}, 0.0),
+}
+
+
+def test_every_effect_outside_the_catalogue_is_asked_whether_it_begins_at_rest():
+    assert set(OUTSIDE) - set(AT_REST) == {"drift"}  # a gain that changes with time has no rest
+
+
+@pytest.mark.parametrize("name", sorted(AT_REST))
+def test_what_is_hidden_begins_at_rest(name):
+    at, source, values, _ = AT_REST[name]
+    run = simulate(STATION, [Run()], [Hidden(name, at, values, source)], rows=50)[:, 0]
+    np.testing.assert_allclose(run, np.broadcast_to(run[0], run.shape), rtol=0, atol=1e-9)
 
 
 def test_a_row_on_a_sampling_instant_is_read_before_it_by_both():

@@ -300,17 +300,18 @@ class Notch(Operator):
     """Outside the catalogue: a band of frequencies is missing."""
 
     states = 2
+    width = 0.5  # of the band, in parts of its middle
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
-        return [np.zeros_like(u), np.zeros_like(u)]
+        return [np.zeros_like(u), self.width * u]
 
     def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
         return u - self.p["k"] * z[0]
 
     def rates(self, u, z):  # type: ignore[no-untyped-def]
         # z0 is u through a band pass around wn with gain 1 there.
-        wn, width = self.p["wn"], 0.5 * self.p["wn"]
-        return [width * (u - z[0]) - wn * z[1], wn * z[0]]
+        wn = self.p["wn"]
+        return [wn * (self.width * (u - z[0]) - z[1]), wn * z[0]]
 
 
 class Drift(Operator):
