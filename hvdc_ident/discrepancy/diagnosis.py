@@ -162,6 +162,7 @@ def _assembled(
             o: {"std": n.std, "ar": list(n.model), "resolution": n.step, "source": n.source} for o, n in first.noise.items()
         },
         notes=notes,
+        doubt=judgement.doubt,
     )  # fmt: skip
 
 

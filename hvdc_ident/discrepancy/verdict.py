@@ -12,6 +12,7 @@ import numpy as np
 from hvdc_ident.discrepancy.adequacy import Binned, adequacy, loud_after_breaks
 from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.beyond import beyond
+from hvdc_ident.discrepancy.constancy import constancy
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import silent, worst
@@ -31,6 +32,8 @@ DOMINANT = 0.5
 PREDICTED = 0.75
 """The same of the held-out gap, where it is told from noise: gains that make good a wrong form do not in other experiments."""
 REFUTED_P = 0.01
+VARYING_P = 1e-4
+"""The same of experiments that agree on a size: the test is of first order, and a name is not to be lost by that."""
 STRONG = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
@@ -41,7 +44,9 @@ class Judgement:
     """The verdict, why, and the tests of what is left.
 
     sets: by effect that was put in, it and what cannot be told from it. experiment: what would show more where nothing was
-    excited. instead: the refit of a formula outside the catalogue that explains more than what would have been named.
+    excited, or what the doubt is about. instead: the refit of a formula outside the catalogue that explains more than what
+    would have been named. doubt: what tells that something else stands behind what was put in, though nothing else that
+    was tried explains as much.
     """
 
     verdict: Verdict
@@ -50,6 +55,7 @@ class Judgement:
     sets: tuple[tuple[Rival, ...], ...] = ()
     experiment: Mapping[str, Any] = field(default_factory=dict)
     instead: Trial | None = None
+    doubt: str = ""
 
 
 def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
@@ -81,7 +87,7 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better)
     found = _named(labels, sets, tests, explained, options)
-    return _in_doubt(found, labels) if found.verdict == "named" and loud_after_breaks(left) else found
+    return _doubted(found, last, left, labels) if found.verdict == "named" else found
 
 
 def _with_formulas(
@@ -118,7 +124,10 @@ def _named(
     left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
     if worst.excess <= options.refuted * explained:
         if len(sets) > 1 and not others:
-            return _stand_in(labels, left, sets, tests)
+            # A relay looks like a coupling with a backlash; a sum of two effects does not leave anything.
+            names = dict.fromkeys(group[0].effect for group in sets)
+            advice = "Each of them by itself. " + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names)
+            return _in_doubt(Judgement(kind, "", tests, sets), f"{labels} beside each other", left, advice)
         return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
     if _all_of_one_kind(sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
@@ -126,25 +135,27 @@ def _named(
     return Judgement("unnameable", text, tests)
 
 
-def _in_doubt(found: Judgement, labels: str) -> Judgement:
-    """Ambiguous, though nothing else that was tried explains as much: in the first rows after a break something quicker shows."""
-    text = (
-        f"Missing: something like {labels}; the first rows after the inputs' breaks are still louder than the others, so it "
-        f"may stand for a quicker form that is none of those tried."
-    )
-    advice = {"text": "The same steps, recorded ten times as densely for the first tenth of a second."}
-    return replace(found, verdict="ambiguous", text=text, experiment=advice)
+def _doubted(found: Judgement, last: Refit, left: Nominal, labels: str) -> Judgement:
+    """What would be named; ambiguous where what it leaves, or what single experiments ask for, tells against it."""
+    if loud_after_breaks(left):
+        doubt = "the first rows after the inputs' breaks are still louder than the others"
+        return _in_doubt(
+            found, labels, doubt, "The same steps, recorded ten times as densely for the first tenth of a second."
+        )
+    for placed in last.placed:
+        p = constancy(last, left, placed)
+        if p < VARYING_P:
+            label = placed.candidate.label
+            doubt = f"the experiments ask for different sizes of {label} (p = {p:.1g})"
+            return _in_doubt(found, labels, doubt, f"The same input in several sizes, in which {label} answers.")
+    return found
 
 
-def _stand_in(labels: str, left: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...]) -> Judgement:
-    """Ambiguous, though nothing else explains as much: what several effects leave in structure tells against all of them.
-
-    A relay looks like a coupling with a backlash, a sum of two effects does not leave anything.
-    """
-    text = f"Missing: something like {labels} beside each other; {left}, so they may stand for something that is none of them."
-    names = dict.fromkeys(group[0].effect for group in sets)
-    advice = {"text": "Each of them by itself. " + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names)}
-    return Judgement("ambiguous", text, tests, sets, experiment=advice)
+def _in_doubt(found: Judgement, labels: str, doubt: str, advice: str) -> Judgement:
+    """Ambiguous, though nothing else that was tried explains as much."""
+    they = "they" if len(found.sets) > 1 else "it"
+    text = f"Missing: something like {labels}; {doubt}, so {they} may stand for something that is none of those tried."
+    return replace(found, verdict="ambiguous", text=text, experiment={"text": advice}, doubt=doubt)
 
 
 def _predicted(first: Refit, last: Refit, floor: float, options: Options) -> float:

@@ -117,13 +117,9 @@ def _consistent(found: dict[str, Any]) -> str:
     if names:
         more = f" and {len(names) - 5} more" if len(names) > 5 else ""
         first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}.{_in_common(found)}"
-    elif verdict == "ambiguous" and not rivals and len(effects) == 1:
-        first += (
-            " It may stand for a quicker form that none of those tried is: right after the inputs' steps the recordings are"
-            " still off by more than elsewhere."
-        )
     elif verdict == "ambiguous" and not rivals:
-        first += " They may stand for something that is none of them: it takes several, and still something is left."
+        they, why = "They" if len(effects) > 1 else "It", found.get("doubt")
+        first += f" {they} may stand for something that none of those tried is{f': {why}' if why else ''}."
     else:
         first += " No other effect of the catalogue, and no other place, explains the recordings as well."
     if not (found.get("remaining") or {}).get("adequate", True):

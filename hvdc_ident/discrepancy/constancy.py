@@ -1,0 +1,48 @@
+"""Whether an effect is the same in all experiments: one that is named in another's stead has a size of its own in each."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from hvdc_ident.discrepancy.begin import Placed
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.effects import effects
+from hvdc_ident.trajectory import Array
+
+TOLD = 1e-4
+"""Share of a slope that has to be left by all the parameters for the data to tell of a size in one experiment alone."""
+
+
+def constancy(refit: Refit, left: Nominal, placed: Placed) -> float:
+    """The chance, under noise and with one size of an effect in all experiments, of asking for others as clearly as they do.
+
+    1 where only one experiment tells of it, and for effects whose answer has steps in their size: those have no slopes.
+    left: the refit's residuals. To first order, by the F test of what sizes of each experiment's own would explain.
+
+    Source: Chow, Econometrica 28 (1960), as a score test.
+    """
+    names = left.problem.names
+    own = [names.index(n) for n in placed.names.values() if n in names]
+    if effects()[placed.candidate.effect].scanned or not own:
+        return 1.0
+    more = _by_experiment(left, own)
+    rows = refit.effective / refit.rows * left.residual.size
+    spare = rows - left.basis.shape[1] - more.shape[1]
+    if not more.shape[1] or spare < 1.0:
+        return 1.0
+    remains = left.projected(left.residual)
+    told = float(np.sum((more.T @ remains) ** 2))
+    share = told / max(float(remains @ remains) - told, np.finfo(float).tiny)
+    return float(f_distribution.sf(share * spare / more.shape[1], more.shape[1], spare))
+
+
+def _by_experiment(left: Nominal, own: list[int]) -> Array:
+    """(N, k) orthonormal, and to the basis: what other sizes in single experiments can make of the residual."""
+    slopes = np.vstack([b.jacobian for b in left.blocks])[:, own]
+    experiment = np.concatenate([np.full(b.residual.size, b.experiment) for b in left.blocks])
+    each = np.hstack([np.where((experiment == e)[:, None], slopes, 0.0) for e in dict.fromkeys(experiment.tolist())])
+    each = each[:, np.linalg.norm(each, axis=0) > 0.0]
+    u, s, _ = np.linalg.svd(left.projected(each / np.linalg.norm(each, axis=0)), full_matrices=False)
+    return np.asarray(u[:, s > TOLD])
