@@ -80,7 +80,6 @@ def diagnose(
     )
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
     outcome = forward(search, first)
-    first = outcome.rounds[0].before  # the same, by the noise as it was told in the end
     judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)
     other = None

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.discrepancy.closer import closer_look
-from hvdc_ident.discrepancy.flicker import told_again
 from hvdc_ident.discrepancy.looks import looked
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
@@ -78,7 +77,6 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
         return replace(opened, failed=failed, why="no candidate could be refitted")
-    opened, sound = _told_again(search, opened, sound)
     before, found = opened.before, opened.candidates
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
     ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
@@ -87,16 +85,6 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     winner = next((t for t in level if not refused[id(t)]), None)
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
-
-
-def _told_again(search: Search, opened: Round, sound: Sequence[Trial]) -> tuple[Round, list[Trial]]:
-    """The round and its refits, by the noise of rounded records that the best refit leaves."""
-    before, refits = told_again(search.executor, opened.before, [t.refit for t in sound])
-    if before is opened.before:
-        return opened, list(sound)
-    scores = opened.scores.in_louder_noise(min(before.chi2 / opened.before.chi2, 1.0))
-    opened = replace(opened, before=before, scores=scores)
-    return opened, [replace(t, refit=r) for t, r in zip(sound, refits, strict=True)]
 
 
 def gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:

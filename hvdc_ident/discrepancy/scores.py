@@ -80,11 +80,6 @@ class Scores:
         beside = np.max(others, axis=0) if others else None
         return replace(self, columns=(*self.columns, *more.columns), beside=beside, **pairs)
 
-    def in_louder_noise(self, share: float) -> Scores:
-        """The scores where a trace counts for this share of what it did: the noise is louder than it was taken for."""
-        traces = {n: share * getattr(self, n) for n in ("raw", "size", "left")}
-        return replace(self, noise=np.sqrt(share) * self.noise, **traces)
-
     @property
     def expected(self) -> Array:
         """(C,) the size the data ask for, in units of the probe's."""

@@ -43,7 +43,6 @@ def forward(search: Search, first: Refit) -> Outcome:
             notes = (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
             break
         rounds.append(found)
-        here = found.before
         if found.winner is None:
             both = pair(search, here, found) if found.significant and number < search.options.most else None
             if both is None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr
 
 from hvdc_ident.trajectory import Array
@@ -48,20 +47,6 @@ class Rounding:
         Added to every square, it makes a sum of squares of nothing but noise as large as the number of rows.
         """
         return _spare(self.step / self.noise)
-
-
-def noise_below(misfit: Array, step: float) -> float:
-    """The standard deviation of white noise below rounding to multiples of `step` that is likeliest to leave such misfits.
-
-    misfit: (m,) measured - simulated, of a model that explains the record. All in the output's unit; at least a hundredth
-    of a step, at most two.
-    """
-    z = np.abs(np.asarray(misfit, dtype=float)) / step
-
-    def cost(log: float) -> float:
-        return -float(np.sum(_log_chance(z * np.exp(-log), np.exp(-log))))
-
-    return step * float(np.exp(minimize_scalar(cost, bounds=np.log([0.01, 2.0]), method="bounded").x))
 
 
 def _log_chance(z: Array, step: float) -> Array:

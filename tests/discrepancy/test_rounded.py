@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import FREE, SIGMA, experiments, model
-from refits import beside, plain
 
 from hvdc_ident import Experiment, Trajectory
-from hvdc_ident.discrepancy.flicker import told_again
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
-from hvdc_ident.discrepancy.refit import METHOD, judged, run
+from hvdc_ident.discrepancy.refit import METHOD
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.frozen import FrozenMap
@@ -74,32 +72,3 @@ def test_taken_for_white_noise_it_rewards_them_more() -> None:
     problems = [_start(seed).problem for seed in (0, 1, 2)]
     plain = sum(_both(replace(p, rounding=FrozenMap()))[1] for p in problems)
     assert plain > 2.0 * sum(_both(p)[1] for p in problems)
-
-
-def test_noise_taken_for_too_small_is_told_again_by_what_the_best_refit_leaves() -> None:
-    """A quarter of a step of noise below the steps, taken for a seventh: by half, differences between models count double."""
-    coarse = {n: 4.0 * s for n, s in SIGMA.items()}
-    given = []
-    for e in experiments(lag=LAG, noise="white", seed=3):
-        assert e.measured is not None
-        rows = [np.round(e.measured[o] / s) * s for o, s in coarse.items()]
-        measured = Trajectory(e.time, np.column_stack(rows), tuple(coarse), ("", ""))
-        given.append(e.with_(measured=measured, noise=FrozenMap()))
-    before = plain(given)
-    low = {
-        o: replace(n, std=float(np.hypot(coarse[o] / 7.0, coarse[o] / np.sqrt(12.0)))) for o, n in before.noise.items()
-    }
-    rounding = {o: r for o, n in low.items() if (r := n.rounding) is not None}
-    assert set(rounding) == set(SIGMA)
-    before = judged(
-        replace(before, noise=FrozenMap(low), problem=replace(before.problem, rounding=FrozenMap(rounding)))
-    )
-    lag = run(beside(before, "lag", "wm", {"T": LAG}, {"T": (0.001, 0.2)}))
-    first, (again,) = told_again(None, before, [lag])
-    for o, s in SIGMA.items():
-        assert again.problem.rounding[o].noise == pytest.approx(s, rel=0.1)
-        assert again.noise[o].rounding == again.problem.rounding[o]
-    assert first.problem.rounding == again.problem.rounding
-    assert again.theta.tolist() == lag.theta.tolist() and first.theta.tolist() == before.theta.tolist()
-    assert first.chi2 - again.chi2 < 0.7 * (before.chi2 - lag.chi2)
-    assert told_again(None, first, [again])[0] is first, "told once, it stands"
