@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.stats import f as f_distribution
 
@@ -15,27 +17,35 @@ TOLD = 1e-4
 """Share of a slope that has to be left by all the parameters for the data to tell of a size in one experiment alone."""
 
 
-def constancy(refit: Refit, left: Nominal, placed: Placed) -> float:
-    """The chance, under noise and with one size of an effect in all experiments, of asking for others as clearly as they do.
+@dataclass(frozen=True)
+class Constancy:
+    """What sizes of each experiment's own would explain. told: the fall of chi2; p: the chance of such a fall under noise."""
 
-    1 where only one experiment tells of it, and for effects whose answer has steps in their size: those have no slopes.
-    left: the refit's residuals. To first order, by the F test of what sizes of each experiment's own would explain.
+    told: float
+    p: float
+
+
+def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
+    """How far the experiments ask for different sizes of an effect, to first order, by an F test.
+
+    Nothing (p = 1) where only one experiment tells of it, and for effects whose answer has steps in their size: those have
+    no slopes. left: the refit's residuals.
 
     Source: Chow, Econometrica 28 (1960), as a score test.
     """
     names = left.problem.names
     own = [names.index(n) for n in placed.names.values() if n in names]
     if effects()[placed.candidate.effect].scanned or not own:
-        return 1.0
+        return Constancy(0.0, 1.0)
     more = _by_experiment(left, own)
     rows = refit.effective / refit.rows * left.residual.size
     spare = rows - left.basis.shape[1] - more.shape[1]
     if not more.shape[1] or spare < 1.0:
-        return 1.0
+        return Constancy(0.0, 1.0)
     remains = left.projected(left.residual)
     told = float(np.sum((more.T @ remains) ** 2))
     share = told / max(float(remains @ remains) - told, np.finfo(float).tiny)
-    return float(f_distribution.sf(share * spare / more.shape[1], more.shape[1], spare))
+    return Constancy(told, float(f_distribution.sf(share * spare / more.shape[1], more.shape[1], spare)))
 
 
 def _by_experiment(left: Nominal, own: list[int]) -> Array:

@@ -139,7 +139,7 @@ def _assembled(
     augmented = None if last is first else last.model.with_values(_own(last))
     given = with_given(first, {f.name: f.start for f in free})
     responses_found = responses(model, first, augmented, last)
-    sets = tuple(g for g in judgement.sets if len(g) > 1)
+    sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
     return Diagnosis(
         verdict=judgement.verdict,
         text=judgement.text if other is None else f"{judgement.text} {other.text}",

@@ -169,7 +169,7 @@ def _once_more(stand: Stand) -> Stand:
 
 
 ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _twins, _elsewhere, _other_forms, _as_late, _elsewhere)
-AT_FIRST: tuple[Look, ...] = (_closer,)
+AT_FIRST: tuple[Look, ...] = (_closer, _as_late)
 """In the first round."""
 WHERE_FAR: tuple[Look, ...] = (_the_others, _from_every_size, _once_more)
 """In the first round, as long as nothing comes near the noise."""

@@ -122,9 +122,9 @@ class Diagnosis:
 
     verdict: named, no-evidence, not-excited, ambiguous or unnameable; text: why, in one or two sentences.
     effects: those put into the model. ambiguity: for each of them the candidates that are as good, the best first, where
-    there is more than one. doubt: what tells that something else stands behind the effects, though nothing that was tried
-    explains as much; empty where nothing does. separating_experiment: what would tell them apart, or show what was not
-    excited or is in doubt.
+    there is more than one, or where that one is in doubt. doubt: what tells that something else stands behind the effects,
+    though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would tell them
+    apart, or show what was not excited or is in doubt.
     candidates: every candidate's line, the best first. location: where model and data differ. detectable: smallest size
     by candidate. gap: before and after. remaining: what is left. parameters_*: by name; `parameters_refitted` are the
     nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.

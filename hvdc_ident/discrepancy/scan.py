@@ -37,7 +37,7 @@ from hvdc_ident.trajectory import Array
 SPOTS = 10
 """Sizes of an effect, the best at any place, at which the model is run."""
 EACH = 3
-"""Of these at one place at most."""
+"""Of these at one place at most, where there are others."""
 PLACES = 4
 """Places of an effect that are refitted then."""
 WORTH = 0.3
@@ -278,10 +278,11 @@ def _tops(spots: Sequence[Spot]) -> list[Spot]:
     for effect in dict.fromkeys(s.candidate.effect for s in spots):
         own = [s for s in spots if s.candidate.effect == effect]
         ranks = [sorted(own, key=lambda s: -s.fall), sorted(own, key=lambda s: -s.score)]
+        each = max(EACH, SPOTS // len({s.candidate.at for s in own}))
         kept: list[Spot] = []
         for s in (s for pair in zip(*ranks, strict=True) for s in pair):
             beside = [k for k in kept if k.candidate.at == s.candidate.at]
-            if len(kept) < SPOTS and len(beside) < EACH and all(k.candidate != s.candidate for k in beside):
+            if len(kept) < SPOTS and len(beside) < each and all(k.candidate != s.candidate for k in beside):
                 kept.append(s)
         chosen += kept
     return chosen

@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.result import Rival, Verdict
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Trial, material_gap
-from hvdc_ident.discrepancy.state import Search
+from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.trajectory import Array
@@ -34,6 +34,8 @@ PREDICTED = 0.75
 REFUTED_P = 0.01
 VARYING_P = 1e-4
 """The same of experiments that agree on a size: the test is of first order, and a name is not to be lost by that."""
+TRIFLE = 0.005
+"""Share of what one effect explains of which nothing is made: of real records no model leaves noise alone."""
 STRONG = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
@@ -87,7 +89,7 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better)
     found = _named(labels, sets, tests, explained, options)
-    return _doubted(found, last, left, labels) if found.verdict == "named" else found
+    return _doubted(found, outcome, left, TRIFLE * explained, options) if found.verdict == "named" else found
 
 
 def _with_formulas(
@@ -114,7 +116,8 @@ def _with_formulas(
 def _named(
     labels: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...], explained: float, options: Options
 ) -> Judgement:
-    """Named or ambiguous; or unnameable where what is left is no noise in the region that the effect was put there for."""
+    """Named, or ambiguous where something else may be behind it; or unnameable where what is left is no noise in the region
+    that the effect was put there for."""
     others = _or_others(sets)
     like = f"{labels}{others} that these data cannot tell from it" if others else labels
     kind: Verdict = "ambiguous" if others else "named"
@@ -123,32 +126,52 @@ def _named(
         return Judgement(kind, f"Missing: {like}.", tests, sets)
     left = f"the residuals over the {worst.name} are still not noise (p = {worst.p:.2g})"
     if worst.excess <= options.refuted * explained:
-        if len(sets) > 1 and not others:
-            # A relay looks like a coupling with a backlash; a sum of two effects does not leave anything.
-            names = dict.fromkeys(group[0].effect for group in sets)
-            advice = "Each of them by itself. " + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names)
-            return _in_doubt(Judgement(kind, "", tests, sets), f"{labels} beside each other", left, advice)
-        return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
+        if others or (len(sets) == 1 and worst.excess <= TRIFLE * explained):
+            return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
+        # A relay looks like a coupling with a backlash, or like a quantiser; what is there does not leave anything.
+        names = list(dict.fromkeys(group[0].effect for group in sets))
+        apart, what = ("Each of them by itself. ", f"{labels} beside each other") if len(sets) > 1 else ("", labels)
+        advice = apart + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names)
+        return _in_doubt(Judgement(kind, "", tests, sets), what, left, advice)
     if _all_of_one_kind(sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
 
 
-def _doubted(found: Judgement, last: Refit, left: Nominal, labels: str) -> Judgement:
-    """What would be named; ambiguous where what it leaves, or what single experiments ask for, tells against it."""
+def _doubted(found: Judgement, outcome: Outcome, left: Nominal, trifle: float, options: Options) -> Judgement:
+    """What would be named; ambiguous where what it leaves, or what single experiments ask for, tells against it.
+
+    trifle: the fall of chi2 of which nothing is made.
+    """
+    last = outcome.refit
+    labels = ", ".join(p.candidate.label for p in last.placed)
     if loud_after_breaks(left):
         doubt = "the first rows after the inputs' breaks are still louder than the others"
         return _in_doubt(
             found, labels, doubt, "The same steps, recorded ten times as densely for the first tenth of a second."
         )
     for placed in last.placed:
-        p = constancy(last, left, placed)
-        if p < VARYING_P:
+        varies = constancy(last, left, placed)
+        if varies.p < VARYING_P and varies.told > trifle:
             label = placed.candidate.label
-            doubt = f"the experiments ask for different sizes of {label} (p = {p:.1g})"
+            doubt = f"the experiments ask for different sizes of {label} (p = {varies.p:.1g})"
             return _in_doubt(found, labels, doubt, f"The same input in several sizes, in which {label} answers.")
+    further = _further(outcome.rounds[-1], options)
+    if further is not None and outcome.refit.chi2 - further.refit.chi2 > trifle:
+        label = further.refit.placed[-1].candidate.label
+        doubt = f"{label} beside it would explain a little more, and more than noise (delta BIC {further.gain:.3g})"
+        return _in_doubt(found, labels, doubt, f"What moves {label} alone, and by more.")
     return found
+
+
+def _further(last: Round, options: Options) -> Trial | None:
+    """The best further effect of a round that ended the search because it is too small to matter, where it is no noise."""
+    if last.winner is not None:
+        return None
+    sure = (t for t in last.trials if min(t.gain, t.told) > options.named_bic)
+    best = max(sure, key=lambda t: t.told, default=None)
+    return best if best is not None and last.scores.p(best.pick.score) <= options.significance else None
 
 
 def _in_doubt(found: Judgement, labels: str, doubt: str, advice: str) -> Judgement:

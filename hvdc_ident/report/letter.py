@@ -117,12 +117,12 @@ def _consistent(found: dict[str, Any]) -> str:
     if names:
         more = f" and {len(names) - 5} more" if len(names) > 5 else ""
         first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}.{_in_common(found)}"
-    elif verdict == "ambiguous" and not rivals:
-        they, why = "They" if len(effects) > 1 else "It", found.get("doubt")
-        first += f" {they} may stand for something that none of those tried is{f': {why}' if why else ''}."
+    elif found.get("doubt"):
+        they = "They" if len(effects) > 1 else "It"
+        first += f" {they} may stand for something that none of those tried is: {found['doubt']}."
     else:
         first += " No other effect of the catalogue, and no other place, explains the recordings as well."
-    if not (found.get("remaining") or {}).get("adequate", True):
+    if not found.get("doubt") and not (found.get("remaining") or {}).get("adequate", True):
         first += " It is not all that is missing: with it the residuals are still not noise."
     return first
 
@@ -201,7 +201,8 @@ def _next(found: dict[str, Any]) -> str:
     advice = (found.get("separating_experiment") or {}).get("text")
     if not advice:
         return ""
-    start = "To tell them apart" if found.get("ambiguity") else "What would show more"
+    several = any(len(group) > 1 for group in found.get("ambiguity") or [])
+    start = "To tell them apart" if several else "What would show more"
     return f"{start}: {advice}" + ("" if advice.endswith(".") else ".")
 
 

@@ -203,18 +203,20 @@ def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_t
     [
         (("coupling", "backlash"), 0.5, 40.0, "named"),
         (("coupling", "backlash"), 0.005, 90.0, "ambiguous"),
-        (("coupling",), 0.005, 90.0, "named"),
+        (("coupling",), 0.5, 40.0, "named"),
+        (("coupling",), 0.005, 90.0, "ambiguous"),
+        (("coupling",), 0.005, 44.0, "named"),
         (("coupling", "backlash"), 0.005, 190.0, "unnameable"),
     ],
 )
-def test_several_effects_that_leave_structure_are_not_named(
+def test_effects_that_leave_structure_are_not_named(
     effects: tuple[str, ...], p: float, statistic: float, verdict: str
 ) -> None:
-    """What is in no catalogue is told as several effects beside each other: a relay as a coupling with a backlash."""
+    """What is in no catalogue is told as what looks like it: a relay as a quantiser, or as a coupling with a backlash."""
     sets = tuple((Rival(e, ("wm",), 0.0, FrozenMap({"k": 0.01})),) for e in effects)
     told = _named(" and ".join(effects), sets, (Binned("time", statistic, 40.0, p),), 1000.0, Options())
     assert told.verdict == verdict
-    assert bool(told.experiment) == (verdict == "ambiguous")
+    assert bool(told.experiment) == bool(told.doubt) == (verdict == "ambiguous")
 
 
 def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:

@@ -55,7 +55,7 @@ def _effects(found: dict[str, Any]) -> str:
 
 def _sets(found: dict[str, Any]) -> str:
     parts = []
-    for group in found.get("ambiguity") or []:
+    for group in (g for g in found.get("ambiguity") or [] if len(g) > 1):
         rows = [
             [
                 text(form_of(r)),

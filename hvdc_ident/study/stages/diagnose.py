@@ -62,7 +62,7 @@ def told(data: Mapping[str, Any]) -> Sequence[str]:
     lines.append(f"Residual in noise units: {', '.join(shown)}.")
     if data["effects"] and data["gap"]["shrink_holdout"] is not None:
         lines.append(f"The held-out gap shrinks by {100 * data['gap']['shrink_holdout']:.1f} %.")
-    for group in data["ambiguity"]:
+    for group in (g for g in data["ambiguity"] if len(g) > 1):
         members = "; ".join(f"{form_of(r)} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for r in group[:8])
         rest = f"; and {len(group) - 8} more" if len(group) > 8 else ""
         lines.append(f"As good (delta BIC): {members}{rest}.")
