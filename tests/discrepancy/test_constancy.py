@@ -77,6 +77,14 @@ def test_a_name_is_in_doubt_where_experiments_ask_for_different_sizes() -> None:
     assert judged(lossy(), trifle=1e6).verdict == "named", "of so little of what it explains nothing is made"
 
 
+def test_a_name_is_in_doubt_where_something_quicker_shows_after_breaks() -> None:
+    there = model().with_effects([{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
+    quick = plain(answered(there, experiments(), seed=0))
+    found = judged(run(beside(quick, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})))
+    assert found.verdict == "ambiguous" and "first rows after" in found.doubt
+    assert "as densely" in found.experiment["text"]
+
+
 @pytest.mark.parametrize(
     ("gain", "score", "verdict"), [(40.0, 1e4, "ambiguous"), (5.0, 1e4, "named"), (40.0, 0.0, "named")]
 )
