@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.discrepancy.adequacy import Binned, adequacy, loud_after_breaks
+from hvdc_ident.discrepancy.adequacy import Binned, adequacy
 from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.beyond import beyond
-from hvdc_ident.discrepancy.constancy import constancy
+from hvdc_ident.discrepancy.doubts import TRIFLE, Doubt, doubt
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import silent, worst
@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.result import Rival, Verdict
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Trial, material_gap
-from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.trajectory import Array
@@ -32,10 +32,6 @@ DOMINANT = 0.5
 PREDICTED = 0.75
 """The same of the held-out gap, where it is told from noise: gains that make good a wrong form do not in other experiments."""
 REFUTED_P = 0.01
-VARYING_P = 1e-4
-"""The same of experiments that agree on a size: the test is of first order, and a name is not to be lost by that."""
-TRIFLE = 0.005
-"""Share of what one effect explains of which nothing is made: of real records no model leaves noise alone."""
 STRONG = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
@@ -89,7 +85,10 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better)
     found = _named(labels, sets, tests, explained, options)
-    return _doubted(found, outcome, left, TRIFLE * explained, options) if found.verdict == "named" else found
+    if found.verdict != "named":
+        return found
+    against = doubt(outcome, left, explained, told, floor, options)
+    return found if against is None else _in_doubt(found, labels, against)
 
 
 def _with_formulas(
@@ -131,54 +130,19 @@ def _named(
         # A relay looks like a coupling with a backlash, or like a quantiser; what is there does not leave anything.
         names = list(dict.fromkeys(group[0].effect for group in sets))
         apart, what = ("Each of them by itself. ", f"{labels} beside each other") if len(sets) > 1 else ("", labels)
-        advice = apart + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names)
-        return _in_doubt(Judgement(kind, "", tests, sets), what, left, advice)
+        against = Doubt(left, apart + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names))
+        return _in_doubt(Judgement(kind, "", tests, sets), what, against)
     if _all_of_one_kind(sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."
     return Judgement("unnameable", text, tests)
 
 
-def _doubted(found: Judgement, outcome: Outcome, left: Nominal, trifle: float, options: Options) -> Judgement:
-    """What would be named; ambiguous where what it leaves, or what single experiments ask for, tells against it.
-
-    trifle: the fall of chi2 of which nothing is made.
-    """
-    last = outcome.refit
-    labels = ", ".join(p.candidate.label for p in last.placed)
-    if loud_after_breaks(left):
-        doubt = "the first rows after the inputs' breaks are still louder than the others"
-        return _in_doubt(
-            found, labels, doubt, "The same steps, recorded ten times as densely for the first tenth of a second."
-        )
-    for placed in last.placed:
-        varies = constancy(last, left, placed)
-        if varies.p < VARYING_P and varies.told > trifle:
-            label = placed.candidate.label
-            doubt = f"the experiments ask for different sizes of {label} (p = {varies.p:.1g})"
-            return _in_doubt(found, labels, doubt, f"The same input in several sizes, in which {label} answers.")
-    further = _further(outcome.rounds[-1], options)
-    if further is not None and outcome.refit.chi2 - further.refit.chi2 > trifle:
-        label = further.refit.placed[-1].candidate.label
-        doubt = f"{label} beside it would explain a little more, and more than noise (delta BIC {further.gain:.3g})"
-        return _in_doubt(found, labels, doubt, f"What moves {label} alone, and by more.")
-    return found
-
-
-def _further(last: Round, options: Options) -> Trial | None:
-    """The best further effect of a round that ended the search because it is too small to matter, where it is no noise."""
-    if last.winner is not None:
-        return None
-    sure = (t for t in last.trials if min(t.gain, t.told) > options.named_bic)
-    best = max(sure, key=lambda t: t.told, default=None)
-    return best if best is not None and last.scores.p(best.pick.score) <= options.significance else None
-
-
-def _in_doubt(found: Judgement, labels: str, doubt: str, advice: str) -> Judgement:
+def _in_doubt(found: Judgement, labels: str, against: Doubt) -> Judgement:
     """Ambiguous, though nothing else that was tried explains as much."""
     they = "they" if len(found.sets) > 1 else "it"
-    text = f"Missing: something like {labels}; {doubt}, so {they} may stand for something that is none of those tried."
-    return replace(found, verdict="ambiguous", text=text, experiment={"text": advice}, doubt=doubt)
+    text = f"Missing: something like {labels}; {against.why}, so {they} may stand for something that is none of those tried."
+    return replace(found, verdict="ambiguous", text=text, experiment={"text": against.advice}, doubt=against.why)
 
 
 def _predicted(first: Refit, last: Refit, floor: float, options: Options) -> float:

@@ -1,4 +1,4 @@
-"""An effect has one size: where each experiment asks for another, what is named stands for something else."""
+"""What tells against a name: experiments that ask for different sizes of it, and what it leaves."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from scipy.stats import kstest
 
 from hvdc_ident.discrepancy import Options
 from hvdc_ident.discrepancy.constancy import constancy
+from hvdc_ident.discrepancy.doubts import Doubt, doubt
 from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.verdict import Judgement, _doubted
 from hvdc_ident.frozen import FrozenMap
 
 
@@ -58,39 +57,40 @@ def test_what_is_told_by_one_experiment_alone_or_jumps_with_its_size_is_not_aske
     assert chance(lagged(alone)) == 1.0
 
 
-def judged(refit: Refit, trifle: float = 0.0, beside: Sequence[Trial] = ()) -> Judgement:
-    """The refit's effect as it would be named. beside: refits of another effect with it, too small to matter."""
-    label = refit.placed[-1].candidate.label
-    named = Judgement("named", f"Missing: {label}.", (), ((Rival("lag", ("wm",), 0.0),),))
+def doubted(refit: Refit, explained: float = 1.0, told: float = 1.0, beside: Sequence[Trial] = ()) -> Doubt | None:
+    """What tells against the refit's effect. beside: refits of another effect with it, too small to matter."""
     last = one_round(Search(("gain",), ("wm",), FrozenMap(), Options(), seed=0), refit, 2)
     assert last.winner is None
     last = replace(last, trials=tuple(beside))
-    return _doubted(named, Outcome(refit, (last,), (last,)), refit.nominal(), trifle, Options())
+    return doubt(Outcome(refit, (last,), (last,)), refit.nominal(), explained, told, 1.0, Options())
 
 
 def test_a_name_is_in_doubt_where_experiments_ask_for_different_sizes() -> None:
-    right = judged(lagged(plain(experiments(lag=0.03))))
-    assert right.verdict == "named" and not right.doubt
-    wrong = judged(lossy())
-    assert wrong.verdict == "ambiguous" and wrong.experiment and "different sizes of loss at drag" in wrong.text
-    assert wrong.doubt in wrong.text
-    assert judged(lossy(), trifle=1e6).verdict == "named", "of so little of what it explains nothing is made"
+    assert doubted(lagged(plain(experiments(lag=0.03)))) is None
+    against = doubted(lossy())
+    assert against is not None and "different sizes of loss at drag" in against.why and "loss" in against.advice
+    assert doubted(lossy(), explained=1e9) is None, "of so little of what it explains nothing is made"
 
 
 def test_a_name_is_in_doubt_where_something_quicker_shows_after_breaks() -> None:
     there = model().with_effects([{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
     quick = plain(answered(there, experiments(), seed=0))
-    found = judged(run(beside(quick, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})))
-    assert found.verdict == "ambiguous" and "first rows after" in found.doubt
-    assert "as densely" in found.experiment["text"]
+    against = doubted(run(beside(quick, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})))
+    assert against is not None and "first rows after" in against.why and "as densely" in against.advice
 
 
-@pytest.mark.parametrize(
-    ("gain", "score", "verdict"), [(40.0, 1e4, "ambiguous"), (5.0, 1e4, "named"), (40.0, 0.0, "named")]
-)
-def test_a_name_is_in_doubt_where_something_beside_it_is_no_noise(gain: float, score: float, verdict: str) -> None:
+@pytest.mark.parametrize(("told", "held_out", "doubtful"), [(0.9, 2.4, True), (0.97, 2.4, False), (0.9, 1.1, False)])
+def test_a_name_is_in_doubt_where_held_out_records_are_explained_in_part(
+    told: float, held_out: float, doubtful: bool
+) -> None:
+    refit = replace(lagged(plain(experiments(lag=0.03))), holdout=held_out)
+    against = doubted(refit, told=told)
+    assert (against is not None and "90% of the held-out gap" in against.why) == doubtful
+
+
+@pytest.mark.parametrize(("gain", "score", "doubtful"), [(40.0, 1e4, True), (5.0, 1e4, False), (40.0, 0.0, False)])
+def test_a_name_is_in_doubt_where_something_beside_it_is_no_noise(gain: float, score: float, doubtful: bool) -> None:
     refit = lagged(plain(experiments(lag=0.03)))
     more = replace(run(beside(refit, "gain", "torque", {"k": 1.01}, {"k": (0.5, 2.0)})), chi2=refit.chi2 - 50.0)
-    found = judged(refit, beside=[Trial(Pick(0, 0, 1.0, score), more, gain, evidence=gain)])
-    assert found.verdict == verdict
-    assert ("gain at torque beside it" in found.doubt) == (verdict == "ambiguous")
+    against = doubted(refit, beside=[Trial(Pick(0, 0, 1.0, score), more, gain, evidence=gain)])
+    assert (against is not None and "gain at torque beside it" in against.why) == doubtful
