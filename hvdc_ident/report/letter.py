@@ -66,26 +66,33 @@ def write_letter(folder: Path) -> Path:
 
 
 def _missed(results: Results, found: dict[str, Any]) -> str:
-    """How far the model, with the gains it came with, is off at most, as a share of what the signal does."""
-    nominal = (found.get("gap") or {}).get("nominal") or {}
-    noise = (found.get("gap") or {}).get("noise_floor") or {}
-    worst: tuple[float, str, str, float] | None = None
-    for line in nominal.values():
-        for output, errors in line.items():
-            for experiment, rmse in errors.items():
-                swing = _swing(results, output, experiment)
-                if rmse is None or rmse < 2.0 * (noise.get(output) or 0.0):
-                    continue  # what is missed there is noise
-                if swing and (worst is None or rmse / swing > worst[0]):
-                    worst = rmse / swing, output, experiment, rmse
-    if worst is None:
+    """How far the model, with the gains it came with, is off at most: as a share of what the signal does, or where no course
+    of it is at hand in times of its noise."""
+    gap = found.get("gap") or {}
+    noise = gap.get("noise_floor") or {}
+    missed = [
+        (output, experiment, rmse)
+        for line in (gap.get("nominal") or {}).values()
+        for output, errors in line.items()
+        for experiment, rmse in errors.items()
+        if rmse is not None and rmse >= 2.0 * (noise.get(output) or 0.0)  # less than that is noise
+    ]
+    if not missed:
         return "With the gains it came with, your model follows every recorded signal to within twice its noise."
-    share, output, experiment, rmse = worst
+    shares = [(m[2] / swing, m) for m in missed if (swing := _swing(results, *m[:2]))]
+    times = [(m[2] / floor, m) for m in missed if (floor := noise.get(m[0]))]
+    most, (output, experiment, rmse) = max(shares or times or [(m[2], m) for m in missed])
+    how = (
+        f"by {100 * most:.2g} % of all that it does there "
+        if shares
+        else f"by {most:.3g} times its noise "
+        if times
+        else ""
+    )
     units = {**(results.get("fit").get("units") or {}), **(results.get("simulation").get("units") or {})}
-    unit = units.get(output, "")
     return (
-        f"With the gains it came with, your model misses {output} in experiment '{experiment}' by "
-        f"{100 * share:.2g} % of all that it does there (RMSE {rmse:.3g} {unit}), more than any other recorded signal."
+        f"With the gains it came with, your model misses {output} in experiment '{experiment}' {how}(RMSE {rmse:.3g} "
+        f"{units.get(output, '')}), more than any other recorded signal."
     ).replace(" )", ")")
 
 

@@ -92,6 +92,13 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
     assert letter.attached == ("augmented-model.toml",)
 
 
+def test_what_is_missed_is_told_in_noise_where_no_course_is_at_hand(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, diagnosis())
+    (folder / "simulation.step.csv").unlink()
+    missed, *_ = letter_of(Results(folder)).sentences
+    assert "misses P2 in experiment 'step' by 20 times its noise (RMSE 0.02 pu)" in missed
+
+
 def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp_path: Path) -> None:
     rivals = [{"effect": n, "at": ["P2_m"], "delta_bic": d} for n, d in (("delay", 0.0), ("lag", 2.0))]
     found = diagnosis(ambiguity=[rivals], remaining={"adequate": False})
