@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.trials import all_far, excess, like_noise, once_more
 
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
-LEAST_SCORE = 0.1
+LEAST_SCORE = 0.25
 """The same where there is one: the sizes that it is of may be none that the refit came to, as of a moving mean's zeros."""
 NEARLY = 0.1
 """Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
