@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from hvdc_ident.discrepancy.begin import Placed
-from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.effects import effects
 from hvdc_ident.trajectory import Array
@@ -25,6 +25,9 @@ class Constancy:
     p: float
 
 
+NOTHING = Constancy(0.0, 1.0)
+
+
 def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
     """How far the experiments ask for different sizes of an effect, to first order, by an F test.
 
@@ -36,12 +39,11 @@ def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
     names = left.problem.names
     own = [names.index(n) for n in placed.names.values() if n in names]
     if effects()[placed.candidate.effect].scanned or not own:
-        return Constancy(0.0, 1.0)
+        return NOTHING
     more = _by_experiment(left, own)
-    rows = refit.effective / refit.rows * left.residual.size
-    spare = rows - left.basis.shape[1] - more.shape[1]
+    spare = refit.effective - left.basis.shape[1] - more.shape[1]
     if not more.shape[1] or spare < 1.0:
-        return Constancy(0.0, 1.0)
+        return NOTHING
     remains = left.projected(left.residual)
     told = float(np.sum((more.T @ remains) ** 2))
     share = told / max(float(remains @ remains) - told, np.finfo(float).tiny)
@@ -53,6 +55,5 @@ def _by_experiment(left: Nominal, own: list[int]) -> Array:
     slopes = np.vstack([b.jacobian for b in left.blocks])[:, own]
     experiment = np.concatenate([np.full(b.residual.size, b.experiment) for b in left.blocks])
     each = np.hstack([np.where((experiment == e)[:, None], slopes, 0.0) for e in dict.fromkeys(experiment.tolist())])
-    each = each[:, np.linalg.norm(each, axis=0) > 0.0]
-    u, s, _ = np.linalg.svd(left.projected(each / np.linalg.norm(each, axis=0)), full_matrices=False)
+    u, s, _ = np.linalg.svd(left.projected(unit_columns(each)), full_matrices=False)
     return np.asarray(u[:, s > TOLD])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hvdc_ident.discrepancy.adequacy import loud_after_breaks
@@ -13,6 +14,7 @@ from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Trial
 from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.discrepancy.trials import LOUD
+from hvdc_ident.effects import effects
 
 TRIFLE = 0.005
 """Share of what is explained of which nothing is made: of real records no model leaves noise alone."""
@@ -45,6 +47,17 @@ def doubt(
         or _not_foretold(outcome.refit, told, floor)
         or _more(outcome, trifle, options)
     )
+
+
+def remains(names: Sequence[str], left: str) -> Doubt:
+    """That more than noise is left: what is there does not leave anything, what stands in its place does.
+
+    A relay looks like a coupling with a backlash, or like a quantiser. names: the effects that were put in; left: where the
+    rest is, as a sentence.
+    """
+    each = list(dict.fromkeys(names))
+    apart = "Each of them by itself. " if len(names) > 1 else ""
+    return Doubt(left, apart + ". ".join(f"{n}: {effects()[n].excited_by}" for n in each))
 
 
 def _quick(left: Nominal) -> Doubt | None:

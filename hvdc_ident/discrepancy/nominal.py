@@ -68,7 +68,7 @@ class Nominal:
         """(N, k) orthonormal, and to the basis: what unknown starts of the states can make of the residual besides."""
         if self.problem.unsettled:
             return np.zeros((self.residual.size, 0))
-        left = self.projected(_unit(self.problem.starts(self.theta)))
+        left = self.projected(unit_columns(self.problem.starts(self.theta)))
         return orthonormal(left[:, np.linalg.norm(left, axis=0) > 1e-6])
 
     @property
@@ -91,7 +91,7 @@ class Nominal:
         return found
 
 
-def _unit(columns: Array) -> Array:
+def unit_columns(columns: Array) -> Array:
     """The columns that are not 0, of length 1."""
     norms = np.linalg.norm(columns, axis=0)
     return np.asarray(columns[:, norms > 0] / norms[norms > 0])
@@ -99,7 +99,7 @@ def _unit(columns: Array) -> Array:
 
 def orthonormal(columns: Array) -> Array:
     """(N, k) an orthonormal basis of what the columns, each as long as the others, span beyond rounding."""
-    unit = _unit(columns)
+    unit = unit_columns(columns)
     if not unit.shape[1]:
         return unit
     u, s, _ = np.linalg.svd(unit, full_matrices=False)

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.discrepancy.adequacy import Binned, adequacy
 from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.beyond import beyond
-from hvdc_ident.discrepancy.doubts import TRIFLE, Doubt, doubt
+from hvdc_ident.discrepancy.doubts import TRIFLE, Doubt, doubt, remains
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import silent, worst
@@ -127,11 +127,8 @@ def _named(
     if worst.excess <= options.refuted * explained:
         if others or (len(sets) == 1 and worst.excess <= TRIFLE * explained):
             return Judgement(kind, f"Missing: {like}. It is not all of it: {left}.", tests, sets)
-        # A relay looks like a coupling with a backlash, or like a quantiser; what is there does not leave anything.
-        names = list(dict.fromkeys(group[0].effect for group in sets))
-        apart, what = ("Each of them by itself. ", f"{labels} beside each other") if len(sets) > 1 else ("", labels)
-        against = Doubt(left, apart + ". ".join(f"{e}: {effects()[e].excited_by}" for e in names))
-        return _in_doubt(Judgement(kind, "", tests, sets), what, against)
+        together = f"{labels} beside each other" if len(sets) > 1 else labels
+        return _in_doubt(Judgement(kind, "", tests, sets), together, remains([g[0].effect for g in sets], left))
     if _all_of_one_kind(sets) and worst.excess < (1.0 - DOMINANT) * explained:
         return Judgement(kind, f"Missing: something like {like}. None is all of it: {left}.", tests, sets)
     text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {left}."

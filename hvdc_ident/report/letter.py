@@ -82,13 +82,11 @@ def _missed(results: Results, found: dict[str, Any]) -> str:
     shares = [(m[2] / swing, m) for m in missed if (swing := _swing(results, *m[:2]))]
     times = [(m[2] / floor, m) for m in missed if (floor := noise.get(m[0]))]
     most, (output, experiment, rmse) = max(shares or times or [(m[2], m) for m in missed])
-    how = (
-        f"by {100 * most:.2g} % of all that it does there "
-        if shares
-        else f"by {most:.3g} times its noise "
-        if times
-        else ""
-    )
+    how = ""
+    if shares:
+        how = f"by {100 * most:.2g} % of all that it does there "
+    elif times:
+        how = f"by {most:.3g} times its noise "
     units = {**(results.get("fit").get("units") or {}), **(results.get("simulation").get("units") or {})}
     return (
         f"With the gains it came with, your model misses {output} in experiment '{experiment}' {how}(RMSE {rmse:.3g} "
