@@ -1,4 +1,4 @@
-"""The two ways to a steady state that Newton's method does not find, compiled: steps of least norm, and following the model."""
+"""The ways to a steady state that Newton's method does not find, compiled: steps of least norm, and following the model."""
 
 from __future__ import annotations
 
@@ -106,7 +106,70 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
             if np.abs(step).max() < 1e-14:
                 return
 
-    return follow, nearest
+    @njit(cache=True, error_model="numpy")
+    def slide(address, inner, nu, nx, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
+        """Moves v (n,) by implicit Euler steps that are solved each, with steps cut short where a jump lies in their way.
+
+        A loop that comes to rest on the edge of a jump is driven to it from both sides: a step that is not solved for
+        goes past the edge, and the next one back. One that is halved as long as it leads past ends within the edge.
+        """
+        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  as above
+        r, ahead, step, weight = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        x, trial, off = np.zeros(n), np.zeros(n), np.zeros(n)
+        jac, matrix, pivots = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n, np.int64)
+        h = 1e-3
+        for _ in range(200):
+            x[:] = v
+            solved, first = False, 0.0
+            for k in range(60):
+                equations(address, y, w, wd, p, m, inner, 1 + nu, x, r, jac)
+                if not (np.isfinite(r).all() and np.isfinite(jac).all()):
+                    return
+                for i in range(n):
+                    for j in range(n):
+                        matrix[i, j] = -jac[i, j]
+                    off[i] = -r[i]
+                    if i < nx:
+                        matrix[i, i] += 1.0 / h
+                        off[i] += (x[i] - v[i]) / h
+                measures(matrix, x, size, weight)
+                before = norm(off, weight)
+                if k == 0:
+                    first = before
+                if before <= 1e-4 * first or before < 1e-2 * ACCURACY:
+                    solved = True
+                    break
+                step[:] = off
+                if not lu(matrix, pivots):
+                    break
+                solve(matrix, pivots, step)
+                damping, better = 1.0, False
+                while damping > 1e-5 and not better:
+                    for i in range(n):
+                        trial[i] = x[i] - damping * step[i]
+                    residual(address, y, w, wd, p, m, n, inner, 1 + nu, trial, ahead)
+                    for i in range(n):
+                        ahead[i] = -ahead[i]
+                        if i < nx:
+                            ahead[i] += (trial[i] - v[i]) / h
+                    better = norm(ahead, weight) < before
+                    damping /= 2
+                if not better:
+                    break
+                x[:] = trial
+            if solved:
+                v[:] = x
+                equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
+                measures(jac, v, size, weight)
+                if norm(r, weight) < 1e-2 * ACCURACY:
+                    return
+                h = min(3.0 * h, 1e9)
+            else:
+                h *= 0.25
+                if h < 1e-12:
+                    return
+
+    return follow, nearest, slide
 
 
-follow, nearest = _entries(stamp())
+follow, nearest, slide = _entries(stamp())

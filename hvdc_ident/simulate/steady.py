@@ -20,7 +20,7 @@ def fallback(
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
     # Compiled when it is needed first: who never needs it does not wait for the compiler.
     from hvdc_ident.simulate.machine import evaluate
-    from hvdc_ident.simulate.patient import follow, nearest
+    from hvdc_ident.simulate.patient import follow, nearest, slide
     from hvdc_ident.simulate.rest import MODES, RESIDUAL, REST_JAC, REST_P
 
     s = structure.sizes
@@ -50,7 +50,11 @@ def fallback(
             nearest(address, inner, s.nu, *model, v)
         r, jac = equations(v)
         if not near.is_rest(r, jac, v):
-            raise _refused(structure, near, r, jac, v)
+            followed, v = v, begin.copy()
+            slide(address, inner, s.nu, s.nx, *model, v)
+            r, jac = equations(v)
+            if not near.is_rest(r, jac, v):
+                raise _refused(structure, near, *equations(followed), followed)
     if s.width:
         rows = np.zeros(n * s.width)
         evaluate(address[REST_P], y, w, p, m, rows)

@@ -145,14 +145,17 @@ def test_both_simulators_agree_on_the_plants(plant):
     assert slots == set(plant.slots)
 
 
-def test_a_quantiser_in_a_loop_comes_to_the_same_sliding_rest():
-    quiet = [Run()]
-    hidden = [Hidden("quantisation", "Pm", {"step": 0.03})]
-    mine = simulate(STATION, quiet, hidden, rows=50)[:, 0].mean(axis=0)
-    model = model_of("station").with_effects([EffectUse("quantisation", ("Pm",), FrozenMap({"step": 0.03}))])
-    theirs = package(model, experiment("e", TIME[:50]), outputs=("P", "Vdc")).trajectory.values.mean(axis=0)
-    np.testing.assert_allclose(mine[:2], theirs, atol=1e-3)
-    assert theirs[0] == pytest.approx(0.495, abs=1e-3), "0.5 lies between two levels; P slides at the edge below"
+@pytest.mark.parametrize("plant, at, step", [(STATION, "Pm", 0.03), (DRIVE, "torque", 0.0236), (DRIVE, "wm", 0.03)])
+def test_a_quantiser_in_a_loop_comes_to_the_same_sliding_rest(plant, at, step):
+    """It lies on an edge, and the loop drives it there from both sides."""
+    mine = simulate(plant, [Run()], [Hidden("quantisation", at, {"step": step})], rows=50)[:, 0].mean(axis=0)
+    model = model_of(plant.name).with_effects([EffectUse("quantisation", (at,), FrozenMap({"step": step}))])
+    watched = plant.outputs[:2]
+    theirs = package(model, experiment("e", TIME[:50]), outputs=watched).trajectory.values
+    assert np.ptp(theirs, axis=0).max() < 1e-6, "it is a rest"
+    np.testing.assert_allclose(mine[:2], theirs.mean(axis=0), atol=1e-3)
+    if at == "Pm":
+        assert theirs[0, 0] == pytest.approx(0.495, abs=1e-3), "0.5 lies between two levels; P slides at the edge below"
 
 
 @pytest.mark.parametrize("lead", [0.0, 1.0])
