@@ -38,6 +38,59 @@ def norm(r, weight):  # type: ignore[no-untyped-def]
     return np.sqrt(total)
 
 
+@kernel()
+def unsolved(r, x, v, h, nx, off):  # type: ignore[no-untyped-def]
+    """Writes into off (n,) what an implicit Euler step of length h from v to x leaves, r being the residual at x."""
+    for i in range(x.size):
+        off[i] = -r[i]
+        if i < nx:
+            off[i] += (x[i] - v[i]) / h
+
+
+@kernel()
+def stepped(address, inner, nu, nx, y, w, wd, p, m, size, v, h, x):  # type: ignore[no-untyped-def]
+    """Writes the end of an implicit Euler step of length h from v into x (n,); whether it was found.
+
+    Newton's method; a change that leads past a jump is halved until it leads nearer, so that it ends within the edge.
+    """
+    n = v.size
+    r, off, ahead, trial, weight = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    matrix, pivots = np.zeros((n, n)), np.zeros(n, np.int64)
+    goal = 1e-2 * ACCURACY
+    x[:] = v
+    for k in range(60):
+        equations(address, y, w, wd, p, m, inner, 1 + nu, x, r, matrix)
+        for i in range(n):
+            for j in range(n):
+                matrix[i, j] = -matrix[i, j]
+            if i < nx:
+                matrix[i, i] += 1.0 / h
+        unsolved(r, x, v, h, nx, off)
+        measures(matrix, x, size, weight)
+        before = norm(off, weight)
+        if not before < np.inf:
+            return False
+        if k == 0:
+            goal = max(goal, 1e-4 * before)
+        if before <= goal:
+            return True
+        if not lu(matrix, pivots):
+            return False
+        solve(matrix, pivots, off)
+        damping, better = 1.0, False
+        while damping > 1e-5 and not better:
+            for i in range(n):
+                trial[i] = x[i] - damping * off[i]
+            residual(address, y, w, wd, p, m, n, inner, 1 + nu, trial, r)
+            unsolved(r, trial, v, h, nx, ahead)
+            better = norm(ahead, weight) < before
+            damping /= 2
+        if not better:
+            return False
+        x[:] = trial
+    return False
+
+
 def _entries(stamp):  # type: ignore[no-untyped-def]
     """What Python calls, for the present state of the kernels' files."""
 
@@ -108,57 +161,17 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
 
     @njit(cache=True, error_model="numpy")
     def slide(address, inner, nu, nx, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
-        """Moves v (n,) by implicit Euler steps that are solved each, with steps cut short where a jump lies in their way.
+        """Moves v (n,) by implicit Euler steps that are solved each: to a rest on the edge of a jump too.
 
-        A loop that comes to rest on the edge of a jump is driven to it from both sides: a step that is not solved for
-        goes past the edge, and the next one back. One that is halved as long as it leads past ends within the edge.
+        A loop that rests there is driven to it from both sides: a step that is not solved for goes past the edge, and the
+        next one back.
         """
         kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  as above
-        r, ahead, step, weight = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-        x, trial, off = np.zeros(n), np.zeros(n), np.zeros(n)
-        jac, matrix, pivots = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n, np.int64)
+        r, jac, weight, end = np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n)
         h = 1e-3
         for _ in range(200):
-            x[:] = v
-            solved, first = False, 0.0
-            for k in range(60):
-                equations(address, y, w, wd, p, m, inner, 1 + nu, x, r, jac)
-                if not (np.isfinite(r).all() and np.isfinite(jac).all()):
-                    return
-                for i in range(n):
-                    for j in range(n):
-                        matrix[i, j] = -jac[i, j]
-                    off[i] = -r[i]
-                    if i < nx:
-                        matrix[i, i] += 1.0 / h
-                        off[i] += (x[i] - v[i]) / h
-                measures(matrix, x, size, weight)
-                before = norm(off, weight)
-                if k == 0:
-                    first = before
-                if before <= 1e-4 * first or before < 1e-2 * ACCURACY:
-                    solved = True
-                    break
-                step[:] = off
-                if not lu(matrix, pivots):
-                    break
-                solve(matrix, pivots, step)
-                damping, better = 1.0, False
-                while damping > 1e-5 and not better:
-                    for i in range(n):
-                        trial[i] = x[i] - damping * step[i]
-                    residual(address, y, w, wd, p, m, n, inner, 1 + nu, trial, ahead)
-                    for i in range(n):
-                        ahead[i] = -ahead[i]
-                        if i < nx:
-                            ahead[i] += (trial[i] - v[i]) / h
-                    better = norm(ahead, weight) < before
-                    damping /= 2
-                if not better:
-                    break
-                x[:] = trial
-            if solved:
-                v[:] = x
+            if stepped(address, inner, nu, nx, y, w, wd, p, m, size, v, h, end):
+                v[:] = end
                 equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
                 measures(jac, v, size, weight)
                 if norm(r, weight) < 1e-2 * ACCURACY:
