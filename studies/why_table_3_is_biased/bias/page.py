@@ -159,7 +159,8 @@ def _bias(axes: Any, told: Mapping[str, Any]) -> None:
     axes.axhline(0, color="black", lw=0.8)
     axes.set(ylabel="off Table I, %")
     axes.set_xticks(np.arange(len(diagnosed.FREE)) + 1.5 * width, diagnosed.FREE)
-    axes.legend(fontsize=8)
+    axes.margins(y=0.5)  # room for the legend
+    axes.legend(fontsize=8, loc="upper left")
 
 
 def _curves(axes: Any, lines: Mapping[str, Any]) -> None:
