@@ -41,6 +41,8 @@ AGAIN = 4
 """Refits of one effect at most whose size is looked for again beside the gains they came to."""
 WORTHY = 0.5
 """Share of the best fall of chi2 from which that is worth its time."""
+TELLING = 0.1
+"""Share of what the model before leaves beyond noise from which it is: noise that is louder than was told leaves falls too."""
 
 
 def refitted(
@@ -72,7 +74,7 @@ def once_more(
     """
     found, was = opened.candidates, opened.before.chi2
     order = by_cost(trials)
-    goal = WORTHY * (was - min([best, *(t.refit.chi2 for t in order)]))
+    goal = max(WORTHY * (was - min([best, *(t.refit.chi2 for t in order)])), TELLING * (was - opened.before.rows))
     chosen: dict[str, list[Trial]] = {}
     for t in sorted(order, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
