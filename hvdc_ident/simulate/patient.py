@@ -1,4 +1,7 @@
-"""The ways to a steady state that Newton's method does not find, compiled: steps of least norm, and following the model."""
+"""The ways to a steady state that Newton's method does not find, compiled: steps of least norm, and following the model.
+
+What follows it takes one Newton step for each in time, or solves each, which is slower and ends on the edge of a jump too.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +42,16 @@ def norm(r, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def advancing(jac, h, nx, matrix):  # type: ignore[no-untyped-def]
+    """Writes the Jacobian (n, n) of an implicit Euler step of length h, jac being that of the rest residual; it may be matrix."""
+    for i in range(jac.shape[0]):
+        for j in range(jac.shape[0]):
+            matrix[i, j] = -jac[i, j]
+        if i < nx:
+            matrix[i, i] += 1.0 / h
+
+
+@kernel()
 def unsolved(r, x, v, h, nx, off):  # type: ignore[no-untyped-def]
     """Writes into off (n,) what an implicit Euler step of length h from v to x leaves, r being the residual at x."""
     for i in range(x.size):
@@ -60,11 +73,7 @@ def stepped(address, inner, nu, nx, y, w, wd, p, m, size, v, h, x):  # type: ign
     x[:] = v
     for k in range(60):
         equations(address, y, w, wd, p, m, inner, 1 + nu, x, r, matrix)
-        for i in range(n):
-            for j in range(n):
-                matrix[i, j] = -matrix[i, j]
-            if i < nx:
-                matrix[i, i] += 1.0 / h
+        advancing(matrix, h, nx, matrix)
         unsolved(r, x, v, h, nx, off)
         measures(matrix, x, size, weight)
         before = norm(off, weight)
@@ -104,12 +113,8 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
         measures(jac, v, size, weight)
         before, h = norm(r, weight), 1e-4
         for _ in range(300):
-            for i in range(n):
-                for j in range(n):
-                    matrix[i, j] = -jac[i, j]
-                if i < nx:
-                    matrix[i, i] += 1.0 / h
-                step[i] = r[i]
+            advancing(jac, h, nx, matrix)
+            step[:] = r
             if not lu(matrix, pivots):
                 h *= 0.3
                 continue

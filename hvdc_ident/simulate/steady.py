@@ -40,21 +40,29 @@ def fallback(
     near = _Region.of(structure, guess, extra)
     begin = np.concatenate([guess, np.zeros(extra)])
     model = (y, w, np.ascontiguousarray(p, dtype=float), m, near.size)
+
+    def closest(v: Array) -> None:
+        nearest(address, inner, s.nu, *model, v)
+
+    def followed(v: Array) -> None:
+        follow(address, inner, s.nu, s.nx, *model, v)
+        closest(v)
+
+    def slid(v: Array) -> None:
+        slide(address, inner, s.nu, s.nx, *model, v)
+
+    ends: list[Array] = []
     with np.errstate(all="ignore"):
         # The rest next to the guess comes first; where there are several, following the model may end at a far one.
-        v = begin.copy()
-        nearest(address, inner, s.nu, *model, v)
-        if not near.is_rest(*equations(v), v):
+        for way in (closest, followed, slid):
             v = begin.copy()
-            follow(address, inner, s.nu, s.nx, *model, v)
-            nearest(address, inner, s.nu, *model, v)
-        r, jac = equations(v)
-        if not near.is_rest(r, jac, v):
-            followed, v = v, begin.copy()
-            slide(address, inner, s.nu, s.nx, *model, v)
+            way(v)
             r, jac = equations(v)
-            if not near.is_rest(r, jac, v):
-                raise _refused(structure, near, *equations(followed), followed)
+            if near.is_rest(r, jac, v):
+                break
+            ends.append(v)
+        else:
+            raise _refused(structure, near, *equations(ends[1]), ends[1])  # where the model went is what tells most
     if s.width:
         rows = np.zeros(n * s.width)
         evaluate(address[REST_P], y, w, p, m, rows)
