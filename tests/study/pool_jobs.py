@@ -40,3 +40,8 @@ class Unloadable:
 def environment(name):
     """A variable of the worker's environment."""
     return os.environ.get(name)
+
+
+def process(_):
+    """Which process the item is worked out in."""
+    return os.getpid()

@@ -35,6 +35,18 @@ def test_map_keeps_the_order_and_raises():
         list(LocalPool(1).map(pool_jobs.Job(fails={2}), range(5)))
 
 
+def test_workers_stay_where_nobody_asks_for_more_than_the_last_item():
+    with LocalPool(1).open() as pool:
+        first = pool.map(pool_jobs.process, [1])
+        worker = next(first)
+        first.close()
+        assert list(pool.map(pool_jobs.process, [1, 2])) == [worker, worker]
+        left = pool.map(pool_jobs.process, range(4))
+        next(left)
+        left.close()  # what it was at when nobody listened any more is never taken for a later run's
+        assert list(pool.map(pool_jobs.Job(), range(5))) == [0, 1, 4, 9, 16]
+
+
 def test_nothing_to_do_and_nothing_that_works():
     assert list(LocalPool(2).run(pool_jobs.Job(), [])) == []
     with pytest.raises(ComputationError, match="cannot be started"):

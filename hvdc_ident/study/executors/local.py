@@ -260,8 +260,12 @@ class _Session:
         _end(worker)
 
     def close(self) -> None:
+        """Nothing; workers that are at nothing wait for the next run, also where nobody asks for what comes after the last item."""
         for worker in list(self.workers):
-            self._end(worker)
+            if worker.ready and not worker.pending:
+                self._retire(worker)
+            else:
+                self._end(worker)
 
 
 def _started(memory: int | None) -> _Worker:
