@@ -164,7 +164,11 @@ class Problem:
         for e in self.fitted_experiments:
             local = [*(f.name for f in self.free), *(unknown_of(e.name, n) for n in e.nuisance)]
             columns = [names.index(n) for n in local]
-            for block in self._experiment(e, theta, derivatives, treatment):
+            found = self._experiment(e, theta, derivatives, treatment)
+            if derivatives and len(local) == len(names):  # every unknown is one of this experiment's, in their order
+                parts += found
+                continue
+            for block in found:
                 jacobian = np.zeros((block.residual.size, len(names)))
                 if derivatives:
                     jacobian[:, columns] = block.jacobian

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,13 +145,18 @@ def residual_blocks(
         misfit = experiment.measured[output][rows] - seen.values[output][rows]
         weight, time, where = sigma[output], experiment.time[rows], f"experiment '{experiment.name}'"
         slopes = -seen.gradient[output][rows]
-        treated = treatment.applied(np.column_stack([misfit, slopes]) / weight, time, output, where)
-        block = Block(experiment.name, output, rows, misfit, weight, treated[:, 0].copy(), treated[:, 1:])
         rounding = treatment.rounded(output)
         if rounding is not None:
             residual, slope = rounding.residual(misfit)
-            jacobian = slopes * slope[:, None]
-            block = replace(block, residual=residual, jacobian=jacobian, slope=slope, spare=rounding.spare)
+            jacobian, spare = slopes * slope[:, None], rounding.spare
+        else:
+            both = np.empty((rows.size, 1 + slopes.shape[1]))
+            both[:, 0], both[:, 1:] = misfit / weight, slopes / weight
+            treated = treatment.applied(both, time, output, where)
+            residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
+        block = Block(
+            experiment.name, output, rows, misfit, weight, residual, jacobian, slope=slope, spare=spare
+        )  # fmt: skip
         blocks.append(block)
         raw.append(slopes[:, k : k + len(loose)])
     return freed(blocks, raw, slice(k, k + len(loose))) if loose else tuple(blocks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -87,21 +88,26 @@ class Coordinates:
 
     unknowns: tuple[Free, ...]
 
-    @property
+    @cached_property
     def log(self) -> Array:
         """(p,) bool: which are logarithms."""
         return np.array([u.log for u in self.unknowns], dtype=bool)
 
-    @property
+    @cached_property
     def span(self) -> Array:
         """(p,): the length of a coordinate's unit where it is not a logarithm, in the unknown's unit."""
         return np.array([u.span for u in self.unknowns])
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """(p,), (p,): the bounds in scaled coordinates."""
-        low, high = (np.array([getattr(u, side) for u in self.unknowns]) for side in ("min", "max"))
+        low, high = self._limits
         return self.scaled(low), self.scaled(high)
+
+    @cached_property
+    def _limits(self) -> tuple[Array, Array]:
+        """(p,), (p,): the bounds in the unknowns' units."""
+        return np.array([u.min for u in self.unknowns]), np.array([u.max for u in self.unknowns])
 
     def scaled(self, theta: Array) -> Array:
         """x of theta, (p,)."""
@@ -110,7 +116,7 @@ class Coordinates:
     def unscaled(self, x: Array) -> Array:
         """Theta of x, (p,), inside the bounds to the last digit."""
         theta = np.where(self.log, np.exp(np.where(self.log, x, 0.0)), x * self.span)
-        low, high = (np.array([getattr(u, side) for u in self.unknowns]) for side in ("min", "max"))
+        low, high = self._limits
         x_low, x_high = self.bounds
         with np.errstate(invalid="ignore"):
             theta = np.where(x <= x_low + 1e-14 * (1.0 + np.abs(x_low)), low, theta)
