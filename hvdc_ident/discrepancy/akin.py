@@ -26,7 +26,7 @@ LEADERS = 4
 STARTS = 2
 """Sizes that another kind of delay is begun at."""
 EFFORT = 600_000
-"""Refits of what bends its signal, times the rows of the records."""
+"""Sizes of what bends its signal, times the rows of the records."""
 LIKE = 0.15
 """Of a logarithm: up to where two delays are alike."""
 

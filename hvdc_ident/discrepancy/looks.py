@@ -13,7 +13,18 @@ from hvdc_ident.discrepancy.scores import signature_rows
 from hvdc_ident.discrepancy.select import Pick, Trial, neighbours, others, shortlist
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search
-from hvdc_ident.discrepancy.trials import HEAT, LONGER, RACE, all_far, best_each, by_cost, on_bound, once_more, refitted
+from hvdc_ident.discrepancy.trials import (
+    HEAT,
+    PROMISING,
+    RACE,
+    TELLING,
+    all_far,
+    best_each,
+    by_cost,
+    on_bound,
+    once_more,
+    refitted,
+)
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
@@ -69,6 +80,13 @@ class Stand:
         """Whether no refit comes near the noise."""
         return all_far(self.opened.before, self.trials)
 
+    @property
+    def anything_told(self) -> bool:
+        """Whether a refit takes away a share of what is beyond noise: where none does, the noise is louder than was told."""
+        before = self.opened.before
+        least = before.chi2 - TELLING * (before.chi2 - before.rows)
+        return any(not t.refit.failure and t.refit.chi2 < least for t in self.trials)
+
 
 Look = Callable[[Stand], Stand]
 
@@ -85,7 +103,7 @@ def looked(
     # Beside an effect that is there already the others cost more than they have been seen to find.
     for look in AT_FIRST if number == 1 else ():
         stand = look(stand)
-    for look in WHERE_FAR if number == 1 else ():
+    for look in WHERE_FAR if number == 1 and stand.anything_told else ():
         if not stand.far:
             break
         stand = look(stand)
@@ -123,7 +141,9 @@ def _twins(stand: Stand) -> Stand:
 
 
 def _elsewhere(stand: Stand) -> Stand:
-    """The best effects at other places."""
+    """The best effects at other places; beside effects that are there already where one of them comes near the noise."""
+    if stand.number > 1 and stand.far:
+        return stand
     return stand.with_more(elsewhere(stand.search, stand.opened, stand.picks, stand.trials, stand.number))
 
 
@@ -158,8 +178,8 @@ def _the_others(stand: Stand) -> Stand:
 
 
 def _from_every_size(stand: Stand) -> Stand:
-    """What bends its signal, from every size probed."""
-    return stand.with_best(stand.refits(bends(stand.opened), "from every size", LONGER))
+    """What bends its signal, from the sizes that promise most of every one probed."""
+    return stand.with_best(stand.refits(bends(stand.opened), "from every size", PROMISING))
 
 
 def _once_more(stand: Stand) -> Stand:

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.refit import Job, Refit, find
+from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.executor import mapped
+from hvdc_ident.fit.problem import stacked
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy.state import Search
@@ -21,12 +24,21 @@ class Race:
 
     sprint: evaluations of every refit at first; more are for those within reach of the best. reach: share of the best
     refit's fall of chi2 from which another that has not ended is within its reach. second: refits, the best of the first
-    sprint, that run another before that is asked.
+    sprint, that run another before that is asked. entrants: refits that are run at all, those that promise most.
     """
 
     sprint: int = 15
     reach: float = 0.7
     second: int = 0
+    entrants: int | None = None
+
+    def admitted(self, search: Search, jobs: Sequence[Job], text: str) -> list[int]:
+        """Which of the jobs are run, in their order."""
+        if self.entrants is None or len(jobs) <= self.entrants:
+            return list(range(len(jobs)))
+        search.tell(0, len(jobs), f"{text}: what {len(jobs)} sizes promise")
+        promised = np.array(list(mapped(search.executor, promise, jobs)))
+        return sorted(np.argsort(promised, kind="stable")[: self.entrants].tolist())
 
     def run(
         self, search: Search, before: float, jobs: Sequence[Job], texts: Sequence[str], best: float = np.inf
@@ -47,6 +59,17 @@ class Race:
         near = [k for k in running if not refits[k].ended and gained[k] >= goal]
         rest = [replace(j, evaluations=j.evaluations - self.sprint) for j in jobs]
         return _on(search, rest, refits, near, [f"{t}, to the end" for t in texts])
+
+
+def promise(job: Job) -> float:
+    """chi2 that a refit comes to from where it begins first, to first order; infinite where the model does not run there."""
+    try:
+        residual, jacobian = stacked(job.problem.blocks(job.begins[0]))
+    except SimulationError:
+        return np.inf
+    if not np.isfinite(jacobian).all():
+        return np.inf
+    return float(residual @ residual - np.sum((orthonormal(jacobian).T @ residual) ** 2))
 
 
 def _on(

@@ -15,6 +15,7 @@ from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import closed, one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
 from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.discrepancy.trials import is_far
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Free
@@ -33,8 +34,10 @@ def settled(
     doing without it.
 
     here: the refit of the model `first` with several effects; kept: the rounds that brought them; number: rounds so far.
+    Where all of them together are far from noise none is what is missing, and none is looked for again.
     """
     kept, notes = list(kept), []
+    near = not is_far(first, here)
     k = 0
     while k < len(kept):
         search.tell(k, len(kept), f"again with the others: {here.placed[k].candidate.label}")
@@ -52,9 +55,10 @@ def settled(
             del kept[k]
             continue
         try:
-            again, winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
-            kept[k] = again.light()
-            here = _in_place(winner.refit, k)
+            if near:
+                again, winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
+                kept[k] = again.light()
+                here = _in_place(winner.refit, k)
         except SimulationError as error:  # refitted it runs, as far as a refit needs it to
             notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
         k += 1

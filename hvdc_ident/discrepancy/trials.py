@@ -23,8 +23,8 @@ from hvdc_ident.model.external import AnyModel
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4, second=20)
 """For many candidates: a short sprint, and another for the best."""
-LONGER = Race(sprint=6, reach=0.4, second=80)
-"""For those that begin far from where they end."""
+PROMISING = Race(sprint=6, reach=0.4, second=20, entrants=40)
+"""For many sizes, most of which do nothing or nearly all. The right one was eighth where no other look found it."""
 PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
 NEAR = 0.05
@@ -48,7 +48,7 @@ TELLING = 0.1
 def refitted(
     search: Search, opened: Round, picks: Sequence[Pick], text: str, earlier: Sequence[Trial] = (), race: Race = RACE
 ) -> list[Trial]:
-    """The picks refitted, in a race with each other and with those refitted earlier."""
+    """The picks refitted, those that the race admits, in a race with each other and with those refitted earlier."""
     before, found = opened.before, opened.candidates
     jobs, of, trials = [], [], []
     made: dict[Hashable, AnyModel] = {}
@@ -59,6 +59,8 @@ def refitted(
         except HvdcIdentError as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
             trials.append(Trial(p, none, -np.inf))
+    admitted = race.admitted(search, jobs, text)
+    jobs, of = [jobs[k] for k in admitted], [of[k] for k in admitted]
     texts = [f"{text}: {found[p.candidate].label}" for p in of]
     best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
     refits = race.run(search, before.chi2, jobs, texts, best)
@@ -132,11 +134,17 @@ def left_by(refit: Refit) -> float:
 
 def all_far(before: Refit, trials: Sequence[Trial], near: float = NEAR) -> bool:
     """Whether no refit comes near the noise, on the fitted data and on the others, or near enough: to a share of what was."""
-    was = left_by(before)
-    far = all(
-        (excess(t.refit) or misses(t.refit)) and left_by(t.refit) > near * was for t in trials if not t.refit.failure
-    )
+    far = all(_leaves_much(before, t.refit, near) for t in trials if not t.refit.failure)
     return far and not any(like_noise(t.refit) for t in by_cost(trials)[:LOOKED_AT])
+
+
+def is_far(before: Refit, refit: Refit) -> bool:
+    """The same of one refit."""
+    return _leaves_much(before, refit, NEAR) and not like_noise(refit)
+
+
+def _leaves_much(before: Refit, refit: Refit, near: float) -> bool:
+    return (excess(refit) or misses(refit)) and left_by(refit) > near * left_by(before)
 
 
 def like_noise(refit: Refit) -> bool:

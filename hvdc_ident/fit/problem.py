@@ -160,7 +160,7 @@ class Problem:
         """
         treatment = replace(self.treatment, band=None) if in_time else self.treatment
         names = self.names
-        parts = []
+        parts: list[Block] = []
         for e in self.fitted_experiments:
             local = [*(f.name for f in self.free), *(unknown_of(e.name, n) for n in e.nuisance)]
             columns = [names.index(n) for n in local]
