@@ -26,7 +26,8 @@ from hvdc_ident.simulate.machine import Code, Function
 from hvdc_ident.trajectory import Array
 
 FINE = 2.5e-4
-"""s: an effect with corners in its derivative is stepped no more coarsely than this, up to eight times a grid interval."""
+"""s: an effect with corners in its derivative is stepped no more coarsely than this, in so many parts of a grid interval as it may take."""
+PARTS = 8
 _NUMPY: dict[str, Any] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "sqrt": np.sqrt,
     "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "asin": np.arcsin,
@@ -107,16 +108,23 @@ class Block:
                 known[n] = _NUMPY[op](*(known[k] for k in a))
         return [known[n] for n in nodes]
 
-    def run(self, parameters: Mapping[str, Array], time: Array, u: Array, source: Array | None) -> Array:
-        """Y, (K, nc), of u and source, (K, nc), at instants (K,), with each parameter (nc,)."""
+    def run(
+        self, parameters: Mapping[str, Array], time: Array, u: Array, source: Array | None, parts: int = PARTS
+    ) -> Array:
+        """Y, (K, nc), of u and source, (K, nc), at instants (K,), with each parameter (nc,).
+
+        parts: of an interval at most, where the effect has corners.
+        """
         if self.quick is not None:
             return self.quick(u, {n: v[None] for n, v in parameters.items()})
         if not self.steps:
             return self._simulated(parameters, time, u, source)
         with np.errstate(all="ignore"):
-            return self._stepped(parameters, time, u, source)
+            return self._stepped(parameters, time, u, source, parts)
 
-    def _stepped(self, parameters: Mapping[str, Array], time: Array, u: Array, source: Array | None) -> Array:
+    def _stepped(
+        self, parameters: Mapping[str, Array], time: Array, u: Array, source: Array | None, parts: int
+    ) -> Array:
         n, m = len(self.states), len(self.model.delays) + len(self.model.sampled)
         inputs = [u] if source is None else [u, source]
         own = [parameters[p] for p in self.model.parameters]
@@ -125,7 +133,7 @@ class Block:
         memory = self._memory(whole, time, u)
         whole[n : n + m] = memory
         if n:
-            whole[:n] = self._states(whole, time, own)
+            whole[:n] = self._states(whole, time, own, parts)
         return np.asarray(np.broadcast_to(self.value([self.output], whole)[0], u.shape), dtype=float)
 
     def _memory(self, whole: list[Any], time: Array, u: Array) -> list[Array]:
@@ -141,7 +149,7 @@ class Block:
                 found.append(_held(signal, time, period, compute))
         return found
 
-    def _states(self, whole: list[Any], time: Array, own: list[Array]) -> list[Array]:
+    def _states(self, whole: list[Any], time: Array, own: list[Array], parts: int) -> list[Array]:
         n = len(self.states)
         first = [v[0] if k < len(whole) - len(own) else v for k, v in enumerate(whole)]
         x = self._rest(first)
@@ -150,7 +158,7 @@ class Block:
             driven = np.ascontiguousarray(np.array(whole[n : len(whole) - len(own)]).transpose(2, 0, 1))
             constants = np.ascontiguousarray(np.array([np.broadcast_to(v, x.shape[1:]) for v in own]).T)
             fine = FINE if self.cornered else np.inf
-            march(self._address, time, driven, constants, np.ascontiguousarray(x.T), fine, path)
+            march(self._address, time, driven, constants, np.ascontiguousarray(x.T), fine, parts, path)
         return list(path)
 
     @cached_property

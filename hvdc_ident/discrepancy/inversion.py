@@ -113,10 +113,10 @@ class Inversion:
         """
         # Thousands are compared, and the best run again: half the digits take half the time.
         shown = self._shown @ at_knots.astype(np.float32)
-        raw, square = self.wanted @ shown, np.sum(shown**2, axis=0, dtype=float)
+        raw, square = self.wanted @ shown, np.einsum("ij,ij->j", shown, shown, dtype=float)
         share = np.where(square > SEEN, 1.0 / np.maximum(square, SEEN), 0.0)
-        chance = np.maximum(shown.T @ noise.astype(np.float32), 0.0) ** 2
-        under = np.max(chance * share[:, None], axis=0, initial=0.0)
+        chance = (shown * np.sqrt(share).astype(np.float32)).T @ noise.astype(np.float32)
+        under = np.max(chance, axis=0, initial=0.0).astype(float) ** 2
         return np.where(share > 0, 2.0 * raw - square, 0.0), np.maximum(raw, 0.0) ** 2 * share, under
 
     @cached_property

@@ -11,11 +11,11 @@ from hvdc_ident.simulate.linear import lu, solve
 
 
 @njit(cache=True, error_model="numpy")
-def march(address, time, driven, constants, start, fine, path):  # type: ignore[no-untyped-def]
+def march(address, time, driven, constants, start, fine, most, path):  # type: ignore[no-untyped-def]
     """Writes the states into path (n, K, nc), from start (nc, n), driven (nc, q, K) and constants (nc, r).
 
     The function at the address gives, of [states, driven, constants], the n derivatives and their (n, n + q) rows.
-    x' = f is stepped by h phi_1 f + h^2 phi_2 f_t in the (1, 2) Padé form, no interval longer than `fine`.
+    x' = f is stepped by h phi_1 f + h^2 phi_2 f_t in the (1, 2) Padé form, no interval longer than `fine`, in `most` parts at most.
     """
     nc, q, count = driven.shape
     n, r = start.shape[1], constants.shape[1]
@@ -31,7 +31,7 @@ def march(address, time, driven, constants, start, fine, path):  # type: ignore[
             width = time[k + 1] - time[k]
             if width > 0.0:
                 parts = 1
-                while width / parts > fine and parts < 8:
+                while width / parts > fine and parts < most:
                     parts += 1
                 h = width / parts
                 for part in range(parts):

@@ -50,6 +50,8 @@ BETWEEN = 7
 """Sizes between one of the scan and its neighbour, then."""
 TOGETHER = 400
 """Sizes whose traces are worked out at a time."""
+COARSE = 2
+"""Parts of an interval that an effect with corners is stepped in: what is looked at are means over many."""
 THIN = 150
 """Sizes at which a closed model is run at first."""
 QUICK = Tolerance(rtol=1e-5, atol=1e-8, max_steps=600, search=False)
@@ -243,7 +245,7 @@ def _at_knots(inverse: Inversion, candidate: Candidate, signals: Sequence[Array]
     own = {parameter(n): np.array([p.values[n] for p in candidate.probes]) for n in kind.present}
     for time, u in zip(inverse.time, signals, strict=True):
         wide = np.repeat(u[:, None], len(candidate.probes), axis=1)
-        changes.append(block(kind.effect, kind.present, kind.brings).run(own, time, wide, None) - wide)
+        changes.append(block(kind.effect, kind.present, kind.brings).run(own, time, wide, None, COARSE) - wide)
     return np.nan_to_num(inverse.knots(changes))
 
 
