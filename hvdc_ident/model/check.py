@@ -79,8 +79,6 @@ def _expressions(model: Model) -> Iterator[tuple[str, str, str, sp.Expr, bool]]:
             yield "states", name, "start", state.start, True
         if state.rest is not None:
             yield "states", name, "rest", state.rest, False
-        if state.rest is not None:
-            yield "states", name, "rest", state.rest, False
     for name, signal in model.signals.items():
         yield "signals", name, "", signal.value, False
     for name, unknown in model.algebraic.items():
