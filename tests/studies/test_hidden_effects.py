@@ -16,11 +16,12 @@ from hvdc_ident.discrepancy.akin import bends
 from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.hops import hopped
+from hvdc_ident.discrepancy.jobs import job
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.refit import Job, Refit, judged, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.trials import LONGER, refitted
+from hvdc_ident.discrepancy.trials import PROMISING, refitted
 from hvdc_ident.effects import EffectUse, Probe, effects
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem
@@ -408,8 +409,12 @@ def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
     probes = found.candidates[picks[0].candidate].probes
     assert {found.candidates[p.candidate].effect for p in bends(found)} == {"rate-limit"}
     assert sorted({p.probe for p in picks}) == list(range(len(probes)))
-    ends = refitted(search, found, picks, "", (), LONGER)
+    ends = refitted(search, found, picks, "", (), PROMISING)
     rates = [t.refit.sizes(t.refit.placed[-1])["rate"] for t in ends]
     met = [abs(rate / case.hidden[0].parameters["rate"] - 1.0) < 0.01 for rate in rates]
     assert any(met) and not all(met)
     assert min(t.refit.chi2 for t in ends) < 0.2 * max(t.refit.chi2 for t in ends)
+    jobs = [job(before, found.candidates, [p]) for p in picks]
+    admitted = replace(PROMISING, entrants=len(jobs) // 2).admitted(search, jobs, "")
+    assert len(admitted) == len(jobs) // 2
+    assert any(met[k] for k in admitted)
