@@ -28,6 +28,7 @@ from hvdc_ident.trajectory import Array
 FINE = 2.5e-4
 """s: an effect with corners in its derivative is stepped no more coarsely than this, in so many parts of a grid interval as it may take."""
 PARTS = 8
+"""The most that it takes where nothing else is said."""
 _NUMPY: dict[str, Any] = {
     "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "sqrt": np.sqrt,
     "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "asin": np.arcsin,
