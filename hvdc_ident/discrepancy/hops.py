@@ -251,7 +251,7 @@ def _looked(search: Search, here: Mapping[K, Refit], grids: Mapping[K, Array], w
     """By key what is left at each size of a grid, wherever that is worked out."""
     cuts = {k: [g[n : n + PIECE] for n in range(0, g.size, PIECE)] for k, g in grids.items()}
     pieces = [_Piece(here[k], c, what) for k, own in cuts.items() for c in own]
-    found = iter(list(mapped(search.executor, _left_at, pieces)))
+    found = mapped(search.executor, _left_at, pieces)
     return {k: np.concatenate([np.empty(0), *(next(found) for _ in own)]) for k, own in cuts.items()}
 
 

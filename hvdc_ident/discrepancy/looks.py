@@ -17,13 +17,13 @@ from hvdc_ident.discrepancy.trials import (
     HEAT,
     PROMISING,
     RACE,
-    TELLING,
     all_far,
     best_each,
     by_cost,
     on_bound,
     once_more,
     refitted,
+    telling,
 )
 
 LOOKED_AT = 80
@@ -83,8 +83,7 @@ class Stand:
     @property
     def anything_told(self) -> bool:
         """Whether a refit takes away a share of what is beyond noise: where none does, the noise is louder than was told."""
-        before = self.opened.before
-        least = before.chi2 - TELLING * (before.chi2 - before.rows)
+        least = self.opened.before.chi2 - telling(self.opened.before)
         return any(not t.refit.failure and t.refit.chi2 < least for t in self.trials)
 
 

@@ -54,13 +54,13 @@ def settled(
             here = without
             del kept[k]
             continue
-        try:
-            if near:
+        if near:
+            try:
                 again, winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
                 kept[k] = again.light()
                 here = _in_place(winner.refit, k)
-        except SimulationError as error:  # refitted it runs, as far as a refit needs it to
-            notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
+            except SimulationError as error:  # refitted it runs, as far as a refit needs it to
+                notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
         k += 1
     return here, kept, tuple(notes)
 

@@ -76,7 +76,7 @@ def once_more(
     """
     found, was = opened.candidates, opened.before.chi2
     order = by_cost(trials)
-    goal = max(WORTHY * (was - min([best, *(t.refit.chi2 for t in order)])), TELLING * (was - opened.before.rows))
+    goal = max(WORTHY * (was - min([best, *(t.refit.chi2 for t in order)])), telling(opened.before))
     chosen: dict[str, list[Trial]] = {}
     for t in sorted(order, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
@@ -87,6 +87,11 @@ def once_more(
     refits = hopped(search, jobs, [f"{text}: {found[t.pick.candidate].label}" for t in again])
     better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
     return [better.get(id(t), t) for t in trials]
+
+
+def telling(before: Refit) -> float:
+    """The fall of chi2 from which a refit is more than what noise that is louder than was told leaves to take away."""
+    return TELLING * (before.chi2 - before.rows)
 
 
 def best_each(trials: Sequence[Trial]) -> list[Trial]:

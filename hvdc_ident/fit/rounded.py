@@ -10,6 +10,10 @@ from numba import njit
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 TAIL = -30.0
 """From where log Phi is by its expansion: erfc is nearly 0 there."""
+NEAR = 1e-4
+"""Misfits below this share of the noise, where the difference of two logarithms has no digits left, take the tangent at 0."""
+FAR = 1e3
+"""Standard deviations beyond half a step from which the tail's expansion stands for logarithms that differ by less than their own error."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -45,30 +49,28 @@ def log_chances(z, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def residuals(misfit, step, noise, near, far):  # type: ignore[no-untyped-def]
-    """g and dg/dz of every row, (n,), from misfit and step, both in the unit of noise; near and far in its multiples.
-
-    Below `near` the tangent at 0 stands for g; from `far` beyond half a step the tail's expansion.
-    """
+def residuals(misfit, step, noise):  # type: ignore[no-untyped-def]
+    """g and dg/dz of every row, (n,), from misfit (n,), step and noise, all in the output's unit."""
     g, slope = np.empty(misfit.size), np.empty(misfit.size)
-    half = 0.5 * step / noise
-    none = log_chance(0.0, 2.0 * half)
-    tangent = math.sqrt(math.exp(-0.5 * half * half - HALF_LOG_2PI - none) * 2.0 * half)
+    wide = step / noise
+    half = 0.5 * wide
+    none = log_chance(0.0, wide)
+    tangent = math.sqrt(math.exp(-0.5 * half * half - HALF_LOG_2PI - none) * wide)
     for k in range(misfit.size):
         z = misfit[k] / noise
         size = abs(z)
-        if size - half > far:
+        if size - half > FAR:
             # Phi(-x) = phi(x)/x (1 - 1/x^2 ...), so that dlog Phi(-x)/dx = -(x + 1/x ...)
             x = size - half
             more = math.sqrt(1.0 + (2.0 * (none + math.log(x)) + 2.0 * HALF_LOG_2PI) / x / x)
             g[k], slope[k] = math.copysign(x * more, z), (1.0 + 1.0 / x / x) / more / noise
             continue
-        log_p = log_chance(size, 2.0 * half)
+        log_p = log_chance(size, wide)
         root = math.sqrt(max(2.0 * (none - log_p), 0.0))
-        if size < near or root == 0.0:
+        if size < NEAR or root == 0.0:
             g[k], slope[k] = tangent * z, tangent / noise
         else:
             x = size - half
-            falls = math.exp(-0.5 * x * x - HALF_LOG_2PI - log_p) * -math.expm1(-size * 2.0 * half)
+            falls = math.exp(-0.5 * x * x - HALF_LOG_2PI - log_p) * -math.expm1(-size * wide)
             g[k], slope[k] = math.copysign(root, z), falls / root / noise
     return g, slope

@@ -16,10 +16,6 @@ import numpy as np
 from hvdc_ident.fit.rounded import log_chances, residuals
 from hvdc_ident.trajectory import Array
 
-NEAR = 1e-4
-"""Misfits below this share of the noise, where the difference of two logarithms has no digits left, take the tangent at 0."""
-FAR = 1e3
-"""Standard deviations beyond half a step from which the tail's expansion stands for logarithms that differ by less than their own error."""
 REACH = 10.0
 """Standard deviations beyond half a step to which the mean of g^2 is integrated."""
 POINTS = 4001
@@ -39,7 +35,7 @@ class Rounding:
         and (|z| - step/2)/noise beyond.
         """
         rows = np.asarray(misfit, dtype=float)
-        g, slope = residuals(rows.ravel(), self.step, self.noise, NEAR, FAR)
+        g, slope = residuals(rows.ravel(), self.step, self.noise)
         return g.reshape(rows.shape), slope.reshape(rows.shape)
 
     @property
@@ -55,5 +51,5 @@ class Rounding:
 def _spare(step: float) -> float:
     """1 - (1/D) integral of P g^2 over all misfits, in units of the noise: each level's rounded values, over all levels."""
     z = np.linspace(0.0, 0.5 * step + REACH, POINTS)
-    g, _ = residuals(z, step, 1.0, NEAR, FAR)
+    g, _ = residuals(z, step, 1.0)
     return 1.0 - 2.0 * float(np.trapezoid(np.exp(log_chances(z, step)) * g**2, z)) / step
