@@ -302,11 +302,14 @@ def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[
     return np.array(u), breaks, pointer, times, values
 
 
-_engine = by_structure(Engine, room=32)
+ROOM = 128
+"""Engines that are kept: one takes a megabyte, a search tries a hundred structures and comes back to the best."""
+
+_engine = by_structure(Engine, room=ROOM)
 
 
 def engine(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
-    """The engine of a model's structure, compiled at the first call and kept for later ones (the last 32)."""
+    """The engine of a model's structure, compiled at the first call and kept for later ones (the last `ROOM`)."""
     return _engine(model, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs))
 
 

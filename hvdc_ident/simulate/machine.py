@@ -181,19 +181,22 @@ class _Emitter:
 
     def _value(self, node: int) -> str:
         """The register or constant of a node, whatever it needs emitted first: iterative, for deep graphs."""
+        names = self.names
+        if node in names:
+            return names[node]
         stack = [node]
         while stack:
             n = stack[-1]
-            if n in self.names:
+            if n in names:
                 stack.pop()
                 continue
-            missing = [a for a in self._arguments(n) if a not in self.names]
+            missing = [a for a in self._arguments(n) if a not in names]
             if missing:
                 stack.extend(reversed(missing))
             else:
-                self.names[n] = self._instruction(n)
+                names[n] = self._instruction(n)
                 stack.pop()
-        return self.names[node]
+        return names[node]
 
     def _arguments(self, n: int) -> tuple[int, ...]:
         key = self.graph.nodes[n]
@@ -214,6 +217,8 @@ class _Emitter:
     def _instruction(self, n: int) -> str:
         op, *a = self.graph.nodes[n]
         kind, bit = self.kind, self.bit
+        if op in ("add", "sub", "mul", "div"):
+            return self._emit(f"f{op} contract {kind} {self.names[a[0]]}, {self.names[a[1]]}")
         if op == "const":
             return self._constant(a[0])
         if op == "bool":
@@ -225,8 +230,6 @@ class _Emitter:
                 return self._emit(f"fcmp olt {kind} {self.names[self.graph.switches[a[0]]]}, {self._constant(0.0)}")
             return self._emit(f"fcmp ogt {kind} {self._leaf('m', a[0])}, {self._constant(0.5)}")
         x = [self.names[k] for k in a]
-        if op in ("add", "sub", "mul", "div"):
-            return self._emit(f"f{op} contract {kind} {x[0]}, {x[1]}")
         if op == "inverse":  # 1/x, and 0 where x is 0
             quotient = self._emit(f"fdiv {kind} {self._constant(1.0)}, {x[0]}")
             zero = self._emit(f"fcmp oeq {kind} {x[0]}, {self._constant(0.0)}")

@@ -101,18 +101,27 @@ def _surroundings() -> tuple[str, ...]:
         llvmlite.__version__,
         ".".join(map(str, llvm.llvm_version_info)),
         llvm.get_default_triple(),
-        llvm.get_host_cpu_name(),
-        llvm.get_host_cpu_features().flatten(),
+        *_processor(),
         hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     )
 
 
-def _machine(effort: int) -> llvm.TargetMachine:
+@cache
+def _processor() -> tuple[str, str]:
+    """The processor's name, and what it can do: to ask takes as long as to load what was compiled."""
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+@cache
+def _target() -> llvm.Target:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple().create_target_machine(
-        opt=effort, cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten()
-    )
+    return llvm.Target.from_default_triple()
+
+
+def _machine(effort: int) -> llvm.TargetMachine:
+    cpu, features = _processor()
+    return _target().create_target_machine(opt=effort, cpu=cpu, features=features)
 
 
 @cache
