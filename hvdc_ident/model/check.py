@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import sympy as sp
@@ -105,8 +106,10 @@ def _check_symbols(model: Model) -> None:
             raise _unknown(model, min(used - names), place)
 
 
-def _used(expression: sp.Expr) -> set[str]:
-    return {s.name for s in expression.free_symbols}
+@lru_cache(maxsize=4096)
+def _used(expression: sp.Expr) -> frozenset[str]:
+    """Names in an expression; an effect leaves most of a model's as they were."""
+    return frozenset(s.name for s in expression.free_symbols)
 
 
 def _only_parameters(model: Model, used: Iterable[str], names: Collection[str], place: str) -> None:

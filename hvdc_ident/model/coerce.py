@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import sympy as sp
@@ -65,7 +66,7 @@ def _section(items: object, section: str, place: str) -> FrozenMap[Any]:
 
 def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
     if isinstance(value, kind):
-        given = {f.name: getattr(value, f.name) for f in fields(kind)}
+        given = {n: getattr(value, n) for n in _fields(kind)}
     elif isinstance(value, Mapping):
         given = dict(value)
     else:
@@ -82,13 +83,19 @@ def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
 
 def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> None:
     """Nothing; raises where a key is no field of the class, or a field without a default has no key."""
-    known = [f.name for f in fields(kind)]
+    known = _fields(kind)
     for key in given:
         if key not in known:
             raise unknown_name("key", str(key), known, where=place)
-    for field in fields(kind):
-        if field.default is MISSING and field.default_factory is MISSING and given.get(field.name) is None:
-            raise ModelError(f"has no {field.name}", where=place, expected=f"{field.name} = ...")
+    for name, required in known.items():
+        if required and given.get(name) is None:
+            raise ModelError(f"has no {name}", where=place, expected=f"{name} = ...")
+
+
+@cache
+def _fields(kind: type[Any]) -> FrozenMap[bool]:
+    """The fields of a class, and whether each has to be given: asked for every value of every model that is made."""
+    return FrozenMap({f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(kind)})
 
 
 def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
