@@ -66,18 +66,13 @@ def candidates(
     names: Iterable[str] | Literal["all"],
     places: Iterable[str | tuple[str, ...]] | None,
     tones: Iterable[float] = (),
-    *,
-    closer: bool = False,
 ) -> tuple[Candidate, ...]:
-    """Every candidate. signals: at the model's slots, those of measured outputs included; times: (K,) of each experiment.
-
-    closer: only the effects that ask for a closer look, with its sizes.
-    """
+    """Every candidate. signals: at the model's slots, those of measured outputs included; times: (K,) of each experiment."""
     live = [p for p in signals if _moves(model, p)]
     groups = places_of(model, live, places)
     about = {p: SlotSignal.of(times, signals[p], tones) for p in live}
     brought = source_signals(model, signals)
-    tried = tuple(e for e in entries(names) if e.scanned or not closer)
+    tried = entries(names)
     doubled = any(e.name == "coupling" for e in tried)
     found: list[Candidate] = []
     for at in groups:
@@ -92,7 +87,7 @@ def candidates(
             usable = brought
             if effect.name == "conductance":  # of the slot's own signal it is a gain, which is tried
                 usable = tuple(b for b in brought if not _proportional(signals[at[0]], signals[b]))
-            found += _at(model, effect, at, joined, still, about, usable, closer)
+            found += _at(model, effect, at, joined, still, about, usable)
     return tuple(found)
 
 
@@ -104,7 +99,6 @@ def _at(
     still: bool,
     about: Mapping[str, SlotSignal],
     brought: Sequence[str],
-    closer: bool,
 ) -> list[Candidate]:
     if effect.resistance:
         found = list(resistances(model, at[0])) if len(at) == 1 and isinstance(model, Model) else []
@@ -116,8 +110,7 @@ def _at(
             for n in found
         ]  # fmt: skip
     if not effect.needs_source:
-        sizes = probes(effect, signal, closer=closer)
-        return [Candidate(effect.name, at, sizes, still=still and not additive(effect))]
+        return [Candidate(effect.name, at, probes(effect, signal), still=still and not additive(effect))]
     if len(at) > 1:
         return []
     open_to = set(sources(model, at[0])) if isinstance(model, Model) else set(_open_ends(model, at[0]))

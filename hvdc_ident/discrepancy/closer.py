@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from hvdc_ident.discrepancy.candidates import Candidate, candidates
+from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.response import Along
-from hvdc_ident.discrepancy.scan import View, bent, joined, scan, widened
+from hvdc_ident.discrepancy.scan import View, bent, met, scan, widened
 from hvdc_ident.discrepancy.scores import Path, runs
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import Column
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
-from hvdc_ident.effects import effects
+from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.model.definition import Model
 
@@ -26,24 +26,15 @@ def closer_look(
 ) -> tuple[Round, tuple[Pick, ...]]:
     """The round with the sizes that a closer look found, and the picks to refit for them. wanted: what is looked at."""
     before, found, options = opened.before, opened.candidates, search.options
-    known = {(c.effect, c.at): k for k, c in enumerate(found)}
-    # Their many sizes are made for those alone that are to be looked at.
     asked = [c for c in found if effects()[c.effect].scanned and _worth_a_scan(c) and wanted(c)]
-    dense = candidates(
-        before.model,
-        slot_signals(opened.paths, before.placed),
-        [a.time for a in opened.paths.values()],
-        list(dict.fromkeys(c.effect for c in asked)),
-        list(dict.fromkeys(c.at for c in asked)),
-        closer=True,
-    )
-    dense = tuple(c for c in dense if (c.effect, c.at) in known and _worth_a_scan(c))
+    times = [a.time for a in opened.paths.values()]
+    signals = slot_signals(opened.paths, before.placed)
+    dense = [met(c, SlotSignal.of(times, signals[c.at[0]])) for c in asked]
     if all(isinstance(p, Along) for p in opened.paths.values()):
-        dense += tuple(widened(c) for c in found if not c.still and bent(c))
-    dense = tuple(c for c in dense if wanted(c))
+        dense += [widened(c) for c in found if not c.still and bent(c) and wanted(c)]
     if not dense:
         return opened, ()
-    text = f"round {number}: a closer look at {', '.join(dict.fromkeys(c.effect for c in dense))}"
+    text = f"round {number}: a closer look at {', '.join(dict.fromkeys(d.candidate.effect for d in dense))}"
     seen = scan(
         before,
         _views(before, nominal, opened.paths),
@@ -54,8 +45,10 @@ def closer_look(
         search.progress,
         text,
     )
-    found = joined(found, [s.candidate for s in seen.spots])
-    at = [known[s.candidate.effect, s.candidate.at] for s in seen.spots]
+    better = [s.dense.alone(0) for s in seen.spots]
+    found = _joined(found, better)
+    known = {_key(c): k for k, c in enumerate(found)}
+    at = [known[_key(c)] for c in better]
     columns = tuple(Column(k, len(found[k].probes) - 1) for k in at)
     scores = opened.scores.joined(replace(seen.scores, columns=columns, beside=seen.largest))
     picks = [
@@ -74,6 +67,16 @@ def _views(before: Refit, nominal: Nominal, paths: Mapping[str, Path]) -> list[V
         with suppress(SimulationError):  # with the gains as given it need not run
             views.append(View(there, runs(before.model, there)))
     return views
+
+
+def _joined(found: Sequence[Candidate], better: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """The candidates, with the sizes that a scan found after their own."""
+    more = {_key(c): c.probes for c in better}
+    return tuple(replace(c, probes=(*c.probes, *more.get(_key(c), ()))) for c in found)
+
+
+def _key(candidate: Candidate) -> Hashable:
+    return candidate.effect, candidate.at, candidate.named
 
 
 def _worth_a_scan(candidate: Candidate) -> bool:

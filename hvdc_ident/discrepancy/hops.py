@@ -23,7 +23,7 @@ from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Job, Refit, judged, of_held_out, signal
 from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, by_level, sized
 from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.effects import SlotSignal, effects, probes
+from hvdc_ident.effects import SlotSignal, effects, scanned
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.executor import mapped
@@ -134,8 +134,7 @@ def _levels(here: Refit) -> Array:
     placed = here.placed[-1]
     seen = signal(here, placed.use.at[0])
     about = SlotSignal.of([e.time for e in here.problem.fitted_experiments], list(seen.values()))
-    name, effect = sized(placed.candidate), effects()[placed.candidate.effect]
-    sizes = np.array([p.values[name] for p in probes(effect, about, closer=True)])
+    _, sizes = scanned(effects()[placed.candidate.effect], about)
     return np.sort(sizes[(sizes > low) & (sizes < high) & (sizes > about.range / LEVELS)])
 
 

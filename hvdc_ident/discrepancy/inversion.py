@@ -112,7 +112,7 @@ class Inversion:
         (B,) the largest such score in each record of noise.
         """
         # Thousands are compared, and the best run again: half the digits take half the time.
-        shown = self._shown @ at_knots.astype(np.float32)
+        shown = self._shown @ at_knots.astype(np.float32, copy=False)
         raw, square = self.wanted @ shown, np.einsum("ij,ij->j", shown, shown, dtype=float)
         share = np.where(square > SEEN, 1.0 / np.maximum(square, SEEN), 0.0)
         chance = (shown * np.sqrt(share).astype(np.float32)).T @ noise.astype(np.float32)
@@ -150,4 +150,4 @@ def _hats(time: Array, knots: int) -> tuple[Array, scipy.sparse.csr_array]:
     hats = scipy.sparse.csr_array(entries, shape=(time.size, knots))
     weights = scipy.sparse.csr_array(hats.T * np.gradient(time))
     total = np.maximum(weights.sum(axis=1), 1e-300)
-    return hats.toarray(), scipy.sparse.csr_array(weights / total[:, None])
+    return hats.toarray(), scipy.sparse.csr_array(weights / total[:, None], dtype=np.float32)

@@ -10,7 +10,6 @@ beginning, at sizes that have to be met.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -26,7 +25,7 @@ from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.response import Along
 from hvdc_ident.discrepancy.scores import Path, Scores, two_sided
 from hvdc_ident.discrepancy.signatures import Column, is_linear, kind_of
-from hvdc_ident.effects import Probe, effects
+from hvdc_ident.effects import Probe, SlotSignal, effects, scanned
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.frozen import FrozenMap
@@ -63,13 +62,48 @@ SAMPLE = 16
 
 
 @dataclass(frozen=True, eq=False)
+class Dense:
+    """A candidate with one size, and (C,) all those that it is looked at with, the least first."""
+
+    candidate: Candidate
+    sizes: Array
+
+    @property
+    def place(self) -> tuple[str, tuple[str, ...]]:
+        """The effect, and where."""
+        return self.candidate.effect, self.candidate.at
+
+    def alone(self, k: int) -> Candidate:
+        """The candidate with one of the sizes."""
+        return replace(
+            self.candidate, probes=(_resized(self.candidate.probes[0], sized(self.candidate), self.sizes[k]),)
+        )
+
+    def only(self, k: int) -> Dense:
+        """One of the sizes."""
+        return replace(self, sizes=self.sizes[k : k + 1])
+
+    def around(self, k: int) -> Dense:
+        """One of the sizes and those between it and its neighbours, evenly in the logarithm."""
+        own, last = self.sizes[k], self.sizes.size - 1
+        beside = [self.sizes[max(k - 1, 0)], self.sizes[min(k + 1, last)]]
+        return replace(
+            self, sizes=np.unique(np.concatenate([[own], *(np.geomspace(own, b, BETWEEN + 2)[1:-1] for b in beside)]))
+        )
+
+    def parts(self) -> list[Dense]:
+        """A part of the sizes each: of all at once the traces would fill the memory."""
+        return [replace(self, sizes=self.sizes[k : k + TOGETHER]) for k in range(0, self.sizes.size, TOGETHER)]
+
+
+@dataclass(frozen=True, eq=False)
 class Spot:
     """A size worth a look: the candidate with it alone, or with the sizes around it, and its score.
 
     fall: by how much chi2 would fall. theta: the unknowns of the model before that go with it.
     """
 
-    candidate: Candidate
+    dense: Dense
     score: float
     fall: float
     theta: Array
@@ -97,18 +131,18 @@ class Slot:
     """What is looked at through one slot's signal: the model's runs, the candidates there, and (N, B) noise."""
 
     view: View
-    found: tuple[Candidate, ...]
+    found: tuple[Dense, ...]
     noise: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One place: the model without the effect and what it leaves, the candidate with all sizes, what traces are
-    multiplied with, and how patiently the model is run."""
+    """One place: the model without the effect and what it leaves, what is looked at there, what traces are multiplied with,
+    and how patiently the model is run."""
 
     before: Refit
     residual: Array
-    candidate: Candidate
+    dense: Dense
     right: Array
     tolerance: Tolerance
 
@@ -116,7 +150,7 @@ class Job:
 def scan(
     before: Refit,
     views: Sequence[View],
-    dense: Sequence[Candidate],
+    dense: Sequence[Dense],
     bootstraps: int,
     seed: int,
     executor: Executor | None,
@@ -133,16 +167,16 @@ def scan(
     if all(isinstance(p, Along) for p in views[0].paths.values()):
         spots, largest = _told(views, dense, right[:, 1 + known :], executor, progress, text)
     else:
-        thin = [replace(c, probes=c.probes[:: max(len(c.probes) // THIN, 1)]) for c in dense]
+        thin = [replace(d, sizes=d.sizes[:: max(d.sizes.size // THIN, 1)]) for d in dense]
         rough = _looked(
-            [Job(before, nominal.residual, c, right, QUICK) for c in thin], right, known, executor, progress, text
+            [Job(before, nominal.residual, d, right, QUICK) for d in thin], right, known, executor, progress, text
         )
         spots, largest = _spots(thin, rough, before.theta), rough.largest
     best = _tops(spots)
-    jobs = [Job(replace(before, theta=s.theta), nominal.residual, s.candidate, right, PATIENT) for s in best]
+    jobs = [Job(replace(before, theta=s.theta), nominal.residual, s.dense, right, PATIENT) for s in best]
     fine = _looked(jobs, right, known, executor, progress, f"{text}, closer still")
     chosen = _best(best, fine)
-    kept = [replace(best[c.candidate], candidate=_alone(best[c.candidate].candidate, c.probe)) for c in chosen]
+    kept = [replace(best[c.candidate], dense=best[c.candidate].dense.only(c.probe)) for c in chosen]
     at = [fine.columns.index(c) for c in chosen]
     spots = [replace(s, score=float(fine.t[k]), fall=float(fine.falls[k])) for s, k in zip(kept, at, strict=True)]
     parts = {n: getattr(fine, n)[at] for n in ("raw", "size", "left", "noise", "sound", "two_sided")}
@@ -159,7 +193,7 @@ def _right_sides(nominal: Nominal, bootstraps: int, seed: int) -> Array:
 
 def _told(
     views: Sequence[View],
-    dense: Sequence[Candidate],
+    dense: Sequence[Dense],
     noise: Array,
     executor: Executor | None,
     progress: Progress | None,
@@ -167,9 +201,9 @@ def _told(
 ) -> tuple[list[Spot], Array]:
     """The best sizes of every candidate, on the model's signal at its slot and on the one that the records tell; and (B,)
     the largest score of all sizes in each record of noise."""
-    by_place: dict[str, list[Candidate]] = {}
-    for c in dense:
-        by_place.setdefault(c.at[0], []).append(c)
+    by_place: dict[str, list[Dense]] = {}
+    for d in dense:
+        by_place.setdefault(d.candidate.at[0], []).append(d)
     jobs = [Slot(_at_one(view, p), tuple(group), noise) for view in views for p, group in by_place.items()]
     spots, largest = [], np.zeros(noise.shape[1])
     for k, (more, under) in enumerate(mapped(executor, _at_slot, jobs), start=1):
@@ -188,20 +222,20 @@ def _at_one(view: View, place: str) -> View:
 def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
     """The best sizes of the candidates at one slot, and (B,) the largest score of any in each record of noise."""
     nominal, paths = slot.view.nominal, {n: p for n, p in slot.view.paths.items() if isinstance(p, Along)}
-    inverse = Inversion.of(nominal, paths, slot.found[0].at[0])
+    inverse = Inversion.of(nominal, paths, slot.found[0].candidate.at[0])
     noise = inverse.against(nominal.projected(slot.noise))
     spots, largest = [], np.zeros(slot.noise.shape[1])
-    for c in slot.found:
-        sizes = _sizes(c)
+    for dense in slot.found:
+        met = _met(dense.candidate)
         for signals in (inverse.own, inverse.told):
-            parts = [_at_knots(inverse, part, signals) for part in _parts(c)]
+            parts = [_at_knots(inverse, part, signals) for part in dense.parts()]
             tables = [inverse.falls(part, noise) for part in parts]
             falls, scores = (np.concatenate([t[k] for t in tables]) for k in range(2))
             largest = np.max([largest, *(t[2] for t in tables)], axis=0)
             at_knots = np.hstack(parts)
-            for k in _leading(falls, scores if _met(c) else np.zeros(scores.size)):
+            for k in _leading(falls, scores if met else np.zeros(scores.size)):
                 theta = inverse.answer(nominal, at_knots[:, k])
-                near = _neighbourhood(c, k, sizes) if _met(c) else _alone(c, k)
+                near = dense.around(k) if met else dense.only(k)
                 spots.append(Spot(near, float(scores[k]), float(falls[k]), theta))
     return spots, largest
 
@@ -223,29 +257,33 @@ def bent(candidate: Candidate) -> bool:
     return single and entry.late is None and not entry.scanned and not is_linear(kind_of(candidate, 0))
 
 
-def widened(candidate: Candidate) -> Candidate:
-    """The candidate with many sizes, evenly in the logarithm."""
+def widened(candidate: Candidate) -> Dense:
+    """Many sizes of a candidate that bends its signal, evenly in the logarithm."""
     name = sized(candidate)
     low, high = candidate.probes[0].free[name]
     tried = [p.values[name] for p in candidate.probes]
-    sizes = np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT)
-    return replace(candidate, probes=tuple(_resized(candidate.probes[0], name, float(s)) for s in sizes))
+    return Dense(candidate, np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT))
 
 
-def _parts(candidate: Candidate) -> list[Candidate]:
-    """The candidate with a part of its sizes each: of all at once the traces would fill the memory."""
-    return [
-        replace(candidate, probes=candidate.probes[k : k + TOGETHER]) for k in range(0, len(candidate.probes), TOGETHER)
-    ]
+def met(candidate: Candidate, signal: SlotSignal) -> Dense:
+    """Every size worth a look of a candidate whose size has to be met. signal: that of its slot."""
+    probe, sizes = scanned(effects()[candidate.effect], signal)
+    return Dense(replace(candidate, probes=(probe,)), np.sort(sizes))
 
 
-def _at_knots(inverse: Inversion, candidate: Candidate, signals: Sequence[Array]) -> Array:
+def _at_knots(inverse: Inversion, dense: Dense, signals: Sequence[Array]) -> Array:
     """(k n, C) at the knots: what each size of a candidate makes of a signal, less the signal."""
-    kind, changes = kind_of(candidate, 0), []
-    own = {parameter(n): np.array([p.values[n] for p in candidate.probes]) for n in kind.present}
+    kind, changes, count = kind_of(dense.candidate, 0), [], dense.sizes.size
+    whole, values = block(kind.effect, kind.present, kind.brings), dict(dense.candidate.probes[0].values)
+    # Thousands are compared, and the best run again: half the digits take a third of the time.
+    digits = np.float32 if whole.quick else np.float64
+    own = {parameter(n): np.full(count, values[n]) for n in kind.present} | {
+        parameter(sized(dense.candidate)): dense.sizes
+    }
     for time, u in zip(inverse.time, signals, strict=True):
-        wide = np.repeat(u[:, None], len(candidate.probes), axis=1)
-        changes.append(block(kind.effect, kind.present, kind.brings).run(own, time, wide, None, COARSE) - wide)
+        wide = np.broadcast_to(u.astype(digits)[:, None], (u.size, count))
+        y = whole.run({n: v.astype(digits) for n, v in own.items()}, time, wide, None, COARSE)
+        changes.append((y - wide).astype(np.float32, copy=False))
     return np.nan_to_num(inverse.knots(changes))
 
 
@@ -261,14 +299,13 @@ def _leading(falls: Array, scores: Array) -> list[int]:
     return kept
 
 
-def _spots(found: Sequence[Candidate], scores: Scores, theta: Array) -> list[Spot]:
+def _spots(found: Sequence[Dense], scores: Scores, theta: Array) -> list[Spot]:
     """The best sizes of candidates that were run at all of theirs."""
     spots: list[Spot] = []
-    for i, c in enumerate(found):
+    for i, dense in enumerate(found):
         own = [k for k, column in enumerate(scores.columns) if column.candidate == i]
-        sizes = _sizes(c)
         spots += [
-            Spot(_neighbourhood(c, k, sizes), float(scores.t[own[k]]), float(scores.falls[own[k]]), theta)
+            Spot(dense.around(k), float(scores.t[own[k]]), float(scores.falls[own[k]]), theta)
             for k in _leading(scores.falls[own], scores.t[own])
         ]
     return spots
@@ -277,14 +314,18 @@ def _spots(found: Sequence[Candidate], scores: Scores, theta: Array) -> list[Spo
 def _tops(spots: Sequence[Spot]) -> list[Spot]:
     """The best of every effect at any place, in turn by how much chi2 falls and by their score."""
     chosen: list[Spot] = []
-    for effect in dict.fromkeys(s.candidate.effect for s in spots):
-        own = [s for s in spots if s.candidate.effect == effect]
+    for effect in dict.fromkeys(s.dense.candidate.effect for s in spots):
+        own = [s for s in spots if s.dense.candidate.effect == effect]
         ranks = [sorted(own, key=lambda s: -s.fall), sorted(own, key=lambda s: -s.score)]
-        each = max(EACH, SPOTS // len({s.candidate.at for s in own}))
+        each = max(EACH, SPOTS // len({s.dense.place for s in own}))
         kept: list[Spot] = []
         for s in (s for pair in zip(*ranks, strict=True) for s in pair):
-            beside = [k for k in kept if k.candidate.at == s.candidate.at]
-            if len(kept) < SPOTS and len(beside) < each and all(k.candidate != s.candidate for k in beside):
+            beside = [k.dense for k in kept if k.dense.place == s.dense.place]
+            if (
+                len(kept) < SPOTS
+                and len(beside) < each
+                and not any(np.array_equal(k.sizes, s.dense.sizes) for k in beside)
+            ):
                 kept.append(s)
         chosen += kept
     return chosen
@@ -297,15 +338,11 @@ def _best(spots: Sequence[Spot], scores: Scores) -> list[Column]:
     least = WORTH * float(worth.max(initial=0.0))
     for k in np.argsort(-worth, kind="stable"):
         c = scores.columns[k]
-        places = kept.setdefault(spots[c.candidate].candidate.effect, {})
+        effect, at = spots[c.candidate].dense.place
+        places = kept.setdefault(effect, {})
         if worth[k] > 0 and worth[k] >= least and len(places) < PLACES:
-            places.setdefault(spots[c.candidate].candidate.at, c)
+            places.setdefault(at, c)
     return [c for places in kept.values() for c in places.values()]
-
-
-def _alone(candidate: Candidate, probe: int) -> Candidate:
-    """The candidate with one of its sizes."""
-    return replace(candidate, probes=(candidate.probes[probe],))
 
 
 def _looked(
@@ -325,28 +362,28 @@ def _looked(
     sound = np.isfinite(size)
     size, product = np.where(sound, size, 0.0), np.where(sound[:, None], product, 0.0)
     left = np.maximum(size - np.sum(product[:, 1 : 1 + known] ** 2, axis=1), 0.0)
-    columns = tuple(Column(i, n) for i, job in enumerate(jobs) for n in range(len(job.candidate.probes)))
-    either = np.array([two_sided(jobs[c.candidate].candidate) for c in columns], dtype=bool)
+    columns = tuple(Column(i, n) for i, job in enumerate(jobs) for n in range(job.dense.sizes.size))
+    either = np.array([two_sided(jobs[c.candidate].dense.candidate) for c in columns], dtype=bool)
     return Scores(columns, product[:, 0], size, left, product[:, 1 + known :], sound, either)
 
 
 def _traces(job: Job) -> tuple[Array, Array]:
     """(C, k) traces times the right-hand sides, (C,) their squares; not finite for a size that could not be run."""
-    c, before = job.candidate, job.before
-    products = np.full((len(c.probes), job.right.shape[1]), np.nan)
-    squares = np.full(len(c.probes), np.nan)
+    before, sizes = job.before, job.dense.sizes
+    products, squares = np.full((sizes.size, job.right.shape[1]), np.nan), np.full(sizes.size, np.nan)
+    c = job.dense.alone(0)
     try:
         model, problem, placed, start = added(before.model, before.problem, c, 0, 1.0)
     except HvdcIdentError:  # it cannot sit there: no size of it is sound
         return products, squares
     problem = replace(problem, simulator=ModelSimulator(model, job.tolerance))
     k, at = len(before.problem.free), list(placed.bounds).index(sized(c))
-    apart = max(len(c.probes) // SAMPLE, 1)
-    order = sorted(range(len(c.probes)), key=lambda i: (i % apart > 0, i))
+    apart = max(sizes.size // SAMPLE, 1)
+    order = sorted(range(sizes.size), key=lambda i: (i % apart > 0, i))
     for n, i in enumerate(order):
         if n == SAMPLE and 2 * np.count_nonzero(np.isfinite(squares)) < SAMPLE:
             break
-        start[at] = c.probes[i].values[sized(c)]
+        start[at] = sizes[i]
         try:
             blocks = problem.blocks(np.concatenate([before.theta[:k], start, before.theta[k:]]), derivatives=False)
         except SimulationError:
@@ -354,22 +391,6 @@ def _traces(job: Job) -> tuple[Array, Array]:
         s = job.residual - np.concatenate([b.residual for b in blocks])
         products[i], squares[i] = s @ job.right, float(s @ s)
     return products, squares
-
-
-def _sizes(candidate: Candidate) -> list[float]:
-    """All sizes of a scan, the least first."""
-    name = sized(candidate)
-    return sorted(p.values[name] for p in candidate.probes)
-
-
-def _neighbourhood(candidate: Candidate, probe: int, sizes: Sequence[float]) -> Candidate:
-    """The candidate with the sizes around one of its scan (`_sizes`), evenly in the logarithm."""
-    name = sized(candidate)
-    own = candidate.probes[probe].values[name]
-    k = bisect_left(sizes, own)
-    sides = [sizes[max(k - 1, 0)], sizes[min(k + 1, len(sizes) - 1)]]
-    tried = {own, *(float(s) for side in sides for s in np.geomspace(own, side, BETWEEN + 2)[1:-1])}
-    return replace(candidate, probes=tuple(_resized(candidate.probes[probe], name, s) for s in sorted(tried)))
 
 
 def sized(candidate: Candidate) -> str:
@@ -382,9 +403,3 @@ def _resized(probe: Probe, name: str, size: float) -> Probe:
     low, high = probe.free[name]
     free = FrozenMap({**probe.free, name: (min(low, 0.9 * size), max(high, 1.1 * size))})
     return replace(probe, values=FrozenMap({**probe.values, name: size}), free=free)
-
-
-def joined(found: Sequence[Candidate], better: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """The candidates, with the sizes that a scan found after their own."""
-    more = {(c.effect, c.at): c.probes for c in better}
-    return tuple(replace(c, probes=(*c.probes, *more.get((c.effect, c.at), ()))) for c in found)

@@ -10,7 +10,7 @@ from typing import Any
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.effects.placing import EffectUse, apply
-from hvdc_ident.effects.probing import Probe, SlotSignal, alone, clearance, probes, resistances, sources
+from hvdc_ident.effects.probing import Probe, SlotSignal, alone, clearance, probes, resistances, scanned, sources
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
@@ -28,6 +28,7 @@ __all__ = [
     "effects",
     "probes",
     "resistances",
+    "scanned",
     "sources",
 ]
 

@@ -159,12 +159,8 @@ def probes(
     signal: SlotSignal,
     source: SlotSignal | None = None,
     given: Mapping[str, float] | None = None,
-    *,
-    closer: bool = False,
 ) -> tuple[Probe, ...]:
     """Sizes worth trying at a slot with this signal; none for a term, whose form has to be found first.
-
-    closer: the many of a closer look, for the parameters that ask for one.
 
     source: the signal that the effect brings in, where it does. given: values that are settled, such as a resistance
     of the model. An effect made of optional parts only is tried with each of them and with all.
@@ -173,12 +169,6 @@ def probes(
         return ()
     other = source or signal
     settled = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
-    if closer:
-        settled |= {
-            n: replace(q, probes=tuple(q.scan(signal)), measure=q.scanned_in or q.measure)
-            for n, q in effect.parameters.items()
-            if q.scan is not None
-        }
     effect = replace(effect, parameters=effect.parameters | settled)
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}
     absent = {n: 0.0 for n, q in effect.parameters.items() if q.optional}
@@ -191,6 +181,18 @@ def probes(
         tried = switched | {n: effect.parameters[n] for n in group}
         found += [{n: values.get(n, 0.0) for n in effect.parameters} for values in _combinations(tried, signal, other)]
     return tuple(_probe(effect, values, signal, other) for values in found)
+
+
+def scanned(effect: Effect, signal: SlotSignal) -> tuple[Probe, Array]:
+    """One probe of a closer look at a slot with this signal, and (C,) all its sizes, in the unit of the parameter that asks
+    for them.
+    """
+    name, q = next((n, q) for n, q in effect.parameters.items() if q.scan is not None)
+    assert q.scan is not None
+    many = replace(q, probes=tuple(q.scan(signal)), measure=q.scanned_in or q.measure)
+    sizes = np.array([_SIZES[many.measure](x, signal, signal, {}) for x in many.probes])
+    one = replace(effect, parameters=effect.parameters | {name: replace(many, probes=many.probes[:1])})
+    return probes(one, signal)[0], np.clip(sizes, q.min, q.max)
 
 
 def _combinations(
