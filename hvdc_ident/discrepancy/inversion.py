@@ -96,7 +96,7 @@ class Inversion:
         parts = zip(self.own, self.seen, _split(self.added, self.means), strict=True)
         return tuple(u + w @ c for u, w, c in parts)
 
-    def knots(self, changes: Sequence[Array]) -> Array:
+    def knots(self, changes: Sequence[NDArray[np.floating]]) -> Array:
         """(k n, C) at the knots of what is added at the instants, (K, C) in each experiment."""
         return np.vstack([m @ d for m, d in zip(self.means, changes, strict=True)])
 

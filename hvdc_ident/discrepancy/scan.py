@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.block import block, parameter
@@ -273,7 +274,8 @@ def met(candidate: Candidate, signal: SlotSignal) -> Dense:
 
 def _at_knots(inverse: Inversion, dense: Dense, signals: Sequence[Array]) -> Array:
     """(k n, C) at the knots: what each size of a candidate makes of a signal, less the signal."""
-    kind, changes, count = kind_of(dense.candidate, 0), [], dense.sizes.size
+    kind, count = kind_of(dense.candidate, 0), dense.sizes.size
+    changes: list[NDArray[np.floating]] = []
     whole, values = block(kind.effect, kind.present, kind.brings), dict(dense.candidate.probes[0].values)
     # Thousands are compared, and the best run again: half the digits take a third of the time.
     digits = np.float32 if whole.quick else np.float64

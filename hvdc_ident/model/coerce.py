@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import sympy as sp
 
@@ -92,10 +92,13 @@ def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> N
             raise ModelError(f"has no {name}", where=place, expected=f"{name} = ...")
 
 
-@cache
-def _fields(kind: type[Any]) -> FrozenMap[bool]:
-    """The fields of a class, and whether each has to be given: asked for every value of every model that is made."""
+def _read(kind: type[Any]) -> FrozenMap[bool]:
+    """The fields of a class, and whether each has to be given."""
     return FrozenMap({f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(kind)})
+
+
+_fields = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
+"""The same, read once: it is asked for every value of every model that is made."""
 
 
 def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
