@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.scan import bent, by_level
 from hvdc_ident.discrepancy.scores import SEEN
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search
-from hvdc_ident.discrepancy.trials import HEAT, best_each, by_cost, cost_of, excess, misses, once_more, refitted
+from hvdc_ident.discrepancy.trials import HEAT, SPRINT, best_each, by_cost, cost_of, excess, misses, once_more, refitted
 from hvdc_ident.effects import effects
 
 ELSEWHERE = 40
@@ -111,7 +111,7 @@ def with_begun(
     the two minutes that a hard case took it was half a minute beside effects that were there already.
     """
     text = f"round {number}: as late as the best"
-    begun = refitted(search, opened, picks, text, trials)
+    begun = refitted(search, opened, picks, text, trials, SPRINT)
     sound = by_cost(trials)
     if number == 1 and sound and (excess(sound[0].refit) or misses(sound[0].refit)):
         begun = once_more(search, opened, begun, text, most=1, best=sound[0].refit.chi2)
@@ -127,7 +127,7 @@ def bends(opened: Round) -> list[Pick]:
     scores, found = opened.scores, opened.candidates
     order = np.argsort(-scores.size, kind="stable")
     columns = [scores.columns[k] for k in order if scores.size[k] > SEEN]
-    at_one = [c for c in columns if len(found[c.candidate].at) == 1]
+    at_one = [c for c in columns if len(found[c.candidate].at) == 1 and opened.reaches(found[c.candidate])]
     every = [c for c in at_one if bent(found[c.candidate]) or by_level(found[c.candidate])]
     # One after the other, for what is compiled for one size serves for all of its candidate.
     chosen = sorted(every[: EFFORT // opened.before.rows], key=lambda c: c.candidate)

@@ -147,7 +147,7 @@ def _assembled(
         ambiguity=sets,
         separating_experiment=separating(sets, {o for e in last.problem.experiments for o in e.outputs}) or judgement.experiment,
         candidates=lines(outcome),
-        location=localise(model if isinstance(model, Model) else None, first.nominal()),
+        location=localise(model if isinstance(model, Model) else None, first.nominal(), outcome.rounds[0].reach),
         detectable=detectable(outcome, search.options),
         gap=gap(given, first, last),
         remaining=remaining(first, last, judgement.tests, search),

@@ -12,13 +12,13 @@ thousands of sizes are then had by their values at the knots.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.response import Along
@@ -39,8 +39,8 @@ class Inversion:
 
     time: (K,) instants of each experiment, s. own: the model's signal there, one array an experiment. seen: (K, k) what
     the slot's signal makes of hats put on it. means: (k, K) values at the knots of what is given at the instants. shown:
-    (rows, k) hats in whitened rows. Of all n experiments' hats, without what parameters can make good: strength (m,) and
-    directions (k n, m), and wanted (m,), what the residual has of each.
+    (rows, k) hats in whitened rows. Of all n experiments' hats, without what parameters can make good: square (k n, k n)
+    products with each other, and asked (k n,) with the residual.
     """
 
     time: tuple[Array, ...]
@@ -48,9 +48,8 @@ class Inversion:
     seen: tuple[Array, ...]
     means: tuple[scipy.sparse.csr_array, ...]
     shown: tuple[Array, ...]
-    strength: Array
-    directions: Array
-    wanted: Array = field(default_factory=lambda: np.zeros(0))
+    square: Array
+    asked: Array
 
     @classmethod
     def of(cls, nominal: Nominal, paths: Mapping[str, Along], place: str) -> Inversion:
@@ -68,14 +67,44 @@ class Inversion:
             seen.append(u[0])
             means.append(mean)
         taken = np.hstack([q.T @ s for q, s in zip(_split(nominal.basis, shown), shown, strict=True)])
-        square, directions = np.linalg.eigh(block_diag(*(s.T @ s for s in shown)) - taken.T @ taken)
+        square = block_diag(*(s.T @ s for s in shown)) - taken.T @ taken
+        free = nominal.projected(nominal.residual[:, None])
+        asked = np.concatenate([s.T @ r[:, 0] for s, r in zip(shown, _split(free, shown), strict=True)])
+        return cls(tuple(time), tuple(own), tuple(seen), tuple(means), tuple(shown), square, asked)
+
+    @cached_property
+    def reach(self) -> tuple[float, int]:
+        """By how much chi2 falls with the best of everything that may be added at the slot, and with how many values: on
+        average noise falls by their number."""
+        strength = np.abs(self.square).sum(axis=0).max(initial=0.0)
+        if strength == 0.0:
+            return 0.0, 0
+        weak = WEAK**2 * strength
+        lower = np.linalg.cholesky(self.square + 2.0 * weak * np.eye(self.asked.size))
+        half = solve_triangular(lower, np.column_stack([self.asked, np.eye(self.asked.size)]), lower=True)
+        return float(half[:, 0] @ half[:, 0]), round(self.asked.size - 2.0 * weak * np.sum(half[:, 1:] ** 2))
+
+    @cached_property
+    def _spectrum(self) -> tuple[Array, Array]:
+        square, directions = np.linalg.eigh(self.square)
         strength = np.sqrt(np.maximum(square[::-1], 0.0))
         kept = strength > WEAK * strength[0]
-        found = cls(
-            tuple(time), tuple(own), tuple(seen), tuple(means), tuple(shown), strength[kept],
-            directions[:, ::-1][:, kept],
-        )  # fmt: skip
-        return replace(found, wanted=found.against(nominal.projected(nominal.residual[:, None]))[:, 0])
+        return strength[kept], directions[:, ::-1][:, kept]
+
+    @property
+    def strength(self) -> Array:
+        """(m,) how strongly each direction of what may be added shows, the strongest first."""
+        return self._spectrum[0]
+
+    @property
+    def directions(self) -> Array:
+        """(k n, m) what is added at the knots in each, orthonormal."""
+        return self._spectrum[1]
+
+    @cached_property
+    def wanted(self) -> Array:
+        """(m,) what the residual has of each."""
+        return np.asarray(self.directions.T @ self.asked / self.strength)
 
     @cached_property
     def added(self) -> Array:
@@ -124,13 +153,13 @@ class Inversion:
         """(m, k n) what shows, in each direction, of a unit at each knot."""
         return np.ascontiguousarray((self.strength * self.directions).T, dtype=np.float32)
 
-    def answer(self, nominal: Nominal, at_knots: Array) -> Array:
-        """(p,) the unknowns, to first order, where this is added (k n,), within their bounds."""
+    def answers(self, nominal: Nominal, at_knots: Array) -> Array:
+        """(C, p) the unknowns, to first order, where each of C is added (k n, C), within their bounds."""
         jacobian = np.vstack([b.jacobian for b in nominal.blocks])
         norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
         parts = zip(self.shown, _split(at_knots, self.means), strict=True)
-        left = nominal.residual - np.concatenate([s @ c for s, c in parts])
-        step = np.linalg.lstsq(jacobian / norms, left, rcond=1e-6)[0] / norms
+        left = nominal.residual[:, None] - np.vstack([s @ c for s, c in parts])
+        step = np.linalg.lstsq(jacobian / norms, left, rcond=1e-6)[0].T / norms
         low = np.array([u.min for u in nominal.problem.unknowns])
         high = np.array([u.max for u in nominal.problem.unknowns])
         return np.clip(nominal.theta - step, low, high)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.reach import Reach
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit.nuisance import observe
@@ -25,8 +26,11 @@ ROUGH = Tolerance(rtol=1e-4, atol=1e-6)
 """Of runs driven by records: every row of noise is a corner, and where a gap lies takes no more digits."""
 
 
-def localise(model: Model | None, nominal: Nominal) -> dict[str, Any]:
-    """Shares of the gap beyond noise, by what it can be sorted by. model: for the blocks, where there are equations."""
+def localise(model: Model | None, nominal: Nominal, reach: Reach | None = None) -> dict[str, Any]:
+    """Shares of the gap beyond noise, by what it can be sorted by. model: for the blocks, where there are equations.
+
+    slots: what of the gap could be made good at each, from `reach`; none where that is not known.
+    """
     power = {(b.experiment, b.output): b.chi2 - b.residual.size for b in nominal.blocks}
     return {
         "outputs": _shares(power, 1),
@@ -36,6 +40,7 @@ def localise(model: Model | None, nominal: Nominal) -> dict[str, Any]:
         "band_hz": _band(nominal),
         "region": _region(nominal),
         "blocks": _blocks(model, nominal) if model is not None else [],
+        "slots": {} if reach is None else dict(reach.shares),
     }
 
 

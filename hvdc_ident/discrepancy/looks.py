@@ -28,7 +28,7 @@ from hvdc_ident.discrepancy.trials import (
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
-WIDER = 80
+WIDER = 40
 """Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
 TWINS = 16
 """Candidates at most that are refitted though their traces are another's."""
@@ -164,7 +164,11 @@ def _closer(stand: Stand) -> Stand:
     """Sizes that a closer look finds: everywhere where nothing explains the data, else at what is akin to the best."""
     far, leading = all_far(stand.opened.before, stand.trials, CLOSE), leaders(stand.opened, stand.trials)
     opened, extra = closer_look(
-        stand.search, stand.opened, stand.nominal, stand.number, lambda c: far or is_akin(c, leading)
+        stand.search,
+        stand.opened,
+        stand.nominal,
+        stand.number,
+        lambda c: stand.opened.reaches(c) and (far or is_akin(c, leading)),
     )
     stand = replace(stand, opened=opened)
     return stand.with_best(stand.refits(extra, "refits of the closer look"))
@@ -172,7 +176,9 @@ def _closer(stand: Stand) -> Stand:
 
 def _the_others(stand: Stand) -> Stand:
     """A candidate for every effect and place that was not tried."""
-    wide = others(stand.picks, stand.opened.scores, stand.opened.candidates, stand.tried, WIDER)
+    opened = stand.opened
+    elsewhere = [k for k, c in enumerate(opened.candidates) if not opened.reaches(c)]
+    wide = others(stand.picks, opened.scores, opened.candidates, [*stand.tried, *elsewhere], WIDER)
     return _as_late(stand.with_more(stand.refits(wide, "the other candidates", HEAT)))
 
 

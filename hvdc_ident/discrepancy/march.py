@@ -73,14 +73,17 @@ def hold(time, signal, period, compute, y):  # type: ignore[no-untyped-def]
     """Writes into y (K, nc) what signal (K, nc) was at the last sample, taken every period, (nc,), from the first instant on,
     that is `compute`, (nc,), old at least; of a doubled instant the later value, before the first sample the first."""
     count, columns = signal.shape
-    at = np.zeros(columns, np.int64)
+    at, value, due = np.zeros(columns, np.int64), signal[0].copy(), np.full(columns, -np.inf)
     for k in range(count):
         for c in range(columns):
-            sample = time[0] + np.floor((time[k] - time[0] - compute[c]) / period[c] + 1e-9) * period[c]
-            j = at[c]
-            while j + 1 < count and time[j + 1] <= sample:
-                j += 1
-            at[c] = j
-            y[k, c] = signal[j, c]
-            if sample > time[j] and j + 1 < count:
-                y[k, c] += (sample - time[j]) / (time[j + 1] - time[j]) * (signal[j + 1, c] - signal[j, c])
+            if time[k] >= due[c]:  # one instant of many
+                whole = np.floor((time[k] - time[0] - compute[c]) / period[c] + 1e-9)
+                sample = time[0] + whole * period[c]
+                j = at[c]
+                while j + 1 < count and time[j + 1] <= sample:
+                    j += 1
+                at[c], value[c] = j, signal[j, c]
+                due[c] = time[0] + compute[c] + (whole + 1.0 - 1e-9) * period[c]
+                if sample > time[j] and j + 1 < count:
+                    value[c] += (sample - time[j]) / (time[j + 1] - time[j]) * (signal[j + 1, c] - signal[j, c])
+            y[k, c] = value[c]

@@ -10,6 +10,7 @@ from hvdc_ident.discrepancy.closer import closer_look
 from hvdc_ident.discrepancy.looks import looked
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
+from hvdc_ident.discrepancy.reach import reach
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.scores import runs, scored
 from hvdc_ident.discrepancy.select import Ruler, Trial, behinds, best_of
@@ -54,7 +55,11 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
         worth = p < NEARLY or (excess(before) and not like_noise(before))
         return _met(search, nothing, nominal) if number == 1 and worth else nothing
-    return closed(search, *looked(search, replace(opened, significant=True), nominal, number, picks), number)
+    # Beside an effect that is there already there is too little left to save by it.
+    could = reach(nominal, paths, search.executor) if number == 1 else None
+    opened = replace(opened, significant=True, reach=could)
+    near = tuple(p for p in picks if opened.reaches(found[p.candidate]))
+    return closed(search, *looked(search, opened, nominal, number, near), number)
 
 
 def _met(search: Search, opened: Round, nominal: Nominal) -> Round:

@@ -129,11 +129,15 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """What is looked at through one slot's signal: the model's runs, the candidates there, and (N, B) noise."""
+    """What is looked at through one slot's signal: the model's runs, the candidates there, and (N, B) noise.
+
+    own: whether the model's own signal is looked at too, not only the one that the records tell.
+    """
 
     view: View
     found: tuple[Dense, ...]
     noise: Array
+    own: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +165,7 @@ def scan(
     """The best sizes of effects that are scanned, and how large a score noise alone gives among those that were run.
 
     before: the model without them; views: the same at its optimum, and with other gains that the records may be looked
-    at with.
+    at with, through the signals that they tell then.
     """
     nominal = views[0].nominal
     right, known = _right_sides(nominal, bootstraps, seed), nominal.basis.shape[1]
@@ -205,7 +209,12 @@ def _told(
     by_place: dict[str, list[Dense]] = {}
     for d in dense:
         by_place.setdefault(d.candidate.at[0], []).append(d)
-    jobs = [Slot(_at_one(view, p), tuple(group), noise) for view in views for p, group in by_place.items()]
+    # With other gains than those that fit, the model's own signal is the one that is known to be wrong.
+    jobs = [
+        Slot(_at_one(view, p), tuple(group), noise, own=view is views[0])
+        for view in views
+        for p, group in by_place.items()
+    ]
     spots, largest = [], np.zeros(noise.shape[1])
     for k, (more, under) in enumerate(mapped(executor, _at_slot, jobs), start=1):
         spots += more
@@ -228,14 +237,14 @@ def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
     spots, largest = [], np.zeros(slot.noise.shape[1])
     for dense in slot.found:
         met = _met(dense.candidate)
-        for signals in (inverse.own, inverse.told):
+        for signals in (inverse.own, inverse.told) if slot.own else (inverse.told,):
             parts = [_at_knots(inverse, part, signals) for part in dense.parts()]
             tables = [inverse.falls(part, noise) for part in parts]
             falls, scores = (np.concatenate([t[k] for t in tables]) for k in range(2))
             largest = np.max([largest, *(t[2] for t in tables)], axis=0)
             at_knots = np.hstack(parts)
-            for k in _leading(falls, scores if met else np.zeros(scores.size)):
-                theta = inverse.answer(nominal, at_knots[:, k])
+            best = _leading(falls, scores if met else np.zeros(scores.size))
+            for k, theta in zip(best, inverse.answers(nominal, at_knots[:, best]), strict=True):
                 near = dense.around(k) if met else dense.only(k)
                 spots.append(Spot(near, float(scores[k]), float(falls[k]), theta))
     return spots, largest
@@ -286,7 +295,8 @@ def _at_knots(inverse: Inversion, dense: Dense, signals: Sequence[Array]) -> Arr
         wide = np.broadcast_to(u.astype(digits)[:, None], (u.size, count))
         y = whole.run({n: v.astype(digits) for n, v in own.items()}, time, wide, None, COARSE)
         changes.append((y - wide).astype(np.float32, copy=False))
-    return np.nan_to_num(inverse.knots(changes))
+    found = inverse.knots(changes)
+    return found if np.isfinite(found).all() else np.nan_to_num(found)
 
 
 def _leading(falls: Array, scores: Array) -> list[int]:

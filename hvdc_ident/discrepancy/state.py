@@ -9,6 +9,7 @@ from typing import Literal
 from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.reach import Reach
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.scores import Path, Scores, runs
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial
@@ -44,6 +45,7 @@ class Round:
     """What one round found. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
 
     trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
+    reach: what of the gap could be made good at each slot; None where that is not known.
     """
 
     before: Refit
@@ -57,6 +59,11 @@ class Round:
     why: str
     significant: bool
     ruler: Ruler | None
+    reach: Reach | None = None
+
+    def reaches(self, candidate: Candidate) -> bool:
+        """Whether a candidate sits where enough of the gap could be made good."""
+        return self.reach is None or any(p in self.reach.enough for p in candidate.at)
 
     def answers(self) -> Mapping[str, Path]:
         """How the model answers at its slots, by experiment: worked out again where the round has let go of that."""

@@ -23,6 +23,8 @@ from hvdc_ident.model.external import AnyModel
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4, second=20)
 """For many candidates: a short sprint, and another for the best."""
+SPRINT = replace(RACE, sprint=6, second=8)
+"""For what is begun near where it ought to end."""
 PROMISING = Race(sprint=6, reach=0.4, second=20, entrants=40)
 """For many sizes, most of which do nothing or nearly all. The right one was eighth where no other look found it."""
 PRICE = 8.0

@@ -24,7 +24,7 @@ from typing import Any
 from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.study.executors.ended import Ended, in_order
 
-BATCH = 0.2  # s of work sent to a worker at a time
+BATCH = 0.05  # s of work sent to a worker at a time
 REPORT = 1e-4  # s of finished work a worker may hold back: a kill of the parent loses no more of it
 START = 180.0  # s a worker may take to begin
 MOST = 1000  # items sent to a worker at a time
