@@ -77,7 +77,7 @@ class Inversion:
         """By how much chi2 falls with the best of everything that may be added at the slot, and with how many values: on
         average noise falls by their number."""
         strength = np.abs(self.square).sum(axis=0).max(initial=0.0)
-        if strength == 0.0:
+        if not 0.0 < strength < np.inf:  # nothing shows, or the answer runs away
             return 0.0, 0
         weak = WEAK**2 * strength
         lower = np.linalg.cholesky(self.square + 2.0 * weak * np.eye(self.asked.size))

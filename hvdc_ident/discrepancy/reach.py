@@ -54,7 +54,7 @@ def reach(nominal: Nominal, paths: Mapping[str, Path], executor: Executor | None
     quick one would not be followed then; nor where there is no gap beyond what chance leaves.
     """
     inner = {n: p for n, p in paths.items() if isinstance(p, Along)}
-    if len(inner) < len(paths) or sum(p.count for p in inner.values()) > KNOTS:
+    if len(inner) < len(paths) or max(p.count for p in inner.values()) > KNOTS // len(inner):
         return None
     left, rows = nominal.projected(nominal.residual[:, None]), nominal.residual.size - nominal.basis.shape[1]
     gap = float(np.sum(left**2)) - rows

@@ -56,6 +56,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         worth = p < NEARLY or (excess(before) and not like_noise(before))
         return _met(search, nothing, nominal) if number == 1 and worth else nothing
     # Beside an effect that is there already there is too little left to save by it.
+    search.tell(0, 1, f"round {number}: what could be made good at each slot")
     could = reach(nominal, paths, search.executor) if number == 1 else None
     opened = replace(opened, significant=True, reach=could)
     near = tuple(p for p in picks if opened.reaches(found[p.candidate]))

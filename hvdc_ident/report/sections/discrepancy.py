@@ -140,7 +140,7 @@ def _where(found: dict[str, Any]) -> str:
         parts.append(f"It is densest where {text(region['signal'])} lies between {ends}.")
     if slots := place.get("slots"):
         listed = ", ".join(f"{text(n)} {100 * min(v, 1.0):.0f} %" for n, v in slots.items())
-        parts.append(f"Of it anything at all could make good: {listed}.")
+        parts.append(f"An effect at one slot could make good of it at most: {listed}.")
     explained, rest = left.get("explained_share"), "noise" if left.get("adequate") else "not all noise"
     if explained is not None:
         parts.append(f"{100 * explained:.1f} % of the gap is explained; what is left is {rest}.")
