@@ -11,7 +11,7 @@ from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.response import Along
-from hvdc_ident.discrepancy.scan import View, bent, met, scan, widened
+from hvdc_ident.discrepancy.scan import View, bent, every_size, scan, widened
 from hvdc_ident.discrepancy.scores import Path, runs
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import Column
@@ -29,7 +29,7 @@ def closer_look(
     asked = [c for c in found if effects()[c.effect].scanned and _worth_a_scan(c) and wanted(c)]
     times = [a.time for a in opened.paths.values()]
     signals = slot_signals(opened.paths, before.placed)
-    dense = [met(c, SlotSignal.of(times, signals[c.at[0]])) for c in asked]
+    dense = [every_size(c, SlotSignal.of(times, signals[c.at[0]])) for c in asked]
     if all(isinstance(p, Along) for p in opened.paths.values()):
         dense += [widened(c) for c in found if not c.still and bent(c) and wanted(c)]
     if not dense:

@@ -55,10 +55,10 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
         worth = p < NEARLY or (excess(before) and not like_noise(before))
         return _met(search, nothing, nominal) if number == 1 and worth else nothing
-    # Beside an effect that is there already there is too little left to save by it.
-    search.tell(0, 1, f"round {number}: what could be made good at each slot")
-    could = reach(nominal, paths, search.executor) if number == 1 else None
-    opened = replace(opened, significant=True, reach=could)
+    opened = replace(opened, significant=True)
+    if number == 1:  # beside an effect that is there already too little is left to save by it
+        search.tell(0, 1, f"round {number}: what could be made good at each slot")
+        opened = replace(opened, reach=reach(nominal, paths, search.executor))
     near = tuple(p for p in picks if opened.reaches(found[p.candidate]))
     return closed(search, *looked(search, opened, nominal, number, near), number)
 

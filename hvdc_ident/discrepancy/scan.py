@@ -275,7 +275,7 @@ def widened(candidate: Candidate) -> Dense:
     return Dense(candidate, np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT))
 
 
-def met(candidate: Candidate, signal: SlotSignal) -> Dense:
+def every_size(candidate: Candidate, signal: SlotSignal) -> Dense:
     """Every size worth a look of a candidate whose size has to be met. signal: that of its slot."""
     probe, sizes = scanned(effects()[candidate.effect], signal)
     return Dense(replace(candidate, probes=(probe,)), np.sort(sizes))
