@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.scan import bent, by_level
+from hvdc_ident.discrepancy.dense import bent, by_level
 from hvdc_ident.discrepancy.scores import SEEN
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search

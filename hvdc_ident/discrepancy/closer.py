@@ -7,11 +7,12 @@ from contextlib import suppress
 from dataclasses import replace
 
 from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.dense import bent, every_size, widened
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.response import Along
-from hvdc_ident.discrepancy.scan import View, bent, every_size, scan, widened
+from hvdc_ident.discrepancy.scan import View, scan
 from hvdc_ident.discrepancy.scores import Path, runs
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import Column

@@ -16,12 +16,13 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.discrepancy.dense import BETWEEN, by_level, sized
 from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.objections import unseen_rows
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Job, Refit, judged, of_held_out, signal
-from hvdc_ident.discrepancy.scan import BETWEEN, QUICK, by_level, sized
+from hvdc_ident.discrepancy.scan import PATIENT
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import SlotSignal, effects, scanned
 from hvdc_ident.errors import HvdcIdentError, SimulationError
@@ -51,8 +52,6 @@ CLOSE = 1.3
 PHASE = 0.2
 """Of a step or period: by how much the last one of a record moves from one size of the closest look to the next."""
 MOST = 1500
-PATIENT = replace(QUICK, max_steps=5000, search=True)
-"""A record that never rests crosses hundreds of levels."""
 BETTER = 0.02
 """Share by which chi2 has to fall for another hop."""
 COUNTS = 12

@@ -69,20 +69,20 @@ class Inversion:
         taken = np.hstack([q.T @ s for q, s in zip(_split(nominal.basis, shown), shown, strict=True)])
         square = block_diag(*(s.T @ s for s in shown)) - taken.T @ taken
         free = nominal.projected(nominal.residual[:, None])
-        asked = np.concatenate([s.T @ r[:, 0] for s, r in zip(shown, _split(free, shown), strict=True)])
+        asked = _with_hats(shown, free)[:, 0]
         return cls(tuple(time), tuple(own), tuple(seen), tuple(means), tuple(shown), square, asked)
 
-    @cached_property
+    @property
     def reach(self) -> tuple[float, int]:
         """By how much chi2 falls with the best of everything that may be added at the slot, and with how many values: on
         average noise falls by their number."""
         strength = np.abs(self.square).sum(axis=0).max(initial=0.0)
         if not 0.0 < strength < np.inf:  # nothing shows, or the answer runs away
             return 0.0, 0
-        weak = WEAK**2 * strength
-        lower = np.linalg.cholesky(self.square + 2.0 * weak * np.eye(self.asked.size))
+        weak = 2.0 * WEAK**2 * strength
+        lower = np.linalg.cholesky(self.square + weak * np.eye(self.asked.size))
         half = solve_triangular(lower, np.column_stack([self.asked, np.eye(self.asked.size)]), lower=True)
-        return float(half[:, 0] @ half[:, 0]), round(self.asked.size - 2.0 * weak * np.sum(half[:, 1:] ** 2))
+        return float(half[:, 0] @ half[:, 0]), round(self.asked.size - weak * np.sum(half[:, 1:] ** 2))
 
     @cached_property
     def _spectrum(self) -> tuple[Array, Array]:
@@ -131,8 +131,7 @@ class Inversion:
 
     def against(self, rows: Array) -> Array:
         """(m, B) what whitened rows (N, B), without what parameters can make good, have of each direction."""
-        at_knots = np.vstack([s.T @ r for s, r in zip(self.shown, _split(rows, self.shown), strict=True)])
-        return np.asarray(self.directions.T @ at_knots / self.strength[:, None])
+        return np.asarray(self.directions.T @ _with_hats(self.shown, rows) / self.strength[:, None])
 
     def falls(self, at_knots: Array, noise: Array) -> tuple[Array, Array, Array]:
         """By how much chi2 falls with each of C additions, the parameters' answer to first order.
@@ -168,6 +167,11 @@ class Inversion:
 def _split(rows: Array, like: Sequence[Array | scipy.sparse.csr_array]) -> list[Array]:
     """The rows of each experiment: as many as its own matrix has."""
     return np.split(rows, np.cumsum([m.shape[0] for m in like])[:-1])
+
+
+def _with_hats(shown: Sequence[Array], rows: Array) -> Array:
+    """(k n, B) products of whitened rows (N, B) with what each hat shows."""
+    return np.vstack([s.T @ r for s, r in zip(shown, _split(rows, shown), strict=True)])
 
 
 def _hats(time: Array, knots: int) -> tuple[Array, scipy.sparse.csr_array]:

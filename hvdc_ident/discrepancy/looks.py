@@ -177,8 +177,8 @@ def _closer(stand: Stand) -> Stand:
 def _the_others(stand: Stand) -> Stand:
     """A candidate for every effect and place that was not tried."""
     opened = stand.opened
-    elsewhere = [k for k, c in enumerate(opened.candidates) if not opened.reaches(c)]
-    wide = others(stand.picks, opened.scores, opened.candidates, [*stand.tried, *elsewhere], WIDER)
+    beyond = [k for k, c in enumerate(opened.candidates) if not opened.reaches(c)]
+    wide = others(stand.picks, opened.scores, opened.candidates, [*stand.tried, *beyond], WIDER)
     return _as_late(stand.with_more(stand.refits(wide, "the other candidates", HEAT)))
 
 

@@ -7,7 +7,7 @@ another slot, what is missing sits elsewhere, and none need be refitted. Linear 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,8 +47,8 @@ class _Slot:
     place: str
 
 
-def reach(nominal: Nominal, paths: Mapping[str, Path], executor: Executor | None) -> Reach | None:
-    """What could be made good at each slot; None where that cannot be told.
+def reach(nominal: Nominal, paths: Mapping[str, Path], slots: Sequence[str], executor: Executor | None) -> Reach | None:
+    """What could be made good at each of the slots, which all runs have; None where that cannot be told.
 
     It cannot of a model that is closed inside, nor where the records have more rows than what is added has values: a
     quick one would not be followed then; nor where there is no gap beyond what chance leaves.
@@ -60,7 +60,6 @@ def reach(nominal: Nominal, paths: Mapping[str, Path], executor: Executor | None
     gap = float(np.sum(left**2)) - rows
     if not gap > SURE * np.sqrt(2.0 * rows):
         return None
-    slots = [p for p in next(iter(inner.values())).slots if all(p in a.slots for a in inner.values())]
     jobs = [_Slot(nominal, {n: p.only(s) for n, p in inner.items()}, s) for s in slots]
     found = np.array(list(mapped(executor, _at_slot, jobs)))
     brings, count = found[:, 0] - found[:, 1], found[:, 1]

@@ -31,9 +31,10 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     options, nominal = search.options, before.nominal()
     search.tell(0, 1, f"round {number}: the model's answers at every slot")
     paths = runs(before.model, nominal)
+    signals = slot_signals(paths, before.placed)
     found = candidates(
         before.model,
-        slot_signals(paths, before.placed),
+        signals,
         [a.time for a in paths.values()],
         search.effects,
         search.places,
@@ -58,7 +59,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     opened = replace(opened, significant=True)
     if number == 1:  # beside an effect that is there already too little is left to save by it
         search.tell(0, 1, f"round {number}: what could be made good at each slot")
-        opened = replace(opened, reach=reach(nominal, paths, search.executor))
+        opened = replace(opened, reach=reach(nominal, paths, list(signals), search.executor))
     near = tuple(p for p in picks if opened.reaches(found[p.candidate]))
     return closed(search, *looked(search, opened, nominal, number, near), number)
 

@@ -18,18 +18,16 @@ from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.begin import added
 from hvdc_ident.discrepancy.block import block, parameter
-from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.dense import Dense, has_to_be_met, sized
 from hvdc_ident.discrepancy.inversion import Inversion
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.response import Along
 from hvdc_ident.discrepancy.scores import Path, Scores, two_sided
-from hvdc_ident.discrepancy.signatures import Column, is_linear, kind_of
-from hvdc_ident.effects import Probe, SlotSignal, effects, scanned
+from hvdc_ident.discrepancy.signatures import Column, kind_of
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit.executor import Executor, Progress, mapped
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
@@ -42,14 +40,6 @@ PLACES = 4
 """Places of an effect that are refitted then."""
 WORTH = 0.3
 """Share of the best fall of chi2 that another one has to bring to be refitted too."""
-BENT = 50
-"""Sizes of an effect that has not to be met."""
-WIDE = 20.0
-"""Below the least and above the largest probe of such an effect: how far its sizes reach."""
-BETWEEN = 7
-"""Sizes between one of the scan and its neighbour, then."""
-TOGETHER = 400
-"""Sizes whose traces are worked out at a time."""
 COARSE = 2
 """Parts of an interval that an effect with corners is stepped in: what is looked at are means over many."""
 THIN = 150
@@ -60,41 +50,6 @@ PATIENT = replace(QUICK, max_steps=5000, search=True)
 """The same where few sizes are left: a record that never rests crosses hundreds of levels."""
 SAMPLE = 16
 """Sizes, spread over all, that are run first: where most of them are passed over, so is the place."""
-
-
-@dataclass(frozen=True, eq=False)
-class Dense:
-    """A candidate with one size, and (C,) all those that it is looked at with, the least first."""
-
-    candidate: Candidate
-    sizes: Array
-
-    @property
-    def place(self) -> tuple[str, tuple[str, ...]]:
-        """The effect, and where."""
-        return self.candidate.effect, self.candidate.at
-
-    def alone(self, k: int) -> Candidate:
-        """The candidate with one of the sizes."""
-        return replace(
-            self.candidate, probes=(_resized(self.candidate.probes[0], sized(self.candidate), self.sizes[k]),)
-        )
-
-    def only(self, k: int) -> Dense:
-        """One of the sizes."""
-        return replace(self, sizes=self.sizes[k : k + 1])
-
-    def around(self, k: int) -> Dense:
-        """One of the sizes and those between it and its neighbours, evenly in the logarithm."""
-        own, last = self.sizes[k], self.sizes.size - 1
-        beside = [self.sizes[max(k - 1, 0)], self.sizes[min(k + 1, last)]]
-        return replace(
-            self, sizes=np.unique(np.concatenate([[own], *(np.geomspace(own, b, BETWEEN + 2)[1:-1] for b in beside)]))
-        )
-
-    def parts(self) -> list[Dense]:
-        """A part of the sizes each: of all at once the traces would fill the memory."""
-        return [replace(self, sizes=self.sizes[k : k + TOGETHER]) for k in range(0, self.sizes.size, TOGETHER)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +191,7 @@ def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
     noise = inverse.against(nominal.projected(slot.noise))
     spots, largest = [], np.zeros(slot.noise.shape[1])
     for dense in slot.found:
-        met = _met(dense.candidate)
+        met = has_to_be_met(dense.candidate)
         for signals in (inverse.own, inverse.told) if slot.own else (inverse.told,):
             parts = [_at_knots(inverse, part, signals) for part in dense.parts()]
             tables = [inverse.falls(part, noise) for part in parts]
@@ -250,42 +205,11 @@ def _at_slot(slot: Slot) -> tuple[list[Spot], Array]:
     return spots, largest
 
 
-def _met(candidate: Candidate) -> bool:
-    """Whether the size has to be met."""
-    return effects()[candidate.effect].scanned
-
-
-def by_level(candidate: Candidate) -> bool:
-    """Whether the size has to be met and is a level of the signal, not a time."""
-    return _met(candidate) and effects()[candidate.effect].late is None
-
-
-def bent(candidate: Candidate) -> bool:
-    """Whether the effect bends its signal at one slot by one parameter that need not be met, and is no kind of delay."""
-    entry = effects()[candidate.effect]
-    single = len(candidate.at) == 1 and not candidate.source and all(len(p.free) == 1 for p in candidate.probes)
-    return single and entry.late is None and not entry.scanned and not is_linear(kind_of(candidate, 0))
-
-
-def widened(candidate: Candidate) -> Dense:
-    """Many sizes of a candidate that bends its signal, evenly in the logarithm."""
-    name = sized(candidate)
-    low, high = candidate.probes[0].free[name]
-    tried = [p.values[name] for p in candidate.probes]
-    return Dense(candidate, np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT))
-
-
-def every_size(candidate: Candidate, signal: SlotSignal) -> Dense:
-    """Every size worth a look of a candidate whose size has to be met. signal: that of its slot."""
-    probe, sizes = scanned(effects()[candidate.effect], signal)
-    return Dense(replace(candidate, probes=(probe,)), np.sort(sizes))
-
-
 def _at_knots(inverse: Inversion, dense: Dense, signals: Sequence[Array]) -> Array:
     """(k n, C) at the knots: what each size of a candidate makes of a signal, less the signal."""
     kind, count = kind_of(dense.candidate, 0), dense.sizes.size
     changes: list[NDArray[np.floating]] = []
-    whole, values = block(kind.effect, kind.present, kind.brings), dict(dense.candidate.probes[0].values)
+    whole, values = block(kind.effect, kind.present, kind.brings), dense.candidate.probes[0].values
     # Thousands are compared, and the best run again: half the digits take a third of the time.
     digits = np.float32 if whole.quick else np.float64
     own = {parameter(n): np.full(count, values[n]) for n in kind.present} | {
@@ -403,15 +327,3 @@ def _traces(job: Job) -> tuple[Array, Array]:
         s = job.residual - np.concatenate([b.residual for b in blocks])
         products[i], squares[i] = s @ job.right, float(s @ s)
     return products, squares
-
-
-def sized(candidate: Candidate) -> str:
-    """The parameter whose size is looked for: the one that has to be met, or the only one."""
-    parameters = effects()[candidate.effect].parameters
-    return next((n for n, q in parameters.items() if q.scan is not None), next(iter(parameters)))
-
-
-def _resized(probe: Probe, name: str, size: float) -> Probe:
-    low, high = probe.free[name]
-    free = FrozenMap({**probe.free, name: (min(low, 0.9 * size), max(high, 1.1 * size))})
-    return replace(probe, values=FrozenMap({**probe.values, name: size}), free=free)

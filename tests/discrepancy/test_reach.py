@@ -55,7 +55,7 @@ def clipped(level: float) -> tuple[Experiment, ...]:
 
 def test_what_sits_at_a_slot_is_within_its_reach_and_not_within_that_of_others() -> None:
     nominal = plain(clipped(0.6)).nominal()
-    found = reach(nominal, runs(model(), nominal), None)
+    found = reach(nominal, runs(model(), nominal), model().slots, None)
     assert found is not None
     assert next(iter(found.shares)) == "outputs.torque"
     assert found.shares["outputs.torque"] == pytest.approx(1.0, abs=0.1)
@@ -66,13 +66,13 @@ def test_what_sits_at_a_slot_is_within_its_reach_and_not_within_that_of_others()
 def test_nothing_is_told_where_it_cannot_be() -> None:
     nominal = plain(experiments(lag=0.03)).nominal()
     paths = runs(model(), nominal)
-    assert reach(nominal, paths, None) is not None
+    assert reach(nominal, paths, model().slots, None) is not None
     long = {n: replace(p, count=500) for n, p in paths.items() if isinstance(p, Along)}
-    assert reach(nominal, long, None) is None
+    assert reach(nominal, long, model().slots, None) is None
     closed = {**paths, "closed": object()}
-    assert reach(nominal, closed, None) is None  # type: ignore[arg-type]
+    assert reach(nominal, closed, model().slots, None) is None  # type: ignore[arg-type]
     quiet = plain(experiments()).nominal()
-    assert reach(quiet, runs(model(), quiet), None) is None
+    assert reach(quiet, runs(model(), quiet), model().slots, None) is None
 
 
 def test_what_is_refitted_first_sits_within_reach_and_the_diagnosis_tells_of_it() -> None:
