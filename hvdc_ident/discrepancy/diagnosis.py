@@ -22,7 +22,7 @@ from hvdc_ident.discrepancy.refit import Refit, judged
 from hvdc_ident.discrepancy.result import Diagnosis, Found
 from hvdc_ident.discrepancy.search import Outcome, forward
 from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.verdict import Judgement, judge
+from hvdc_ident.discrepancy.verdict import Judgement, judge, tests_of
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator
@@ -84,9 +84,9 @@ def diagnose(
     inside = isinstance(model, Model)
     other = None
     if judgement.instead is not None:
-        other = formula_found(judgement.instead.refit, judgement.instead.gain)
+        other = formula_found(judgement.instead)
     elif judgement.verdict == "unnameable" and chosen.fallback and inside:
-        other = fallback(search, first, outcome)
+        other = fallback(search, outcome.rounds[0])
     if not inside:
         notes = (*notes, CLOSED)
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
@@ -129,6 +129,7 @@ def _assembled(
 ) -> Diagnosis:
     search.tell(0, 1, "before and after")
     in_place = judgement.verdict in ("named", "ambiguous")
+    tests = judgement.tests
     effects: tuple[Found, ...] = ()
     last = first
     if in_place:
@@ -136,6 +137,7 @@ def _assembled(
         effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
     elif other is not None and other.refit is not None:
         last = other.refit
+        tests = tests_of(search, last)
     augmented = None if last is first else last.model.with_values(_own(last))
     given = with_given(first, {f.name: f.start for f in free})
     responses_found = responses(model, first, augmented, last)
@@ -150,7 +152,7 @@ def _assembled(
         location=localise(model if isinstance(model, Model) else None, first.nominal(), outcome.rounds[0].reach),
         detectable=detectable(outcome, search.options),
         gap=gap(given, first, last),
-        remaining=remaining(first, last, judgement.tests, search),
+        remaining=remaining(first, last, tests, search),
         parameters_before=FrozenMap({f.name: f.start for f in free}),
         parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.start) for f in free}),
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.start) for f in free}),

@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.candidates import kind_of, source_signals
-from hvdc_ident.discrepancy.formula import at_run, filled, formula_job
+from hvdc_ident.discrepancy.formula import Law, filled, labelled
 from hvdc_ident.discrepancy.hidden import Regression, over_signal, over_time, regression
-from hvdc_ident.discrepancy.library import Term, terms
-from hvdc_ident.discrepancy.noise import draws
-from hvdc_ident.discrepancy.refit import Refit, run, unseen
+from hvdc_ident.discrepancy.law import STABLE, law
+from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.scores import Path
-from hvdc_ident.discrepancy.search import Outcome
-from hvdc_ident.discrepancy.select import Ruler
-from hvdc_ident.discrepancy.state import Search, slot_signals
+from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.effects import effects
-from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
+from hvdc_ident.words import listed
 
-MOST = 3
-STABLE = 0.8
-AGAIN = 25
-CLOSE = 2.0
-"""What a term may leave, in noise units (of chi2 a row, and held out)."""
 PLACES = 6
-"""Places, the best by regression, at which the form is tried by full simulation."""
+"""Places, the best over time, at which what is missing is sought over signals too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +30,8 @@ class Fallback:
     """What was found outside the catalogue. kind: term, disturbance, curve or nothing.
 
     at: the slot; expression and coefficients: of a term; stability: share of noise records that choose the same terms;
-    curve: of the others, {over, at, value, std}. refit: the model with the term; text: a sentence.
+    curve: of the others, {over, at, value, std}. as_good: terms, {at, expression}, that explain as much. refit: the model with
+    the term; text: a sentence.
     """
 
     kind: str
@@ -50,6 +42,7 @@ class Fallback:
     stability: float | None = None
     delta_bic: float | None = None
     curve: Mapping[str, Any] | None = None
+    as_good: tuple[Mapping[str, str], ...] = ()
     refit: Refit | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -57,45 +50,20 @@ class Fallback:
         return {n: plain(getattr(self, n)) for n in self.__dataclass_fields__ if n != "refit"}
 
 
-def fallback(search: Search, first: Refit, outcome: Outcome) -> Fallback:
-    """A term found from the data and refitted by full simulation; where none is stable, a disturbance or a curve."""
-    nominal, paths = first.nominal(), outcome.rounds[0].answers()
-    places = _places(search, first, paths)
-    signals = source_signals(first.model, slot_signals(paths))
-    price = search.options.named_bic + float(np.log(nominal.residual.size))
-    ranked = []
-    for k, place in enumerate(places):
-        search.tell(k, len(places), f"hidden input at {place}")
-        library = terms([place, *(s for s in signals if s != place)] if not _is_output(first, place) else signals)
-        found = regression(nominal, paths, place, [at_run(t) for t in library])
-        chosen = found.selected(MOST, price)
-        if chosen:
-            coefficients, gain = found.solved(chosen)
-            score = gain - len(chosen) * price
-            ranked.append((score, place, [library[j] for j in chosen], coefficients, found, chosen))
-    ranked.sort(key=lambda item: -item[0])
-    tried: list[tuple[float, Fallback]] = []
-    for _, place, chosen_terms, coefficients, found, chosen in ranked[:PLACES]:
-        stability = _stability(search, first, found, chosen, coefficients, price)
-        if stability >= STABLE:
-            made = _inserted(search, first, place, chosen_terms, coefficients, stability)
-            if made is not None and made.refit is not None:
-                tried.append((made.refit.chi2 + len(chosen) * price, made))
-    if tried:
-        return min(tried, key=lambda item: item[0])[1]
-    return _curve(search, first, paths, [p for _, p, *_ in ranked] or places)
+def fallback(search: Search, opened: Round) -> Fallback:
+    """A law found from the data; where none stands, a disturbance or a curve. opened: the search's first round, which may have
+    looked for a law already."""
+    found = law(search, opened) if opened.laws is None else next(iter(opened.laws), None)
+    if found is not None:
+        return formula_found(found)
+    return _curve(search, opened)
 
 
-def _is_output(first: Refit, place: str) -> bool:
-    return kind_of(first.model, place) == "output"
-
-
-def _places(search: Search, first: Refit, paths: Mapping[str, Path]) -> list[str]:
+def _places(search: Search, opened: Round) -> list[str]:
     """Slots inside the model that are heard at the outputs."""
-    inner = [p for p in slot_signals(paths) if kind_of(first.model, p) in ("signal", "algebraic")]
-    if search.places is not None:
-        named = {p for g in search.places for p in ((g,) if isinstance(g, str) else g)}
-        inner = [p for p in inner if p in named]
+    paths = opened.answers()
+    inner = [p for p in slot_signals(paths) if kind_of(opened.before.model, p) in ("signal", "algebraic")]
+    inner = [p for p in inner if search.looks_at(p)]
     path = next(iter(paths.values()))
     heard = []
     for p in inner:
@@ -106,52 +74,9 @@ def _places(search: Search, first: Refit, paths: Mapping[str, Path]) -> list[str
     return heard
 
 
-def _stability(
-    search: Search, first: Refit, found: Regression, chosen: Sequence[int], coefficients: Array, price: float
-) -> float:
-    """The share of records, the terms' answer with other noise, from which the same terms are chosen."""
-    nominal = first.nominal()
-    noise = nominal.projected(
-        np.vstack(draws(first.problem, nominal.blocks, first.noise, nominal.fitted(), AGAIN, search.seed + 77))
-    )
-    explained = found.columns[:, list(chosen)] @ coefficients
-    same = 0
-    for b in range(AGAIN):
-        again = Regression(found.columns, explained + noise[:, b])
-        same += set(again.selected(MOST, price)) == set(chosen)
-    return same / AGAIN
-
-
-def _inserted(
-    search: Search, first: Refit, place: str, chosen: Sequence[Term], coefficients: Array, stability: float
-) -> Fallback | None:
-    """The term in the model, refitted; None where it does not stand the tests an effect of the catalogue has to."""
-    try:
-        refit = run(formula_job(first, place, chosen, coefficients))
-    except HvdcIdentError:
-        return None
-    if refit.failure:
-        return None
-    gain = Ruler.of(refit).gain(first.chi2, refit.chi2, refit.count)
-    was, now = unseen(first), unseen(refit)
-    if not (
-        gain > search.options.named_bic
-        and was is not None
-        and now is not None
-        and was - now > search.options.holdout_share
-    ):
-        return None
-    if refit.chi2 / refit.rows > CLOSE or now > CLOSE:
-        return None  # a formula is a claim: what it leaves has to be next to noise
-    explained = first.chi2 - refit.chi2
-    tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
-    if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):
-        return None
-    return formula_found(refit, gain, stability)
-
-
-def formula_found(refit: Refit, gain: float, stability: float | None = None) -> Fallback:
-    """The formula that a refit ends with. gain: delta BIC; stability: share of noise records that choose the same terms."""
+def formula_found(found: Law) -> Fallback:
+    """The formula that a refit ends with."""
+    refit = found.refit
     placed = refit.placed[-1]
     (place,) = placed.candidate.at
     shown = {}
@@ -159,43 +84,61 @@ def formula_found(refit: Refit, gain: float, stability: float | None = None) -> 
         std = refit.std.get(placed.names[n])
         shown[n] = {"value": value, "ci95": None if std is None else [value - 1.96 * std, value + 1.96 * std]}
     text = effects()["term"].sentence.replace("{at}", place).replace("{expression}", filled(placed, refit))
+    said = [f"Found from the data, outside the catalogue: {text}."]
+    if found.others:
+        said.append(f"As good: {listed([labelled(r) for r in found.others])}.")
+    if found.stability is not None and found.stability < STABLE:
+        said.append(f"With other noise other terms would have been chosen in {1 - found.stability:.0%} of all cases.")
     return Fallback(
-        "term", place, f"Found from the data, outside the catalogue: {text}.", placed.use.expression,
-        FrozenMap(shown), stability, gain, None, refit,
+        "term", place, " ".join(said), placed.use.expression, FrozenMap(shown), found.stability, found.gain, None,
+        tuple({"at": r.placed[-1].candidate.at[0], "expression": r.placed[-1].use.expression} for r in found.others), refit,
     )  # fmt: skip
 
 
-def _curve(search: Search, first: Refit, paths: Mapping[str, Path], places: Sequence[str]) -> Fallback:
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """A hidden input at a place as hats over time or a signal. worth: the fall of chi2 less the price of its knots."""
+
+    worth: float
+    place: str
+    over: str
+    at: Array
+    values: Array
+    found: Regression
+
+
+def _curve(search: Search, opened: Round) -> Fallback:
     """The hidden input over time or over a signal, whichever explains more for its number of knots."""
-    nominal = first.nominal()
-    rows = float(np.log(nominal.residual.size))
-    best: tuple[float, str, str, Array, Regression, Array] | None = None
-    signals = source_signals(first.model, slot_signals(paths))
-    for place in list(places)[:PLACES]:
-        begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())
-        hats = over_time(paths)
-        options = [("time", np.linspace(begin, end, len(hats)), hats)]
-        for s in dict.fromkeys([place, *signals[:4]]):
-            if np.ptp(np.concatenate([a.signal(s) for a in paths.values()])) > 0:
-                options.append((s, *over_signal(paths, s)))
-        for over, at, functions in options:
-            found = regression(nominal, paths, place, functions)
-            values, gain = found.solved(range(len(functions)))
-            worth = gain - len(functions) * rows
-            if worth > 0 and (best is None or worth > best[0]):
-                best = (worth, place, over, at, found, values)
-    if best is None:
+    paths, nominal = opened.answers(), opened.before.nominal()
+    begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())
+    signals = source_signals(opened.before.model, slot_signals(paths))
+    hats = over_time(paths)
+
+    def shape(place: str, over: str, at: Array, functions: Sequence[Callable[[str, Path], Array]]) -> _Shape:
+        found = regression(nominal, paths, place, functions)
+        values, gain = found.solved(range(len(functions)))
+        return _Shape(gain - len(functions) * float(np.log(nominal.residual.size)), place, over, at, values, found)
+
+    in_time = [shape(p, "time", np.linspace(begin, end, len(hats)), hats) for p in _places(search, opened)]
+    in_time.sort(key=lambda s: -s.worth)
+    shapes = [s for s in in_time if s.worth > 0]
+    for place in [s.place for s in in_time[:PLACES]]:
+        for over in dict.fromkeys([place, *signals[:4]]):
+            if np.ptp(np.concatenate([a.signal(over) for a in paths.values()])) > 0:
+                shapes.append(shape(place, over, *over_signal(paths, over)))
+    best = max(shapes, key=lambda s: s.worth, default=None)
+    if best is None or best.worth <= 0:
         return Fallback("nothing", "", "No hidden input at any one place explains it.")
-    worth, place, over, at, found, values = best
-    spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(found.columns.T @ found.columns, rcond=1e-10)), 0.0))
-    curve = {"over": over, "at": at.tolist(), "value": values.tolist(), "std": spread.tolist()}
-    if over == "time":
-        repeats = len(first.problem.fitted_experiments) > 1
+    place, columns = best.place, best.found.columns
+    spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(columns.T @ columns, rcond=1e-10)), 0.0))
+    curve = {"over": best.over, "at": best.at.tolist(), "value": best.values.tolist(), "std": spread.tolist()}
+    if best.over == "time":
+        repeats = len(opened.before.problem.fitted_experiments) > 1
         text = (
             f"It acts at {place} at the same times in every experiment, whatever the state: a disturbance"
             if repeats
             else (f"It acts at {place}; with one experiment a disturbance cannot be told from a form")
         )
-        return Fallback("disturbance" if repeats else "curve", place, f"{text}.", delta_bic=worth, curve=curve)
-    text = f"No formula is stable; what is missing at {place} is given as a curve over {over} with its band."
-    return Fallback("curve", place, text, delta_bic=worth, curve=curve)
+        return Fallback("disturbance" if repeats else "curve", place, f"{text}.", delta_bic=best.worth, curve=curve)
+    text = f"No formula is stable; what is missing at {place} is given as a curve over {best.over} with its band."
+    return Fallback("curve", place, text, delta_bic=best.worth, curve=curve)

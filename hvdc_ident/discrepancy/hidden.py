@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from hvdc_ident.discrepancy.scores import Path, Whitening
 from hvdc_ident.trajectory import Array
 
 KNOTS = 24
+INDEPENDENT = 1e-8
+"""Share of a column's square that is left beside those chosen: with less it is made of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,26 +35,56 @@ class Regression:
         c = np.linalg.lstsq(a / norms, self.residual, rcond=1e-8)[0]
         return c / norms, float(self.residual @ self.residual - np.sum((self.residual - (a / norms) @ c) ** 2))
 
-    def selected(self, most: int, price: float) -> list[int]:
-        """Columns chosen one after the other, each the one that lowers chi2 most, while that is worth its price."""
-        chosen: list[int] = []
-        for _ in range(most):
-            falls = self._falls(chosen)
+    def selected(self, most: int, price: float, residual: Array | None = None) -> list[int]:
+        """Columns that lower chi2 by more than their price: the best one, pair, and so on, each found from the pair before.
+
+        Of columns that are much alike none of two that explain the residual together need be the best by itself: pairs are
+        all looked at, a further one is added to them. residual: (N,) another one; one of many is asked for in little time.
+        """
+        asked = self._units.T @ (self.residual if residual is None else residual)
+        best = self._pair(asked, price)
+        while best and len(best) < most:
+            falls = self._further(asked, best)
             k = int(np.argmax(falls))
             if falls[k] <= price:
                 break
-            chosen.append(k)
-        return chosen
+            best = [*best, k]
+        return best
 
-    def _falls(self, chosen: list[int]) -> Array:
+    def _pair(self, asked: Array, price: float) -> list[int]:
+        """The best column, or the best two where the second is worth its price; none where none is."""
+        alone = asked**2
+        k = int(np.argmax(alone))
+        left = 1.0 - self._products**2
+        sound = left > INDEPENDENT
+        cross = self._products * np.outer(asked, asked)
+        both = np.where(sound, (alone[:, None] + alone - 2.0 * cross) / np.where(sound, left, 1.0), 0.0)
+        i, j = np.unravel_index(int(np.argmax(both)), both.shape)
+        if both[i, j] - alone[k] > price:
+            return sorted((int(i), int(j)), key=lambda n: -alone[n])
+        return [k] if alone[k] > price else []
+
+    def _further(self, asked: Array, chosen: list[int]) -> Array:
         """(k,) by how much chi2 falls with each column beside those chosen; 0 for one that is made of them."""
-        left, columns = self.residual, self.columns
-        if chosen:
-            q = np.linalg.qr(self.columns[:, chosen])[0]
-            left, columns = left - q @ (q.T @ left), columns - q @ (q.T @ columns)
-        norms = np.linalg.norm(columns, axis=0)
-        sound = norms > 1e-4 * np.maximum(np.linalg.norm(self.columns, axis=0), 1e-300)
-        return np.where(sound, (columns.T @ left) ** 2 / np.where(sound, norms**2, 1.0), 0.0)
+        half = np.linalg.solve(
+            self._products[np.ix_(chosen, chosen)], np.column_stack([self._products[chosen], asked[chosen]])
+        )
+        square = np.diag(self._products) - np.einsum("ij,ij->j", self._products[chosen], half[:, :-1])
+        left = asked - self._products[chosen].T @ half[:, -1]
+        sound = square > INDEPENDENT
+        return np.where(sound, left**2 / np.where(sound, square, 1.0), 0.0)
+
+    @cached_property
+    def _norms(self) -> Array:
+        return np.asarray(np.linalg.norm(self.columns, axis=0))
+
+    @cached_property
+    def _units(self) -> Array:
+        return np.asarray(self.columns / np.where(self._norms > 0, self._norms, 1.0))
+
+    @cached_property
+    def _products(self) -> Array:
+        return np.asarray(self._units.T @ self._units)
 
 
 def regression(

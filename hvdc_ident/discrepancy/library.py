@@ -1,4 +1,4 @@
-"""Terms that a hidden input may be made of: powers, magnitudes and products of the model's own signals."""
+"""Terms that a hidden input may be made of: powers, magnitudes and products of the model's own signals, and their drifts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from hvdc_ident.trajectory import Array
 
 MOST = 7
 """Signals the terms are made of."""
+TIME = "time"
+"""What a drift grows with, s: of a signal from nothing, or with it of its gain."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,10 @@ def terms(signals: Sequence[str]) -> tuple[Term, ...]:
     found += [Term(f"{n}*abs({n})", (n,), "xx") for n in chosen]
     found += [Term(f"abs({n})", (n,), "abs") for n in chosen]
     found += [Term(f"{a}*{b}", (a, b), "xy") for i, a in enumerate(chosen) for b in chosen[i + 1 :]]
+    found += [Term(TIME, (TIME,), "x"), *(Term(f"{n}*{TIME}", (n, TIME), "xy") for n in chosen)]
     return tuple(found)
 
 
-def along(term: Term, values: Mapping[str, Array]) -> Array:
-    """The term along a run."""
-    return term([values[n] for n in term.signals])
+def along(term: Term, time: Array, values: Mapping[str, Array]) -> Array:
+    """The term along a run. time: (K,) its instants, s; values: its signals, (K,) each."""
+    return term([time if n == TIME else values[n] for n in term.signals])

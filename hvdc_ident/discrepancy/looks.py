@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.law import law
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.scores import signature_rows
@@ -102,8 +103,9 @@ def looked(
     # Beside an effect that is there already the others cost more than they have been seen to find.
     for look in AT_FIRST if number == 1 else ():
         stand = look(stand)
-    for look in WHERE_FAR if number == 1 and stand.anything_told else ():
-        if not stand.far:
+    further = (*WHERE_FAR, *(THOROUGH if search.options.thorough else ()))
+    for look in further if number == 1 and stand.anything_told else ():
+        if not stand.far or stand.opened.law:
             break
         stand = look(stand)
     return stand.opened, stand.trials
@@ -174,6 +176,14 @@ def _closer(stand: Stand) -> Stand:
     return stand.with_best(stand.refits(extra, "refits of the closer look"))
 
 
+def _as_a_law(stand: Stand) -> Stand:
+    """A formula outside the catalogue: one that leaves next to nothing but noise spares all looks that are left."""
+    if not stand.search.options.fallback:
+        return stand
+    found = law(stand.search, stand.opened, next((t.refit for t in by_cost(stand.trials)), None))
+    return replace(stand, opened=replace(stand.opened, laws=() if found is None else (found,)))
+
+
 def _the_others(stand: Stand) -> Stand:
     """A candidate for every effect and place that was not tried."""
     opened = stand.opened
@@ -196,5 +206,7 @@ def _once_more(stand: Stand) -> Stand:
 ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _twins, _elsewhere, _other_forms, _as_late, _elsewhere)
 AT_FIRST: tuple[Look, ...] = (_closer, _as_late)
 """In the first round."""
-WHERE_FAR: tuple[Look, ...] = (_the_others, _from_every_size, _once_more)
+WHERE_FAR: tuple[Look, ...] = (_as_a_law, _from_every_size)
 """In the first round, as long as nothing comes near the noise."""
+THOROUGH: tuple[Look, ...] = (_the_others, _once_more)
+"""After these, where that is asked for: they take as long as all before them, and seldom find anything."""

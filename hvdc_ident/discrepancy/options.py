@@ -18,6 +18,8 @@ class Options:
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
     refuted: share of what an effect explains that may be left, in structure, in the region it was put there for.
     starts: runs of the nominal multistart. fallback: whether a form outside the catalogue is looked for.
+    thorough: whether candidates are refitted, too, of which the scores tell little, where no other comes near the noise:
+    of 160 hidden effects that were found in nine out of ten times without that, it would find another one or two.
     Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.
     """
 
@@ -33,6 +35,7 @@ class Options:
     refuted: float = 0.1
     starts: int = 2
     fallback: bool = True
+    thorough: bool = False
 
     def __post_init__(self) -> None:
         if not (0 < self.significance < 1 and self.bootstraps * self.significance >= 1):

@@ -22,8 +22,12 @@ REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
 LEAST_SCORE = 0.25
 """The same where there is one: the sizes that it is of may be none that the refit came to, as of a moving mean's zeros."""
+LARGE = 2.0
+"""Times its rows: chi2 of a model with an effect in it from which it is asked where anything would explain the rest."""
 NEARLY = 0.1
 """Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
+
+BEYOND = "none of it comes near the noise, and a formula does"
 
 
 def one_round(search: Search, before: Refit, number: int) -> Round:
@@ -57,7 +61,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
         worth = p < NEARLY or (excess(before) and not like_noise(before))
         return _met(search, nothing, nominal) if number == 1 and worth else nothing
     opened = replace(opened, significant=True)
-    if number == 1:  # beside an effect that is there already too little is left to save by it
+    if number == 1 or before.chi2 > LARGE * before.rows:  # else too little is left to save by it
         search.tell(0, 1, f"round {number}: what could be made good at each slot")
         opened = replace(opened, reach=reach(nominal, paths, list(signals), search.executor))
     near = tuple(p for p in picks if opened.reaches(found[p.candidate]))
@@ -87,6 +91,8 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     before, found = opened.before, opened.candidates
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
     ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
+    if opened.law is not None:
+        return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=BEYOND)
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
     refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
     winner = next((t for t in level if not refused[id(t)]), None)

@@ -44,7 +44,8 @@ def forward(search: Search, first: Refit) -> Outcome:
             break
         rounds.append(found)
         if found.winner is None:
-            both = pair(search, here, found) if found.significant and number < search.options.most else None
+            hopeful = found.significant and found.law is None and number < search.options.most
+            both = pair(search, here, found) if hopeful else None
             if both is None:
                 break
             rounds[-1] = both[0]

@@ -54,7 +54,9 @@ def settled(
             here = without
             del kept[k]
             continue
-        if near:
+        if _beside_these(kept[k], others, last=k == len(kept) - 1):
+            kept[k] = kept[k].light()
+        elif near:
             try:
                 again, winner = _looked_again(search, first, here, kept[k], k, without, number + k + 1)
                 kept[k] = again.light()
@@ -63,6 +65,12 @@ def settled(
                 notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
         k += 1
     return here, kept, tuple(notes)
+
+
+def _beside_these(own: Round, others: Sequence[Placed], last: bool) -> bool:
+    """Whether the round that brought the last effect looked for it beside the others as they are, and refitted its rivals."""
+    before = [p.candidate.label for p in own.before.placed]
+    return last and len(own.trials) > 1 and before == [p.candidate.label for p in others]
 
 
 def _looked_again(

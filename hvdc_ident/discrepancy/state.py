@@ -8,6 +8,7 @@ from typing import Literal
 
 from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.reach import Reach
 from hvdc_ident.discrepancy.refit import Refit
@@ -34,6 +35,10 @@ class Search:
         """Whether an effect is among those looked for."""
         return self.effects == "all" or effect in self.effects
 
+    def looks_at(self, slot: str) -> bool:
+        """Whether a slot is among those looked at."""
+        return self.places is None or any(slot in ((g,) if isinstance(g, str) else g) for g in self.places)
+
     def tell(self, done: int, total: int, text: str) -> None:
         """Nothing; whoever watches is told."""
         if self.progress:
@@ -45,7 +50,8 @@ class Round:
     """What one round found. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
 
     trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
-    reach: what of the gap could be made good at each slot; None where that is not known.
+    reach: what of the gap could be made good at each slot; None where that is not known. laws: the formula outside the
+    catalogue that explains most, or nothing; None where none was looked for.
     """
 
     before: Refit
@@ -60,6 +66,12 @@ class Round:
     significant: bool
     ruler: Ruler | None
     reach: Reach | None = None
+    laws: tuple[Law, ...] | None = None
+
+    @property
+    def law(self) -> Law | None:
+        """The formula that leaves next to nothing but noise, where no effect that was refitted does."""
+        return next((one for one in self.laws or () if one.near), None)
 
     def reaches(self, candidate: Candidate) -> bool:
         """Whether a candidate sits where enough of the gap could be made good."""

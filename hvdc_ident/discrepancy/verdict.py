@@ -13,6 +13,7 @@ from hvdc_ident.discrepancy.adequacy import Binned, adequacy
 from hvdc_ident.discrepancy.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.beyond import beyond
 from hvdc_ident.discrepancy.doubts import TRIFLE, Doubt, doubt, remains
+from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.noise import FEWEST
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import silent, worst
@@ -20,7 +21,7 @@ from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.result import Rival, Verdict
 from hvdc_ident.discrepancy.search import Outcome
-from hvdc_ident.discrepancy.select import Trial, material_gap
+from hvdc_ident.discrepancy.select import material_gap
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
@@ -52,7 +53,7 @@ class Judgement:
     tests: tuple[Binned, ...]
     sets: tuple[tuple[Rival, ...], ...] = ()
     experiment: Mapping[str, Any] = field(default_factory=dict)
-    instead: Trial | None = None
+    instead: Law | None = None
     doubt: str = ""
 
 
@@ -60,7 +61,7 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     """The verdict on a search that has ended."""
     options, last = search.options, outcome.refit
     left = last.nominal()
-    tests = adequacy(left, _signals(last), bootstraps=options.bootstraps, seed=search.seed)
+    tests = tests_of(search, last)
     if not outcome.kept:
         return _nothing(search, first, outcome, tests)
     explained = first.chi2 - last.chi2
@@ -91,9 +92,14 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     return found if against is None else _in_doubt(found, labels, against)
 
 
+def tests_of(search: Search, last: Refit) -> tuple[Binned, ...]:
+    """Whether what a model leaves is noise, over time and over the signals at the slots of its effects."""
+    return adequacy(last.nominal(), _signals(last), bootstraps=search.options.bootstraps, seed=search.seed)
+
+
 def _with_formulas(
     search: Search, outcome: Outcome, sets: tuple[tuple[Rival, ...], ...]
-) -> tuple[tuple[tuple[Rival, ...], ...], Trial | None]:
+) -> tuple[tuple[tuple[Rival, ...], ...], Law | None]:
     """By effect that was put in, it and what cannot be told from it; and a formula that explains more than one of them does.
 
     sets: by the catalogue alone. Formulas are tried where it has no rival, before a name is said, unless no form outside it
@@ -107,7 +113,8 @@ def _with_formulas(
         formulas = beyond(search, found)
         near = formula_rivals(found, formulas, options)
         if not near:
-            return (), max(formulas, key=lambda t: t.told)
+            best = max(formulas, key=lambda t: t.told)
+            return (), Law(best.refit, best.gain)
         wider.append(near)
     return tuple(wider), None
 
@@ -205,6 +212,9 @@ def noise_left(left: Nominal) -> float:
 def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned, ...]) -> Judgement:
     found = outcome.rounds[-1]
     options = search.options
+    if found.law is not None:
+        text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
+        return Judgement("unnameable", text, tests, instead=found.law)
     was = unseen(first)
     gap_there = material_gap(
         was, 1.0, options.holdout_share, search.material, (worst(first), dict.fromkeys(search.material, 0.0))

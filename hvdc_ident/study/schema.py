@@ -260,11 +260,13 @@ class Fit(Table):
 
 
 class Diagnose(Table):
-    """[diagnose]: which effects to try, what is too small to matter, and how many effects may be missing at most."""
+    """[diagnose]: which effects to try, what is too small to matter, how many effects may be missing at most, and whether what
+    the scores tell little of is refitted too where nothing else comes near the noise."""
 
     effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = "all"
     material: dict[Name, Positive] = {}
     most: Annotated[int, Field(ge=1)] = 3
+    thorough: bool = False
 
 
 class StudyFile(Table):

@@ -12,7 +12,6 @@ from scipy.linalg import block_diag
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.discrepancy.hidden import Regression
 from hvdc_ident.discrepancy.inversion import Inversion
 from hvdc_ident.discrepancy.reach import SHARE, reach
 from hvdc_ident.discrepancy.response import Along
@@ -85,25 +84,6 @@ def test_what_is_refitted_first_sits_within_reach_and_the_diagnosis_tells_of_it(
     assert any(max(slots[p] for p in at) < least for at in left_out)
     assert found.verdict in ("named", "ambiguous"), found.text
     assert [(e.effect, e.at) for e in found.effects] == [("limit", ("outputs.torque",))]
-
-
-def test_terms_are_chosen_as_by_solving_for_each() -> None:
-    random = np.random.default_rng(1)
-    columns = random.standard_normal((200, 30)) * np.geomspace(1e-3, 1e3, 30)
-    columns[:, 7] = columns[:, 6] + 1e-9 * columns[:, 7]  # one is another again
-    residual = (
-        3.0 * columns[:, 4] / columns[:, 4].std() + columns[:, 21] / columns[:, 21].std() + random.standard_normal(200)
-    )
-    whole = Regression(columns, residual)
-    chosen: list[int] = []
-    gain = 0.0
-    for _ in range(4):
-        best, k = max((whole.solved([*chosen, k])[1], k) for k in range(30) if k not in chosen)
-        if best - gain <= 12.0:
-            break
-        chosen, gain = [*chosen, k], best
-    assert sorted(chosen) == [4, 21]
-    assert whole.selected(4, 12.0) == chosen
 
 
 @pytest.mark.parametrize("effect", ["quantisation", "sample-hold"])

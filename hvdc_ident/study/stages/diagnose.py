@@ -41,7 +41,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             effects="all" if asked.effects == "all" else list(asked.effects),
             material=asked.material,
             report=report,
-            options=Budget(most=asked.most),
+            options=Budget(most=asked.most, thorough=asked.thorough),
             seed=options.seed,
             executor=executor,
             progress=options.progress,

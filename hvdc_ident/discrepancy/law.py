@@ -1,0 +1,164 @@
+"""A law found from the records: terms of the model's own signals, chosen by sparse regression at each slot, and refitted.
+
+For what the catalogue has no name for. A formula is a claim: by full simulation it has to stand the tests that an effect of
+the catalogue has to, and to leave noise of the fitted records and of the others, or its terms to be chosen from other noise too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.adequacy import adequacy
+from hvdc_ident.discrepancy.candidates import source_signals
+from hvdc_ident.discrepancy.formula import Law, at_run, formula_job
+from hvdc_ident.discrepancy.hidden import Regression, regression
+from hvdc_ident.discrepancy.library import Term, terms
+from hvdc_ident.discrepancy.noise import draws
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.refit import Refit, unseen
+from hvdc_ident.discrepancy.response import Along
+from hvdc_ident.discrepancy.select import Ruler
+from hvdc_ident.discrepancy.state import Round, Search, slot_signals
+from hvdc_ident.discrepancy.trials import RACE, is_far
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.fit.executor import mapped
+from hvdc_ident.trajectory import Array
+
+MOST = 3
+"""Terms of one formula."""
+STABLE = 0.8
+"""Share of noise records from which the same terms have to be chosen where more than noise is left."""
+AGAIN = 25
+CLOSE = 2.0
+"""What a formula may leave, in noise units (of chi2 a row, and held out)."""
+PLACES = 6
+"""Places, the best by regression, at which the form is tried by full simulation."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Slot:
+    """What is regressed at one slot. noise: (N, B) records of it, projected; price: what a term has to bring."""
+
+    nominal: Nominal
+    paths: Mapping[str, Along]
+    place: str
+    library: tuple[Term, ...]
+    noise: Array
+    price: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """Terms chosen at a slot with their coefficients. worth: the fall of chi2 they bring less their price."""
+
+    place: str
+    terms: tuple[Term, ...]
+    coefficients: Array
+    worth: float
+    stability: float
+
+    def less(self) -> list[_Form]:
+        """It, and without its last term where that came to a pair: linear in a bias of the gains, it may not be needed."""
+        shorter = replace(self, terms=self.terms[:-1], coefficients=self.coefficients[:-1])
+        return [self, shorter] if len(self.terms) == MOST else [self]
+
+
+def law(search: Search, found: Round, best: Refit | None = None) -> Law | None:
+    """The formula that explains most of what the model before a round lacks; None where none stands every test.
+
+    Looked for within reach, as the round has it. None, too, for a model that is closed inside. best: of the refits of the
+    catalogue, which a formula has to beat to be near the noise where they are not.
+    """
+    before, paths = found.before, {n: p for n, p in found.answers().items() if isinstance(p, Along)}
+    if len(paths) < len(before.problem.fitted_experiments):
+        return None
+    forms = [shorter for form in _forms(search, found, paths)[:PLACES] for shorter in form.less()]
+    jobs, of = [], []
+    for form in forms:
+        with suppress(HvdcIdentError):  # it cannot sit there: a loop through itself, or no name of the model's
+            jobs.append(formula_job(before, form.place, form.terms, form.coefficients))
+            of.append(form)
+    texts = [
+        f"outside the catalogue: {j.placed[-1].use.expression} at {f.place}" for j, f in zip(jobs, of, strict=True)
+    ]
+    refits = RACE.run(search, before.chi2, jobs, texts)
+    costs = {k: r.chi2 + r.count * _price(search, found) for k, r in enumerate(refits) if not r.failure}
+    for k in sorted(costs, key=lambda k: costs[k]):
+        one = _tested(search, before, refits[k], of[k].stability, best)
+        if one is not None:
+            alike = [j for j in costs if j != k and costs[j] - costs[k] <= search.options.set_bic]
+            return replace(one, others=tuple(refits[j] for j in alike))
+    return None
+
+
+def _price(search: Search, found: Round) -> float:
+    return search.options.named_bic + float(np.log(found.before.rows))
+
+
+def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Form]:
+    """Of every slot the terms that are chosen there; what brings most first."""
+    before, nominal = found.before, found.before.nominal()
+    signals = slot_signals(paths, before.placed)
+    sources = source_signals(before.model, signals)
+    drawn = draws(before.problem, nominal.blocks, before.noise, nominal.fitted(), AGAIN, search.seed + 77)
+    noise, price = nominal.projected(np.vstack(drawn)), _price(search, found)
+    jobs = []
+    for place in signals:
+        if search.looks_at(place) and (found.reach is None or place in found.reach.enough):
+            own = place.removeprefix("outputs.")
+            known = all(own in p.values for p in paths.values())
+            library = terms([*([own] if known else []), *(s for s in sources if s != own)])
+            used = {n for t in library for n in t.signals}
+            slim = {
+                n: replace(p.only(place), values={s: v for s, v in p.values.items() if s in used})
+                for n, p in paths.items()
+            }
+            jobs.append(_Slot(nominal, slim, place, library, noise, price))
+    forms = []
+    for k, form in enumerate(mapped(search.executor, _form, jobs)):
+        search.tell(k + 1, len(jobs), f"hidden input at {jobs[k].place}")
+        if form is not None:
+            forms.append(form)
+    return sorted(forms, key=lambda f: -f.worth)
+
+
+def _form(slot: _Slot) -> _Form | None:
+    """What is chosen at a slot; None where nothing is worth its price."""
+    found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in slot.library])
+    chosen = found.selected(MOST, slot.price)
+    if not chosen:
+        return None
+    coefficients, gain = found.solved(chosen)
+    stability = _stability(found, chosen, coefficients, slot)
+    return _Form(
+        slot.place, tuple(slot.library[j] for j in chosen), coefficients, gain - len(chosen) * slot.price, stability
+    )
+
+
+def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, slot: _Slot) -> float:
+    """The share of records, the terms' answer with other noise, from which the same terms are chosen."""
+    explained = found.columns[:, list(chosen)] @ coefficients
+    again = [found.selected(MOST, slot.price, explained + noise) for noise in slot.noise.T]
+    return sum(set(a) == set(chosen) for a in again) / len(again)
+
+
+def _tested(search: Search, before: Refit, refit: Refit, stability: float, best: Refit | None) -> Law | None:
+    """The law; None where it does not stand the tests an effect of the catalogue has to."""
+    ruler = Ruler.of(refit)
+    gain = ruler.gain(before.chi2, refit.chi2, refit.count - before.count)
+    was, now = unseen(before), unseen(refit)
+    if was is None or now is None or gain <= search.options.named_bic or was - now <= search.options.holdout_share:
+        return None
+    if refit.chi2 / refit.rows > CLOSE or now > CLOSE:
+        return None  # what it leaves has to be next to noise
+    explained = before.chi2 - refit.chi2
+    tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
+    if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):
+        return None
+    ahead = best is None or ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic
+    near = ahead and not is_far(before, refit)
+    return Law(refit, gain, stability, near) if near or stability >= STABLE else None
