@@ -37,6 +37,11 @@ CLOSED = (
     "not, and no form outside the catalogue was looked for."
 )
 
+SPARED = (
+    "No single effect came near the noise. What the scores tell little of was not refitted; a thorough search does that "
+    "(thorough = true in [diagnose])."
+)
+
 
 def diagnose(
     subject: AnyModel | Simulator,
@@ -89,6 +94,8 @@ def diagnose(
         other = fallback(search, outcome.rounds[0])
     if not inside:
         notes = (*notes, CLOSED)
+    if outcome.rounds[0].spared and judgement.verdict != "named":
+        notes = (*notes, SPARED)
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
 
 

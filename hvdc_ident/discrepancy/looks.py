@@ -103,9 +103,13 @@ def looked(
     # Beside an effect that is there already the others cost more than they have been seen to find.
     for look in AT_FIRST if number == 1 else ():
         stand = look(stand)
-    further = (*WHERE_FAR, *(THOROUGH if search.options.thorough else ()))
-    for look in further if number == 1 and stand.anything_told else ():
+    if number > 1 or not stand.anything_told:
+        return stand.opened, stand.trials
+    for look in (*WHERE_FAR, *THOROUGH):
         if not stand.far or stand.opened.law:
+            break
+        if look in THOROUGH and not search.options.thorough:
+            stand = replace(stand, opened=replace(stand.opened, spared=True))
             break
         stand = look(stand)
     return stand.opened, stand.trials

@@ -130,3 +130,5 @@ def test_more_is_refitted_where_a_thorough_search_is_asked_for() -> None:
     assert any(text.startswith("round 1: the other candidates") for text in looks[True])
     tried = {k: [c for c in d.candidates if c.delta_bic is not None] for k, d in done.items()}
     assert len(tried[True]) > len(tried[False])
+    assert any("thorough" in note for note in done[False].notes)
+    assert not any("thorough" in note for note in done[True].notes)
