@@ -160,24 +160,32 @@ def _gains(found: dict[str, Any]) -> str:
         return ""
     name = max(moved, key=lambda n: abs(moved[n][0]))
     alone, with_it = moved[name]
-    if found.get("verdict") == "unnameable":
+    what = _added(found)
+    if found.get("verdict") == "unnameable" and not what:
         return (
             f"Your gains cannot be judged while that is missing: a fit moves {name} by {_percent(alone)}, and how much of it "
             "makes up for what is missing these records do not tell."
         )
-    if not found.get("effects"):
+    if not what:
         if abs(alone) < 0.02:
             return "Your gains are not to blame: a fit leaves them within 2 % of what you gave."
         return f"Your gains are to blame: fitted, {name} moves by {_percent(alone)}, and that closes the gap as far as it closes."
     if abs(with_it) < 0.5 * abs(alone):
         return (
-            f"Your gains are not to blame: a fit without the effect moves {name} by {_percent(alone)} to make up for it; "
-            f"with the effect the same fit moves it by {_percent(with_it)}."
+            f"Your gains are not to blame: a fit without the {what} moves {name} by {_percent(alone)} to make up for it; "
+            f"with the {what} the same fit moves it by {_percent(with_it)}."
         )
     return (
-        f"Your gains are to blame too: a fit moves {name} by {_percent(alone)} without the effect and by "
+        f"Your gains are to blame too: a fit moves {name} by {_percent(alone)} without the {what} and by "
         f"{_percent(with_it)} with it."
     )
+
+
+def _added(found: dict[str, Any]) -> str:
+    """What the augmented model has: an effect, or a formula found from the data; empty where nothing was added."""
+    if found.get("effects"):
+        return "effect"
+    return "formula" if (found.get("fallback") or {}).get("kind") == "term" and found.get("augmented_model") else ""
 
 
 def _percent(share: float) -> str:
@@ -189,7 +197,7 @@ def _percent(share: float) -> str:
 def _gained(found: dict[str, Any]) -> str:
     gap = found.get("gap") or {}
     shrink = gap.get("shrink_holdout")
-    if shrink is None or not found.get("effects"):
+    if shrink is None or not _added(found):
         return ""
     pooled = (gap.get("pooled") or {}).get("augmented") or {}
     left = pooled.get("holdout")

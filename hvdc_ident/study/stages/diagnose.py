@@ -60,7 +60,7 @@ def told(data: Mapping[str, Any]) -> Sequence[str]:
         f"{n} {pooled[n]['fit']:.3g}" for n in ("nominal", "refitted", "augmented") if pooled[n]["fit"] is not None
     ]
     lines.append(f"Residual in noise units: {', '.join(shown)}.")
-    if data["effects"] and data["gap"]["shrink_holdout"] is not None:
+    if data["augmented_model"] and data["gap"]["shrink_holdout"] is not None:
         lines.append(f"The held-out gap shrinks by {100 * data['gap']['shrink_holdout']:.1f} %.")
     for group in (g for g in data["ambiguity"] if len(g) > 1):
         members = "; ".join(f"{form_of(r)} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for r in group[:8])
