@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from hvdc_ident.discrepancy.refit import Job, Refit, find
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.executor import mapped
 from hvdc_ident.fit.problem import stacked
+from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy.state import Search
@@ -37,7 +39,8 @@ class Race:
         if self.entrants is None or len(jobs) <= self.entrants:
             return list(range(len(jobs)))
         search.tell(0, len(jobs), f"{text}: what {len(jobs)} sizes promise")
-        promised = np.array(list(mapped(search.executor, promise, jobs)))
+        groups = [list(group) for _, group in groupby(jobs, key=lambda j: id(j.model))]
+        promised = np.concatenate(list(mapped(search.executor, promises, groups)))
         return sorted(np.argsort(promised, kind="stable")[: self.entrants].tolist())
 
     def run(
@@ -59,6 +62,11 @@ class Race:
         near = [k for k in running if not refits[k].ended and gained[k] >= goal]
         rest = [replace(j, evaluations=j.evaluations - self.sprint) for j in jobs]
         return _on(search, rest, refits, near, [f"{t}, to the end" for t in texts])
+
+
+def promises(jobs: Sequence[Job]) -> Array:
+    """What each promises. Those of one model go together: only one worker then makes its machine code."""
+    return np.array([promise(job) for job in jobs])
 
 
 def promise(job: Job) -> float:

@@ -61,3 +61,26 @@ def test_a_start_given_twice_is_run_once(before: Refit, monkeypatch: pytest.Monk
     two = run(job(before, "lag", "wm", 0.05, begins=2))
     assert len(count) == 2 * runs
     assert np.array_equal(one.theta, two.theta)
+
+
+def test_those_that_promise_most_are_admitted_whoever_shares_their_model(before: Refit) -> None:
+    """The promise is where one Gauss-Newton step of all unknowns, without bounds, would come to if the model were linear."""
+    one, other = job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)
+    at = len(before.theta)
+
+    def sized(j: Job, size: float) -> Job:
+        begin = j.begins[0].copy()
+        begin[at] = size
+        return replace(j, begins=(begin,))
+
+    jobs = [*(sized(one, s) for s in (0.2, 0.02, 0.05)), *(sized(other, s) for s in (0.3, 0.05)), sized(one, 0.04)]
+    expected = []
+    for j in jobs:
+        blocks = j.problem.blocks(j.begins[0])
+        r, slopes = np.concatenate([b.residual for b in blocks]), np.vstack([b.jacobian for b in blocks])
+        step = np.linalg.lstsq(slopes / np.linalg.norm(slopes, axis=0), r, rcond=None)[0]
+        expected.append(float(np.sum((r - slopes / np.linalg.norm(slopes, axis=0) @ step) ** 2)))
+    admitted = Race(entrants=2).admitted(SEARCH, jobs, "race")
+    assert admitted == sorted(np.argsort(expected)[:2].tolist())
+    assert {jobs[k].placed[-1].candidate.at for k in admitted} == {("wm",)}
+    assert Race(entrants=6).admitted(SEARCH, jobs, "race") == list(range(6)) == Race().admitted(SEARCH, jobs, "race")
