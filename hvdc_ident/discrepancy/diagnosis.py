@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.ambiguity import separating
 from hvdc_ident.discrepancy.bode import responses
 from hvdc_ident.discrepancy.candidates import entries
 from hvdc_ident.discrepancy.explain import found_of
-from hvdc_ident.discrepancy.fallback import Fallback, fallback, formula_found
+from hvdc_ident.discrepancy.fallback import Fallback, fallback, law_found
 from hvdc_ident.discrepancy.gap import gap, with_given
 from hvdc_ident.discrepancy.lines import detectable, lines
 from hvdc_ident.discrepancy.localise import localise
@@ -89,7 +89,7 @@ def diagnose(
     inside = isinstance(model, Model)
     other = None
     if judgement.instead is not None:
-        other = formula_found(judgement.instead)
+        other = law_found(judgement.instead)
     elif judgement.verdict == "unnameable" and chosen.fallback and inside:
         other = fallback(search, outcome.rounds[0])
     if not inside:

@@ -55,7 +55,7 @@ def fallback(search: Search, opened: Round) -> Fallback:
     looked for a law already."""
     found = law(search, opened) if opened.laws is None else next(iter(opened.laws), None)
     if found is not None:
-        return formula_found(found)
+        return law_found(found)
     return _curve(search, opened)
 
 
@@ -74,8 +74,12 @@ def _places(search: Search, opened: Round) -> list[str]:
     return heard
 
 
-def formula_found(found: Law) -> Fallback:
-    """The formula that a refit ends with."""
+def law_found(found: Law) -> Fallback:
+    """The formula, or the curve, that a refit ends with."""
+    return _curve_found(found) if found.terms and found.terms[0].knots else _formula_found(found)
+
+
+def _formula_found(found: Law) -> Fallback:
     refit = found.refit
     placed = refit.placed[-1]
     (place,) = placed.candidate.at
@@ -93,6 +97,17 @@ def formula_found(found: Law) -> Fallback:
         "term", place, " ".join(said), placed.use.expression, FrozenMap(shown), found.stability, found.gain, None,
         tuple({"at": r.placed[-1].candidate.at[0], "expression": r.placed[-1].use.expression} for r in found.others), refit,
     )  # fmt: skip
+
+
+def _curve_found(found: Law) -> Fallback:
+    placed, (over,) = found.refit.placed[-1], found.terms[0].signals
+    (place,) = placed.candidate.at
+    std = [found.refit.std.get(name) for name in placed.names.values()]
+    curve = {
+        "over": over, "at": list(found.terms[0].knots), "value": list(found.refit.sizes(placed).values()), "std": std,
+    }  # fmt: skip
+    text = f"Found from the data, outside the catalogue: {place} is off by what hangs on {over} alone, a curve given with its band."
+    return Fallback("curve", place, text, placed.use.expression, delta_bic=found.gain, curve=curve, refit=found.refit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,14 +26,18 @@ LESS = (0.3, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A formula in the model, refitted. gain: delta BIC over the model without it; stability: share of noise records that
-    choose the same terms; near: whether it comes near the noise, and nothing of the catalogue does; others: refits of other
-    formulas, or of the same at other places, that explain as much."""
+    """A formula in the model, refitted, or a curve.
+
+    gain: delta BIC over the model without it. stability: share of noise records that choose the same terms. near: whether it
+    comes near the noise, and nothing of the catalogue does. terms: those of it; of a curve hats over one signal. others:
+    refits of other formulas, or of the same at other places, that explain as much.
+    """
 
     refit: Refit
     gain: float
     stability: float | None = None
     near: bool = False
+    terms: tuple[Term, ...] = ()
     others: tuple[Refit, ...] = ()
 
 
@@ -49,7 +53,9 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
     had = set(before.model.parameters)
     model = before.model.with_effects([use])
     new = [n for n in model.parameters if n not in had]
-    bounds = {n: (-WIDE * abs(v), WIDE * abs(v)) for n, v in values.items()}
+    # Of a curve the largest value tells how large the others may become: one may begin at 0.
+    most = max(map(abs, values.values())) if all(t.form == "hat" for t in chosen) else 0.0
+    bounds = {n: (-WIDE * max(abs(v), most), WIDE * max(abs(v), most)) for n, v in values.items()}
     free = tuple(Free(m, values[n], *bounds[n]) for n, m in zip(names, new, strict=True))
     problem = replace(before.problem, simulator=ModelSimulator(model), free=(*before.problem.free, *free))
     placed = Placed(

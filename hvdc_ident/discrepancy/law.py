@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.adequacy import adequacy
 from hvdc_ident.discrepancy.candidates import source_signals
 from hvdc_ident.discrepancy.formula import Law, at_run, formula_job
 from hvdc_ident.discrepancy.hidden import Regression, regression
-from hvdc_ident.discrepancy.library import Term, terms
+from hvdc_ident.discrepancy.library import Term, hats, terms
 from hvdc_ident.discrepancy.noise import draws
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.refit import Refit, unseen
@@ -37,29 +37,53 @@ CLOSE = 2.0
 """What a formula may leave, in noise units (of chi2 a row, and held out)."""
 PLACES = 6
 """Places, the best by regression, at which the form is tried by full simulation."""
+KNOTS = 11
+"""Of a curve: a tenth of what its signal travels from one to the next."""
+CURVES = 2
+"""Curves, the best by regression, that are tried by full simulation where no formula comes near the noise."""
+MOSTLY = 0.75
+"""Share of what is beyond noise that a form has to explain to first order to be tried by full simulation."""
+OVER = 6
+"""Signals that a curve at a slot may be over."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Slot:
-    """What is regressed at one slot. noise: (N, B) records of it, projected; price: what a term has to bring."""
+    """What is regressed at one slot: a library, and curves, each of hats over a signal's levels.
+
+    noise: (N, B) records of it, projected; price: what a term has to bring.
+    """
 
     nominal: Nominal
     paths: Mapping[str, Along]
     place: str
     library: tuple[Term, ...]
+    curves: tuple[tuple[Term, ...], ...]
     noise: Array
     price: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """Terms chosen at a slot with their coefficients. worth: the fall of chi2 they bring less their price."""
+    """Terms chosen at a slot with their coefficients. fall: of chi2, to first order; worth: it less the terms' price.
+    stability: None of the hats of a curve, which were not chosen."""
 
     place: str
     terms: tuple[Term, ...]
     coefficients: Array
+    fall: float
     worth: float
-    stability: float
+    stability: float | None
+
+    @property
+    def label(self) -> str:
+        """What is put in, and where."""
+        what = (
+            " + ".join(t.text for t in self.terms)
+            if self.stability is not None
+            else f"a curve over {self.terms[0].signals[0]}"
+        )
+        return f"{what} at {self.place}"
 
     def less(self) -> list[_Form]:
         """It, and without its last term where that came to a pair: linear in a bias of the gains, it may not be needed."""
@@ -76,19 +100,27 @@ def law(search: Search, found: Round, best: Refit | None = None) -> Law | None:
     before, paths = found.before, {n: p for n, p in found.answers().items() if isinstance(p, Along)}
     if len(paths) < len(before.problem.fitted_experiments):
         return None
-    forms = [shorter for form in _forms(search, found, paths)[:PLACES] for shorter in form.less()]
-    jobs, of = [], []
+    gap = before.chi2 - before.rows
+    forms = [f for f in _forms(search, found, paths) if f.fall > MOSTLY * gap]
+    formulas = [shorter for form in [f for f in forms if f.stability is not None][:PLACES] for shorter in form.less()]
+    told = _best(search, found, formulas, best)
+    if told is not None and told.near:
+        return told
+    return _best(search, found, [f for f in forms if f.stability is None][:CURVES], best) or told
+
+
+def _best(search: Search, found: Round, forms: Sequence[_Form], best: Refit | None) -> Law | None:
+    """The form, refitted, that leaves least for the price of its terms; None where none stands every test."""
+    before, jobs, of = found.before, [], []
     for form in forms:
         with suppress(HvdcIdentError):  # it cannot sit there: a loop through itself, or no name of the model's
             jobs.append(formula_job(before, form.place, form.terms, form.coefficients))
             of.append(form)
-    texts = [
-        f"outside the catalogue: {j.placed[-1].use.expression} at {f.place}" for j, f in zip(jobs, of, strict=True)
-    ]
+    texts = [f"outside the catalogue: {form.label}" for form in of]
     refits = RACE.run(search, before.chi2, jobs, texts)
     costs = {k: r.chi2 + r.count * _price(search, found) for k, r in enumerate(refits) if not r.failure}
     for k in sorted(costs, key=lambda k: costs[k]):
-        one = _tested(search, before, refits[k], of[k].stability, best)
+        one = _tested(search, before, refits[k], of[k], best)
         if one is not None:
             alike = [j for j in costs if j != k and costs[j] - costs[k] <= search.options.set_bic]
             return replace(one, others=tuple(refits[j] for j in alike))
@@ -112,22 +144,52 @@ def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Fo
             own = place.removeprefix("outputs.")
             known = all(own in p.values for p in paths.values())
             library = terms([*([own] if known else []), *(s for s in sources if s != own)])
-            used = {n for t in library for n in t.signals}
+            over = list(dict.fromkeys([*([own] if known else []), *sources]))[:OVER]
+            curves = tuple(hats(s, _levels([p.values[s] for p in paths.values()])) for s in over)
+            used = {n for t in (*library, *(t for c in curves for t in c)) for n in t.signals}
             slim = {
                 n: replace(p.only(place), values={s: v for s, v in p.values.items() if s in used})
                 for n, p in paths.items()
             }
-            jobs.append(_Slot(nominal, slim, place, library, noise, price))
+            jobs.append(_Slot(nominal, slim, place, library, curves, noise, price))
     forms = []
-    for k, form in enumerate(mapped(search.executor, _form, jobs)):
+    for k, own_forms in enumerate(mapped(search.executor, _at_slot, jobs)):
         search.tell(k + 1, len(jobs), f"hidden input at {jobs[k].place}")
-        if form is not None:
-            forms.append(form)
+        forms += own_forms
     return sorted(forms, key=lambda f: -f.worth)
 
 
-def _form(slot: _Slot) -> _Form | None:
-    """What is chosen at a slot; None where nothing is worth its price."""
+def _levels(signals: Sequence[Array]) -> Array:
+    """Levels of a signal, one array an experiment, with as much travelled between any two neighbours: more where it moves more."""
+    ends = np.sort(np.concatenate([np.column_stack([u[:-1], u[1:]]) for u in signals]), axis=1)
+    edges = np.unique(ends)
+    # Each level between two edges is passed by the steps that begin below and end above it.
+    passed = np.searchsorted(np.sort(ends[:, 0]), edges[:-1], "right") - np.searchsorted(
+        np.sort(ends[:, 1]), edges[:-1], "right"
+    )
+    travelled = np.concatenate([[0.0], np.cumsum(passed * np.diff(edges))])
+    return np.interp(np.linspace(0.0, travelled[-1], KNOTS), travelled, edges)
+
+
+def _at_slot(slot: _Slot) -> list[_Form]:
+    """What is chosen at a slot from its library, and its best curve; as far as they are worth their price."""
+    found = [_formula(slot), *(_curve(slot, c) for c in slot.curves if len(c) > 2)]
+    formulas = [f for f in found[:1] if f is not None]
+    return [*formulas, *sorted((f for f in found[1:] if f is not None), key=lambda f: -f.worth)[:1]]
+
+
+def _curve(slot: _Slot, curve: tuple[Term, ...]) -> _Form | None:
+    """A curve at a slot; None where it is not worth its price, or its signal skips a level, as one that steps does."""
+    found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in curve])
+    if np.linalg.norm(found.columns, axis=0).min() < 1e-6 * np.linalg.norm(found.columns):
+        return None
+    values, gain = found.solved(range(len(curve)))
+    worth = gain - len(curve) * slot.price
+    return _Form(slot.place, curve, values, gain, worth, None) if worth > 0 else None
+
+
+def _formula(slot: _Slot) -> _Form | None:
+    """What is chosen at a slot from its library; None where nothing is worth its price."""
     found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in slot.library])
     chosen = found.selected(MOST, slot.price)
     if not chosen:
@@ -135,7 +197,12 @@ def _form(slot: _Slot) -> _Form | None:
     coefficients, gain = found.solved(chosen)
     stability = _stability(found, chosen, coefficients, slot)
     return _Form(
-        slot.place, tuple(slot.library[j] for j in chosen), coefficients, gain - len(chosen) * slot.price, stability
+        slot.place,
+        tuple(slot.library[j] for j in chosen),
+        coefficients,
+        gain,
+        gain - len(chosen) * slot.price,
+        stability,
     )
 
 
@@ -146,7 +213,7 @@ def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, sl
     return sum(set(a) == set(chosen) for a in again) / len(again)
 
 
-def _tested(search: Search, before: Refit, refit: Refit, stability: float, best: Refit | None) -> Law | None:
+def _tested(search: Search, before: Refit, refit: Refit, form: _Form, best: Refit | None) -> Law | None:
     """The law; None where it does not stand the tests an effect of the catalogue has to."""
     ruler = Ruler.of(refit)
     gain = ruler.gain(before.chi2, refit.chi2, refit.count - before.count)
@@ -161,4 +228,4 @@ def _tested(search: Search, before: Refit, refit: Refit, stability: float, best:
         return None
     ahead = best is None or ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic
     near = ahead and not is_far(before, refit)
-    return Law(refit, gain, stability, near) if near or stability >= STABLE else None
+    return Law(refit, gain, form.stability, near, form.terms) if near or (form.stability or 0.0) >= STABLE else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,16 +18,23 @@ TIME = "time"
 
 @dataclass(frozen=True)
 class Term:
-    """A term: its text in the model's names, the signals in it, and how it is computed from them."""
+    """A term: its text in the model's names, the signals in it, and how it is computed from them.
+
+    knots: of a hat over a signal's levels, which is 1 at the one of number `peak` and 0 at the others.
+    """
 
     text: str
     signals: tuple[str, ...]
     form: str
+    knots: tuple[float, ...] = ()
+    peak: int = 0
 
     def __call__(self, values: Sequence[Array]) -> Array:
         """The term along a run, (K,)."""
         a = values[0]
         b = values[-1]
+        if self.form == "hat":
+            return np.asarray(np.interp(a, self.knots, np.eye(len(self.knots))[self.peak]))
         return {
             "x": a, "x2": a**2, "x3": a**3, "xx": a * np.abs(a), "abs": np.abs(a), "xy": a * b, "x2y": a**2 * b,
         }[self.form]  # fmt: skip
@@ -43,6 +51,15 @@ def terms(signals: Sequence[str]) -> tuple[Term, ...]:
     found += [Term(f"{a}*{b}", (a, b), "xy") for i, a in enumerate(chosen) for b in chosen[i + 1 :]]
     found += [Term(TIME, (TIME,), "x"), *(Term(f"{n}*{TIME}", (n, TIME), "xy") for n in chosen)]
     return tuple(found)
+
+
+def hats(signal: str, levels: Array) -> tuple[Term, ...]:
+    """A hat for each of some levels of a signal, rising: times its values there, their sum is a curve, level at both ends."""
+    knots = tuple(dict.fromkeys(float(f"{v:.6g}") for v in levels))
+    rises = [f"(clip({signal}, {a!r}, {b!r}) - {a!r})/{(b - a)!r}" for a, b in pairwise(knots)]
+    falls = [f" - {r}" for r in rises]
+    texts = [f"({up}{down})" for up, down in zip(["1", *rises], [*falls, ""], strict=True)]
+    return tuple(Term(t, (signal,), "hat", knots, k) for k, t in enumerate(texts))
 
 
 def along(term: Term, time: Array, values: Mapping[str, Array]) -> Array:

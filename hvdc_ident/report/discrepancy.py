@@ -37,6 +37,24 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
     return fig
 
 
+def hidden_curve(at: str, curve: Mapping[str, Any]) -> Figure:
+    """What is added at a slot, over time or over a signal, with its 95 % band where that is known."""
+    fig = figure(7.4, 2.6, {"left": 0.12, "right": 0.98, "bottom": 0.2, "top": 0.97})
+    axes = fig.subplots()
+    x, y = np.array(curve["at"]), np.array(curve["value"])
+    wide = 1.96 * np.array([np.nan if s is None else s for s in curve["std"]])
+    axes.fill_between(x, y - wide, y + wide, color=AFTER, alpha=0.25, linewidth=0.0)
+    axes.plot(x, y, color=AFTER, linewidth=1.4, marker=".", markersize=5)
+    # A level that the records hardly visit has a band that would hide all others.
+    known = y[np.isfinite(wide) & (wide < np.ptp(y))] if np.ptp(y) > 0 else y
+    room = 0.3 * max(float(np.ptp(known)) if known.size else 0.0, 1e-12)
+    if known.size:
+        axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
+    axes.set_xlabel("time, s" if curve["over"] == "time" else str(curve["over"]))
+    axes.set_ylabel(f"added to {at}")
+    return fig
+
+
 def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
     """Gain above phase over frequency for each channel, beside each other: the record, the nominal and the augmented model."""
     most = sorted((c for c in channels if c.get("omega")), key=lambda c: -len(c["omega"]))[:CHANNELS]

@@ -182,10 +182,11 @@ def _gains(found: dict[str, Any]) -> str:
 
 
 def _added(found: dict[str, Any]) -> str:
-    """What the augmented model has: an effect, or a formula found from the data; empty where nothing was added."""
+    """What the augmented model has: an effect, or a formula or curve found from the data; empty where nothing was added."""
     if found.get("effects"):
         return "effect"
-    return "formula" if (found.get("fallback") or {}).get("kind") == "term" and found.get("augmented_model") else ""
+    kind = (found.get("fallback") or {}).get("kind", "") if found.get("augmented_model") else ""
+    return {"term": "formula", "curve": "curve"}.get(kind, "")
 
 
 def _percent(share: float) -> str:

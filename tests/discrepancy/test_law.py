@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, TIME, experiments, model
+from cases import FREE, SIGMA, TIME, TRUE, experiments, model
 from refits import plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
 from hvdc_ident.discrepancy.hidden import Regression
-from hvdc_ident.discrepancy.law import law
+from hvdc_ident.discrepancy.law import _levels, law
+from hvdc_ident.discrepancy.library import hats
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.state import Search
+from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression.parser import parse
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model import Model, parse_card
+from hvdc_ident.model.card import write_card
 from hvdc_ident.trajectory import Array
 
 Meter = Callable[[dict[str, Array]], Array]
@@ -101,6 +106,50 @@ def test_what_no_effect_of_the_catalogue_explains_is_told_as_a_law(
     assert found.augmented is not None
     run = simulate(found.augmented, metered(output, meter)[0].with_(measured=None), outputs=[output])
     assert np.isfinite(run[output]).all()
+
+
+def bent(seen: dict[str, Array]) -> Array:
+    """The torque by a meter with an error that goes over from one side to the other where the speed passes a level."""
+    return seen["torque"] + error(seen["w"])
+
+
+def error(w: Array) -> Array:
+    return 0.05 * np.tanh((w - 1.1) / 0.1)
+
+
+def test_what_hangs_on_one_signal_and_is_no_formula_is_told_as_a_curve_and_put_in() -> None:
+    found = diagnose(model(), metered("torque", bent), FREE)
+    assert found.verdict == "unnameable" and found.fallback is not None
+    told, curve = found.fallback, found.fallback["curve"]
+    assert (told["kind"], told["at"], curve["over"]) == ("curve", "outputs.torque", "w")
+    at, value, std = (np.array(curve[n]) for n in ("at", "value", "std"))
+    known = std < 0.01
+    assert known.sum() >= 8 and np.all(np.diff(at) > 0)
+    # Between knots the curve is straight: a little is missing where it bends.
+    assert np.abs(value - error(at))[known].max() < 0.01
+    assert isinstance(found.augmented, Model) and found.parameters_after["Ki"] == pytest.approx(TRUE["Ki"], rel=0.05)
+    assert (found.gap.shrink_holdout or 0.0) > 0.5
+    assert parse_card(write_card(found.augmented)).slots == found.augmented.slots
+
+
+@pytest.mark.parametrize("peak", range(4))
+def test_a_hat_is_what_its_text_says(peak: int) -> None:
+    levels = np.array([-0.5, 0.1, 0.4, 1.5])
+    hat = hats("s", levels)[peak]
+    s = np.linspace(-1.0, 2.0, 301)
+    told = parse(hat.text)
+    shown = np.array([float(told.subs({symbol("s"): v})) for v in s])
+    assert shown == pytest.approx(np.interp(s, levels, np.eye(4)[peak]), abs=1e-12)
+    assert hat([s]) == pytest.approx(shown, abs=1e-12)
+
+
+def test_levels_lie_where_the_signal_travels_and_a_signal_that_steps_gives_none() -> None:
+    there = np.concatenate([np.zeros(50), np.linspace(0.0, 1.0, 20), np.linspace(1.0, 0.9, 30)])
+    levels = _levels([there, there[:60]])
+    travelled = [np.abs(np.diff(np.clip(u, a, b))).sum() for a, b in pairwise(levels) for u in (there, there[:60])]
+    shares = np.array(travelled).reshape(-1, 2).sum(axis=1)
+    assert shares == pytest.approx(shares.mean() * np.ones(shares.size), rel=1e-6)
+    assert levels[0] == 0.0 and levels[-1] == 1.0
 
 
 def test_a_law_is_near_only_where_it_beats_what_the_catalogue_has() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.discrepancy import bode, gap_bars
+from hvdc_ident.report.discrepancy import bode, gap_bars, hidden_curve
 from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import number, share, table, text
 from hvdc_ident.report.results import Results
@@ -24,6 +24,7 @@ def _render(results: Results) -> str:
     parts = [
         _lead(found),
         _effects(found),
+        _curve(found),
         _sets(found),
         _gap(found, units),
         _gains(found),
@@ -37,6 +38,15 @@ def _render(results: Results) -> str:
 def _lead(found: dict[str, Any]) -> str:
     verdict = str(found["verdict"])
     return f"<p><strong>{text(verdict[:1].upper() + verdict[1:])}.</strong> {text(found.get('text', ''))}</p>"
+
+
+def _curve(found: dict[str, Any]) -> str:
+    """The curve of what has no name, where one was found."""
+    other = found.get("fallback") or {}
+    if not other.get("curve"):
+        return ""
+    name = f"what is added to {other['at']} over {other['curve']['over']}"
+    return f"<figure>{svg(hidden_curve(other['at'], other['curve']), name)}</figure>"
 
 
 def _effects(found: dict[str, Any]) -> str:
