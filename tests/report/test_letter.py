@@ -155,14 +155,17 @@ def test_gains_are_not_blamed_while_something_without_a_name_is_missing(tmp_path
     )
 
 
-def test_a_formula_that_was_found_counts_as_an_effect_does(tmp_path: Path) -> None:
-    found = diagnosis(verdict="unnameable", effects=[], ambiguity=[], text="A formula does.", sizes=None)
-    told = " ".join(letter_of(Results(folder_with(tmp_path, {**found, "fallback": {"kind": "term"}}))).sentences)
-    assert "a fit without the formula moves KIP by +5.0 %" in told and "cannot be judged" not in told
+@pytest.mark.parametrize(("kind", "word"), [("term", "formula"), ("curve", "curve")])
+def test_a_law_that_was_found_counts_as_an_effect_does_where_it_is_in_the_model(
+    tmp_path: Path, kind: str, word: str
+) -> None:
+    found = diagnosis(verdict="unnameable", effects=[], ambiguity=[], text="A law does.", sizes=None)
+    told = " ".join(letter_of(Results(folder_with(tmp_path, {**found, "fallback": {"kind": kind}}))).sentences)
+    assert f"a fit without the {word} moves KIP by +5.0 %" in told and "cannot be judged" not in told
     assert "Adding it shrinks the error on" in told
-    for less in ({"fallback": {"kind": "curve"}}, {"fallback": {"kind": "term"}, "augmented_model": None}):
-        told = " ".join(letter_of(Results(folder_with(tmp_path, {**found, **less}))).sentences)
-        assert "cannot be judged" in told and "shrinks" not in told
+    less = {**found, "fallback": {"kind": kind}, "augmented_model": None}
+    told = " ".join(letter_of(Results(folder_with(tmp_path, less))).sentences)
+    assert "cannot be judged" in told and "shrinks" not in told
 
 
 def test_the_page_has_one_curve_to_see_and_a_slider_for_the_others(tmp_path: Path) -> None:

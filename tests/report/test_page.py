@@ -17,6 +17,8 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.report.drawing import visible
 from hvdc_ident.report.html import number, share
 from hvdc_ident.report.page import page, write_report
+from hvdc_ident.report.results import Results
+from hvdc_ident.report.sections.discrepancy import SECTION
 
 NASTY = "<script>alert(1)</script>&\"'$x^2$"
 
@@ -195,3 +197,22 @@ def test_numbers(value: object, shown: str) -> None:
 def test_shares() -> None:
     assert share(2.0, 1.0) == "+100.0 %"
     assert share(2.0, 0.0) == share(None, 1.0) == "–"
+
+
+def test_a_curve_that_has_no_name_is_drawn_with_its_band(tmp_path: Path) -> None:
+    curve = {"over": "w", "at": [0.0, 1.0, 2.0], "value": [-0.1, 0.0, 0.3], "std": [0.01, None, 0.02]}
+    found = {
+        "verdict": "unnameable",
+        "text": "Something is missing.",
+        "fallback": {"kind": "curve", "at": "v", "curve": curve},
+    }
+    (tmp_path / "discrepancy.json").write_text(
+        json.dumps({"schema": 1, "study": "s", "model": "m", "software": "h", **found}), "utf-8"
+    )
+    drawn = SECTION.render(Results(tmp_path))
+    assert 'aria-label="what is added to v over w"' in drawn and ">added to v</text>" in drawn
+    plain = {**found, "fallback": {"kind": "nothing", "at": "", "curve": None}}
+    (tmp_path / "discrepancy.json").write_text(
+        json.dumps({"schema": 1, "study": "s", "model": "m", "software": "h", **plain}), "utf-8"
+    )
+    assert "what is added" not in SECTION.render(Results(tmp_path))

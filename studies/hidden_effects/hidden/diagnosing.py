@@ -120,6 +120,7 @@ def _told(found: Any) -> dict[str, Any]:
         "found": told["effects"],
         "ambiguity": told["ambiguity"],
         "location": told["location"],
+        "law": {n: (told["fallback"] or {}).get(n) for n in ("kind", "at", "expression")},
         "shrink": told["gap"]["shrink_holdout"],
         "adequate": told["remaining"].get("adequate"),
         "best_score": max(scored, key=lambda c: c["score"], default=None),
