@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -65,15 +66,18 @@ class _Slot:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """Terms chosen at a slot with their coefficients. fall: of chi2, to first order; worth: it less the terms' price.
-    stability: None of the hats of a curve, which were not chosen."""
+    """Terms chosen at a slot with their coefficients. fall: of chi2, to first order. stability: None of the hats of a curve,
+    which were not chosen."""
 
     place: str
     terms: tuple[Term, ...]
     coefficients: Array
     fall: float
-    worth: float
     stability: float | None
+
+    def worth(self, price: float) -> float:
+        """The fall less the price of the terms."""
+        return self.fall - len(self.terms) * price
 
     @property
     def label(self) -> str:
@@ -138,14 +142,17 @@ def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Fo
     sources = source_signals(before.model, signals)
     drawn = draws(before.problem, nominal.blocks, before.noise, nominal.fitted(), AGAIN, search.seed + 77)
     noise, price = nominal.projected(np.vstack(drawn)), _price(search, found)
+
+    @cache
+    def curve(signal: str) -> tuple[Term, ...]:
+        return hats(signal, _levels([p.values[signal] for p in paths.values()]))
+
     jobs = []
     for place in signals:
         if search.looks_at(place) and (found.reach is None or place in found.reach.enough):
-            own = place.removeprefix("outputs.")
-            known = all(own in p.values for p in paths.values())
-            library = terms([*([own] if known else []), *(s for s in sources if s != own)])
-            over = list(dict.fromkeys([*([own] if known else []), *sources]))[:OVER]
-            curves = tuple(hats(s, _levels([p.values[s] for p in paths.values()])) for s in over)
+            own = [n for n in (place.removeprefix("outputs."),) if all(n in p.values for p in paths.values())]
+            near = list(dict.fromkeys([*own, *sources]))
+            library, curves = terms(near), tuple(curve(n) for n in near[:OVER])
             used = {n for t in (*library, *(t for c in curves for t in c)) for n in t.signals}
             slim = {
                 n: replace(p.only(place), values={s: v for s, v in p.values.items() if s in used})
@@ -156,7 +163,7 @@ def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Fo
     for k, own_forms in enumerate(mapped(search.executor, _at_slot, jobs)):
         search.tell(k + 1, len(jobs), f"hidden input at {jobs[k].place}")
         forms += own_forms
-    return sorted(forms, key=lambda f: -f.worth)
+    return sorted(forms, key=lambda f: -f.worth(price))
 
 
 def _levels(signals: Sequence[Array]) -> Array:
@@ -173,9 +180,9 @@ def _levels(signals: Sequence[Array]) -> Array:
 
 def _at_slot(slot: _Slot) -> list[_Form]:
     """What is chosen at a slot from its library, and its best curve; as far as they are worth their price."""
-    found = [_formula(slot), *(_curve(slot, c) for c in slot.curves if len(c) > 2)]
-    formulas = [f for f in found[:1] if f is not None]
-    return [*formulas, *sorted((f for f in found[1:] if f is not None), key=lambda f: -f.worth)[:1]]
+    curves = [f for c in slot.curves if len(c) > 2 and (f := _curve(slot, c)) is not None]
+    best = max(curves, key=lambda f: f.worth(slot.price), default=None)
+    return [f for f in (_formula(slot), best) if f is not None]
 
 
 def _curve(slot: _Slot, curve: tuple[Term, ...]) -> _Form | None:
@@ -184,8 +191,8 @@ def _curve(slot: _Slot, curve: tuple[Term, ...]) -> _Form | None:
     if np.linalg.norm(found.columns, axis=0).min() < 1e-6 * np.linalg.norm(found.columns):
         return None
     values, gain = found.solved(range(len(curve)))
-    worth = gain - len(curve) * slot.price
-    return _Form(slot.place, curve, values, gain, worth, None) if worth > 0 else None
+    form = _Form(slot.place, curve, values, gain, None)
+    return form if form.worth(slot.price) > 0 else None
 
 
 def _formula(slot: _Slot) -> _Form | None:
@@ -196,14 +203,7 @@ def _formula(slot: _Slot) -> _Form | None:
         return None
     coefficients, gain = found.solved(chosen)
     stability = _stability(found, chosen, coefficients, slot)
-    return _Form(
-        slot.place,
-        tuple(slot.library[j] for j in chosen),
-        coefficients,
-        gain,
-        gain - len(chosen) * slot.price,
-        stability,
-    )
+    return _Form(slot.place, tuple(slot.library[j] for j in chosen), coefficients, gain, stability)
 
 
 def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, slot: _Slot) -> float:
