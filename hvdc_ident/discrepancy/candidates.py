@@ -52,7 +52,7 @@ class Candidate:
 def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:
     """The effects of the catalogue to try; forms that have to be found first are not among them."""
     catalogue = effects()
-    chosen = list(catalogue) if names == "all" else list(names)
+    chosen = [n for n, e in catalogue.items() if e.sought] if names == "all" else list(names)
     for name in chosen:
         if name not in catalogue:
             raise unknown_name("effect", name, catalogue)

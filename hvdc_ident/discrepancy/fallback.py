@@ -27,9 +27,9 @@ PLACES = 6
 
 @dataclass(frozen=True, eq=False)
 class Fallback:
-    """What was found outside the catalogue. kind: term, disturbance, curve or nothing.
+    """What was found outside the catalogue. kind: term, filter, disturbance, curve or nothing.
 
-    at: the slot; expression and coefficients: of a term; stability: share of noise records that choose the same terms;
+    at: the slot; expression and coefficients: of a term or a filter; stability: share of noise records that choose the same terms;
     curve: of the others, {over, at, value, std}. as_good: terms, {at, expression}, that explain as much. refit: the model with
     the term; text: a sentence.
     """
@@ -75,7 +75,9 @@ def _places(search: Search, opened: Round) -> list[str]:
 
 
 def law_found(found: Law) -> Fallback:
-    """The formula, or the curve, that a refit ends with."""
+    """The formula, the curve or the filter that a refit ends with."""
+    if found.refit.placed[-1].use.effect == "filter":
+        return _filter_found(found)
     return _curve_found(found) if found.terms and found.terms[0].knots else _formula_found(found)
 
 
@@ -83,10 +85,6 @@ def _formula_found(found: Law) -> Fallback:
     refit = found.refit
     placed = refit.placed[-1]
     (place,) = placed.candidate.at
-    shown = {}
-    for n, value in refit.sizes(placed).items():
-        std = refit.std.get(placed.names[n])
-        shown[n] = {"value": value, "ci95": None if std is None else [value - 1.96 * std, value + 1.96 * std]}
     text = effects()["term"].sentence.replace("{at}", place).replace("{expression}", filled(placed, refit))
     said = [f"Found from the data, outside the catalogue: {text}."]
     if found.others:
@@ -94,9 +92,58 @@ def _formula_found(found: Law) -> Fallback:
     if found.stability is not None and found.stability < STABLE:
         said.append(f"With other noise other terms would have been chosen in {1 - found.stability:.0%} of all cases.")
     return Fallback(
-        "term", place, " ".join(said), placed.use.expression, FrozenMap(shown), found.stability, found.gain, None,
+        "term", place, " ".join(said), placed.use.expression, _sizes(refit), found.stability, found.gain, None,
         tuple({"at": r.placed[-1].candidate.at[0], "expression": r.placed[-1].use.expression} for r in found.others), refit,
     )  # fmt: skip
+
+
+def _filter_found(found: Law) -> Fallback:
+    refit = found.refit
+    places = ", ".join(refit.placed[-1].candidate.at)
+    said = [
+        f"Found from the data, outside the catalogue: {places} passes {_shape(refit)}, H(s) = {transfer_function(refit)}."
+    ]
+    if found.others:
+        said.append(f"As good: one at {listed([', '.join(r.placed[-1].candidate.at) for r in found.others])}.")
+    as_good = tuple(
+        {"at": ", ".join(r.placed[-1].candidate.at), "expression": transfer_function(r)} for r in found.others
+    )
+    return Fallback(
+        "filter", places, " ".join(said), transfer_function(refit), _sizes(refit), delta_bic=found.gain, as_good=as_good,
+        refit=refit,
+    )  # fmt: skip
+
+
+def _polynomials(refit: Refit) -> tuple[Array, Array]:
+    """Numerator and denominator of the filter that a refit ends with, the highest power first."""
+    p = refit.sizes(refit.placed[-1])
+    band = 2.0 * p["zeta"] * p["wn"]
+    above, below = 1.0 + p["k"] * p["high"], 1.0 + p["k"] * p["low"]
+    return np.array([above, band * (1.0 + p["k"]), p["wn"] ** 2 * below]), np.array([1.0, band, p["wn"] ** 2])
+
+
+def _shape(refit: Refit) -> str:
+    """Whether the filter lowers or raises most, and where."""
+    omega = refit.sizes(refit.placed[-1])["wn"] * np.geomspace(0.1, 10.0, 2001)
+    numerator, denominator = _polynomials(refit)
+    level = np.log(np.abs(np.polyval(numerator, 1j * omega) / np.polyval(denominator, 1j * omega)))
+    most = np.argmax(np.abs(level))
+    return f"a {'notch' if level[most] < 0 else 'resonance'} around {omega[most]:.3g} rad/s"
+
+
+def transfer_function(refit: Refit) -> str:
+    """The filter that a refit ends with, as a fraction of polynomials in s."""
+    told = [" + ".join((f"{a:.4g} s^2", f"{b:.4g} s", f"{c:.4g}")) for a, b, c in _polynomials(refit)]
+    return "/".join(f"({t.removeprefix('1 ').replace('+ -', '- ')})" for t in told)
+
+
+def _sizes(refit: Refit) -> FrozenMap[Any]:
+    """By parameter of what was put in last its value, and the interval that holds it in 95 of 100 cases where that is known."""
+    placed, shown = refit.placed[-1], {}
+    for n, value in refit.sizes(placed).items():
+        std = refit.std.get(placed.names[n])
+        shown[n] = {"value": value, "ci95": None if std is None else [value - 1.96 * std, value + 1.96 * std]}
+    return FrozenMap(shown)
 
 
 def _curve_found(found: Law) -> Fallback:

@@ -122,13 +122,22 @@ def _best(search: Search, found: Round, forms: Sequence[_Form], best: Refit | No
             of.append(form)
     texts = [f"outside the catalogue: {form.label}" for form in of]
     refits = RACE.run(search, before.chi2, jobs, texts)
+    k, one = standing(search, found, refits, [form.stability for form in of], best)
+    return one and replace(one, terms=of[k].terms)
+
+
+def standing(
+    search: Search, found: Round, refits: Sequence[Refit], stable: Sequence[float | None], best: Refit | None
+) -> tuple[int, Law | None]:
+    """Of the forms that were refitted the one that leaves least for the price of its terms, of those that stand every test,
+    and which it is; None where none does. stable: the share of noise records that each was chosen from."""
     costs = {k: r.chi2 + r.count * _price(search, found) for k, r in enumerate(refits) if not r.failure}
     for k in sorted(costs, key=lambda k: costs[k]):
-        one = _tested(search, before, refits[k], of[k], best)
+        one = _tested(search, found.before, refits[k], stable[k], best)
         if one is not None:
             alike = [j for j in costs if j != k and costs[j] - costs[k] <= search.options.set_bic]
-            return replace(one, others=tuple(refits[j] for j in alike))
-    return None
+            return k, replace(one, others=tuple(refits[j] for j in alike))
+    return -1, None
 
 
 def _price(search: Search, found: Round) -> float:
@@ -213,7 +222,7 @@ def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, sl
     return sum(set(a) == set(chosen) for a in again) / len(again)
 
 
-def _tested(search: Search, before: Refit, refit: Refit, form: _Form, best: Refit | None) -> Law | None:
+def _tested(search: Search, before: Refit, refit: Refit, stability: float | None, best: Refit | None) -> Law | None:
     """The law; None where it does not stand the tests an effect of the catalogue has to."""
     ruler = Ruler.of(refit)
     gain = ruler.gain(before.chi2, refit.chi2, refit.count - before.count)
@@ -228,4 +237,4 @@ def _tested(search: Search, before: Refit, refit: Refit, form: _Form, best: Refi
         return None
     ahead = best is None or ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic
     near = ahead and not is_far(before, refit)
-    return Law(refit, gain, form.stability, near, form.terms) if near or (form.stability or 0.0) >= STABLE else None
+    return Law(refit, gain, stability, near) if near or (stability or 0.0) >= STABLE else None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.filtered import filtered
 from hvdc_ident.discrepancy.law import law
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.race import Race
@@ -21,6 +22,7 @@ from hvdc_ident.discrepancy.trials import (
     all_far,
     best_each,
     by_cost,
+    is_noise,
     on_bound,
     once_more,
     refitted,
@@ -103,6 +105,8 @@ def looked(
     # Beside an effect that is there already the others cost more than they have been seen to find.
     for look in AT_FIRST if number == 1 else ():
         stand = look(stand)
+        if stand.opened.law:
+            return stand.opened, stand.trials
     if number > 1 or not stand.anything_told:
         return stand.opened, stand.trials
     for look in (*WHERE_FAR, *THOROUGH):
@@ -180,6 +184,15 @@ def _closer(stand: Stand) -> Stand:
     return stand.with_best(stand.refits(extra, "refits of the closer look"))
 
 
+def _as_a_filter(stand: Stand) -> Stand:
+    """A linear filter outside the catalogue, where no refit leaves noise."""
+    best = next((t.refit for t in by_cost(stand.trials)), None)
+    if best is None or not stand.search.options.fallback or is_noise(best, stand.search.seed):
+        return stand
+    found = filtered(stand.search, stand.opened, stand.nominal, best)
+    return stand if found is None else replace(stand, opened=replace(stand.opened, laws=(found,)))
+
+
 def _as_a_law(stand: Stand) -> Stand:
     """A formula outside the catalogue: one that leaves next to nothing but noise spares all looks that are left."""
     if not stand.search.options.fallback:
@@ -208,7 +221,7 @@ def _once_more(stand: Stand) -> Stand:
 
 
 ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _twins, _elsewhere, _other_forms, _as_late, _elsewhere)
-AT_FIRST: tuple[Look, ...] = (_closer, _as_late)
+AT_FIRST: tuple[Look, ...] = (_as_a_filter, _closer, _as_late)
 """In the first round."""
 WHERE_FAR: tuple[Look, ...] = (_as_a_law, _from_every_size, _once_more)
 """In the first round, as long as nothing comes near the noise."""

@@ -27,7 +27,7 @@ LARGE = 2.0
 NEARLY = 0.1
 """Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
 
-BEYOND = "none of it comes near the noise, and a law of the model's own signals does"
+BEYOND = "none of it leaves noise, and what is found from the data alone does"
 
 
 def one_round(search: Search, before: Refit, number: int) -> Round:

@@ -9,7 +9,7 @@ from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.settle import settled
 from hvdc_ident.discrepancy.state import Round, Search
-from hvdc_ident.discrepancy.trials import excess, shapeless
+from hvdc_ident.discrepancy.trials import is_noise
 from hvdc_ident.errors import SimulationError
 
 
@@ -54,14 +54,9 @@ def forward(search: Search, first: Refit) -> Outcome:
             break
         kept.append(found)
         here = found.winner.refit
-        if is_noise(here, search):
+        if is_noise(here, search.seed):
             break
     if len(kept) > 1:
         here, kept, more = settled(search, first, here, kept, len(rounds))
         notes += more
     return Outcome(here, tuple(rounds), tuple(kept), notes)
-
-
-def is_noise(refit: Refit, search: Search) -> bool:
-    """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
-    return not excess(refit) and shapeless(refit.nominal(), search.seed)

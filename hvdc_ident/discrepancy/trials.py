@@ -171,6 +171,11 @@ def like_noise(refit: Refit) -> bool:
     return held is not None and shapeless(Nominal(held, refit.theta[: len(held.free)], refit.noise), 0)
 
 
+def is_noise(refit: Refit, seed: int) -> bool:
+    """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
+    return not excess(refit) and shapeless(refit.nominal(), seed)
+
+
 def shapeless(nominal: Nominal, seed: int) -> bool:
     """Whether sums over time of what a model leaves are what they are of noise."""
     return all(b.p > SHAPED for b in adequacy(nominal, {}, bootstraps=100, seed=seed))

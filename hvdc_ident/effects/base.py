@@ -160,7 +160,8 @@ class Effect:
     example: values that show on a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: whether it brings another signal in (`from`). needs_expression: whether its form is given with it,
-    with coefficients of the user's own names. resistance: the parameter for which a resistance of the model stands in.
+    with coefficients of the user's own names. sought: whether a search for every effect tries it; what stands for many others
+    is tried where none of them is enough. resistance: the parameter for which a resistance of the model stands in.
     restless: whether it moves the model by itself, so that a record of it does not begin at rest. late: by how long, s, it
     delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common. quick: the
     same y of u as the equations, in numpy, where those are too many to be evaluated for thousands of sizes. widens: effects
@@ -179,6 +180,7 @@ class Effect:
     confusable: FrozenMap[str] = field(default_factory=FrozenMap)
     needs_source: bool = False
     needs_expression: bool = False
+    sought: bool = True
     resistance: str = ""
     restless: bool = False
     late: Callable[[Mapping[str, float]], float] | None = None

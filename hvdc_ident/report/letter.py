@@ -182,11 +182,11 @@ def _gains(found: dict[str, Any]) -> str:
 
 
 def _added(found: dict[str, Any]) -> str:
-    """What the augmented model has: an effect, or a formula or curve found from the data; empty where nothing was added."""
+    """What the augmented model has: an effect, or a formula, filter or curve found from the data; empty where nothing was added."""
     if found.get("effects"):
         return "effect"
     kind = (found.get("fallback") or {}).get("kind", "") if found.get("augmented_model") else ""
-    return {"term": "formula", "curve": "curve"}.get(kind, "")
+    return {"term": "formula", "filter": "filter", "curve": "curve"}.get(kind, "")
 
 
 def _percent(share: float) -> str:

@@ -61,16 +61,19 @@ def experiments(
     offset: float = 0.0,
     noise: str = "white",
     seed: int = 0,
+    meter: Callable[[Array], Array] | None = None,
 ) -> tuple[Experiment, ...]:
     """Records of the drive with something hidden. lag: of the measured speed, s. drag: of the speed, instead of b w.
 
-    offset: of the torque that acts. noise: white, ar (0.9) or quantised.
+    offset: of the torque that acts. noise: white, ar (0.9) or quantised. meter: what becomes of the torque before it.
     """
     random = np.random.default_rng(seed)
     found = []
     for name, (role, moves) in RUNS.items():
         inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
         clean = _solved(inputs, lag, drag or (lambda w: TRUE["b"] * w), offset)
+        if meter:
+            clean[:, 1] = meter(clean[:, 1])
         y = np.column_stack([_noisy(clean[:, k], s, noise, random) for k, s in enumerate(SIGMA.values())])
         measured = Trajectory(TIME, y, tuple(SIGMA), ("", ""))
         told = FrozenMap(SIGMA) if noise == "white" else FrozenMap()

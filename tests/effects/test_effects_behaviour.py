@@ -191,6 +191,11 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
         ("inductance", {"L": 0.02, "R": 4.0}, lambda s: 1 / (1 + 0.005 * s)),
         ("second-order", {"wn": 50.0, "zeta": 0.2}, lambda s: 2500 / (s * s + 20 * s + 2500)),
         ("lead-lag", {"T1": 0.03, "T2": 0.01}, lambda s: (1 + 0.03 * s) / (1 + 0.01 * s)),
+        (
+            "filter",
+            {"k": -0.4, "low": 0.5, "high": -0.2, "wn": 40.0, "zeta": 0.3},
+            lambda s: 1 - 0.4 * (0.5 * 1600 + 24 * s - 0.2 * s * s) / (s * s + 24 * s + 1600),
+        ),
         ("delay", {"T": 0.01}, lambda s: np.exp(-0.01 * s)),
         ("window-mean", {"T": 0.01}, lambda s: (1 - np.exp(-0.01 * s)) / (0.01 * s)),
         (

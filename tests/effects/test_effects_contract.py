@@ -33,6 +33,7 @@ NEUTRAL = {
     "delay": ({"T": 0.0},),
     "disturbance": ({"amplitude": 0.0},),
     "droop": ({"k": 0.0},),
+    "filter": ({"k": 0.0},),
     "gain": ({"k": 1.0},),
     "inductance": ({"L": 0.0},),
     "lag": ({"T": 0.0},),

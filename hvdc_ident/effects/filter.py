@@ -1,0 +1,57 @@
+"""A linear filter of second order: u and k times what it passes around wn, and of that a part below and above."""
+
+import math
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """y = u + k (low x + 2 zeta v + high (u - x - 2 zeta v)) of x' = wn v, v' = wn (u - x - 2 zeta v).
+
+    x is what a low pass lets through, 2 zeta v a band pass with gain 1 at wn, the rest of u a high pass.
+    """
+    wn, zeta = p["wn"], p["zeta"]
+    x, v = add.states(("x", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])))
+    band = 2 * zeta * v
+    return u + p["k"] * (p["low"] * x + band + p["high"] * (u - x - band))
+
+
+EFFECT = Effect(
+    name="filter",
+    summary="linear filter of second order, y = u + k (low wn^2 + 2 zeta wn s + high s^2)/(s^2 + 2 zeta wn s + wn^2) u",
+    parameters=FrozenMap(
+        {
+            "k": EffectParameter(
+                -0.5,
+                neutral=0.0,
+                min=-math.inf,
+                description="what is added at wn",
+                probes=(0.3,),
+                search=(-5.0, 5.0),
+            ),
+            "low": EffectParameter(0.0, min=-math.inf, description="of that the part well below wn"),
+            "high": EffectParameter(0.0, min=-math.inf, description="of that the part well above wn"),
+            "wn": EffectParameter(
+                100.0,
+                unit="rad/s",
+                min=1e-9,
+                description="middle of the band",
+                measure="rate",
+                probes=(0.9, 0.78, 0.67, 0.56, 0.44, 0.33, 0.22, 0.1),
+            ),
+            "zeta": EffectParameter(
+                0.25, description="half the band's width, of wn", probes=(0.3,), search=(0.01, 5.0)
+            ),
+        }
+    ),
+    rewrite=rewrite,
+    sentence="{at} passes a filter of second order around {wn}, damping {zeta}: {k} more there, low = {low}, high = {high}",
+    excited_by="a multisine through the slot over the filter's band",
+    example=FrozenMap({"k": -0.5, "low": 0.1, "high": -0.1, "wn": 60.0, "zeta": 0.25}),
+    states="x and v = x'/wn, one pair a slot",
+    sought=False,
+)
