@@ -1,4 +1,5 @@
-"""What a named form might be instead, outside the catalogue: powers, magnitudes and products of signals at its slot.
+"""What a named form might be instead, outside the catalogue: powers, magnitudes and products of signals at its slot, or a
+notch or a resonance.
 
 A saturation bends by the third order, a coupling is a product at its operating point: whoever has only the catalogue's
 name for it takes a form for told that the data do not tell.
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from hvdc_ident.discrepancy.candidates import additive, source_signals
+from hvdc_ident.discrepancy.filtered import filters
 from hvdc_ident.discrepancy.formula import at_run, formula_job
 from hvdc_ident.discrepancy.hidden import regression
 from hvdc_ident.discrepancy.library import Term, terms
@@ -28,15 +30,18 @@ TRIED = 6
 
 
 def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
-    """The refits of formulas at the winner's slot in its stead, each with the winner's pick; those that failed are left out.
+    """The refits of forms outside the catalogue in the winner's stead; those that failed are left out.
 
-    Only for what bends a signal or brings one in, without memory, at one slot inside a model: no formula of signals at one
-    time is a delay.
+    Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
+    winner's pick. No formula of signals at one time is a delay: for one kind of these or another filters, wherever they are.
     """
     winner = found.winner
     assert winner is not None and found.ruler is not None
     placed = winner.refit.placed[-1]
     effect = effects()[placed.candidate.effect]
+    if effect.late is not None and not effect.scanned:
+        here = filters(search, found, found.before.nominal())
+        return tuple(gained(t, found.before, found.ruler) for t in here)
     # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
     remembers = effect.states != "none" and not effect.needs_source
     if remembers or effect.scanned or additive(effect):

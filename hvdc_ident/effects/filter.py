@@ -54,4 +54,11 @@ EFFECT = Effect(
     example=FrozenMap({"k": -0.5, "low": 0.1, "high": -0.1, "wn": 60.0, "zeta": 0.25}),
     states="x and v = x'/wn, one pair a slot",
     sought=False,
+    confusable=FrozenMap(
+        {
+            "second-order": "a multisine from well below to well above wn: the second order lets nothing through above it",
+            "lead-lag": "a multisine from well below to well above wn: a lead-lag's gain goes one way only",
+            "lag": "a multisine from well below to well above wn: behind a lag nothing comes back above it",
+        }
+    ),
 )
