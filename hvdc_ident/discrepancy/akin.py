@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.dense import bent, by_level
+from hvdc_ident.discrepancy.jobs import job_of
 from hvdc_ident.discrepancy.scores import SEEN
 from hvdc_ident.discrepancy.select import Pick, Trial
 from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.discrepancy.trials import HEAT, SPRINT, best_each, by_cost, cost_of, excess, misses, once_more, refitted
 from hvdc_ident.effects import effects
+from hvdc_ident.errors import HvdcIdentError
 
 ELSEWHERE = 40
 """Other places at most at which the best effects are refitted."""
@@ -116,6 +120,28 @@ def with_begun(
     if number == 1 and sound and (excess(sound[0].refit) or misses(sound[0].refit)):
         begun = once_more(search, opened, begun, text, most=1, best=sound[0].refit.chi2)
     return best_each([*trials, *begun])
+
+
+def carried(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> list[Trial]:
+    """The best, where its size has to be met, with that size and those gains at every other place within reach.
+
+    The scores that put it where it is are of other sizes, and of gains that are biased.
+    """
+    found, sound = opened.candidates, by_cost(trials)
+    best = found[sound[0].pick.candidate] if sound else None
+    if best is None or not effects()[best.effect].scanned or len(best.at) > 1:
+        return []
+    refit, placed = sound[0].refit, sound[0].refit.placed[-1]
+    picks, jobs = [], []
+    for k, c in enumerate(found):
+        if c.effect == best.effect and len(c.at) == 1 and c.at != best.at and opened.reaches(c) and not c.still:
+            there = replace(placed, candidate=replace(placed.candidate, at=c.at), use=replace(placed.use, at=c.at))
+            with suppress(HvdcIdentError):  # it cannot sit there
+                jobs.append(job_of(opened.before, refit, [there], {0: refit.sizes(placed)}))
+                picks.append(Pick(k, 0, 1.0, opened.score_p(k)[0]))
+    texts = [f"round {number}: {best.effect} elsewhere: {found[p.candidate].label}" for p in picks]
+    ends = SPRINT.run(search, opened.before.chi2, jobs, texts, refit.chi2)
+    return [Trial(p, r, -np.inf) for p, r in zip(picks, ends, strict=True)]
 
 
 def bends(opened: Round) -> list[Pick]:

@@ -21,13 +21,14 @@ from hvdc_ident.discrepancy.jobs import as_given
 from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.objections import unseen_rows
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Job, Refit, judged, of_held_out, signal
+from hvdc_ident.discrepancy.refit import Job, Refit, judged, of_held_out, run, signal
 from hvdc_ident.discrepancy.scan import PATIENT
 from hvdc_ident.discrepancy.state import Search
 from hvdc_ident.effects import SlotSignal, effects, scanned
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.executor import mapped
+from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
@@ -58,6 +59,13 @@ COUNTS = 12
 """Numbers of steps, on either side of the one there is, that a level may be from 0."""
 UNSURE = 3.0
 """Standard deviations within which sizes are one to the fitted data."""
+POLISHED = 2
+"""Refits, the best, of what has levels that are polished without slopes."""
+ROUGH = 3.0
+"""Times its rows: chi2 up to which one is."""
+RUNS = 500
+SIMPLEX = 0.003
+"""Of the range of each unknown: the first simplex."""
 PIECE = 30
 """Sizes that are looked at in one go, wherever that is done."""
 
@@ -100,8 +108,18 @@ def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Re
         here = here | moving
     here = further(here, _Sweep(_closely))
     here |= further({k: here[k] for k in counted}, _Sweep(_other_counts, between=False))
+    best = {k for k in sorted(counted, key=lambda k: _left(here[k]))[:POLISHED] if here[k].chi2 < ROUGH * here[k].rows}
+    here |= dict(zip(best, mapped(search.executor, _polished, [here[k] for k in best]), strict=True))
     found = stuck | _agreed(search, here)
     return [found[k] for k in range(len(jobs))]
+
+
+def _polished(here: Refit) -> Refit:
+    """The refit from where a simplex ends, where that is better: rows that go over an edge make of a slope a stair."""
+    simplex = NelderMead(max_evaluations=RUNS, size=SIMPLEX, cost=0.05, step=1e-8, restarts=2)
+    end = simplex.run(replace(here.problem, simulator=ModelSimulator(here.model, PATIENT)), here.theta)
+    there = run(Job(here.model, here.placed, here.problem, (end.theta,), here.noise))
+    return min(here, here if there.failure else there, key=_left)
 
 
 def _further(

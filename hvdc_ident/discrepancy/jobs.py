@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.begin import Placed, added, moved
+from hvdc_ident.discrepancy.begin import PATIENCE, Placed, added, moved
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.refit import Job, Refit
 from hvdc_ident.discrepancy.select import Pick
 from hvdc_ident.discrepancy.signatures import is_linear, kind_of
+from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.fit import Free
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model.transform import home
+from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
 BIASED = 0.4
@@ -72,3 +78,31 @@ def as_given(refit: Refit) -> Array | None:
         far = far or abs(theta[k] - f.start) > BIASED * abs(f.start) or f.on_bound(theta[k])
         theta[k] = f.start
     return theta if far else None
+
+
+def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> Job:
+    """The refit of the nominal model with these effects; sizes: of some, by their place, instead of where they stand."""
+    model, free, again = first.model, list(first.problem.free), []
+    at = here.values
+    for k, p in enumerate(placed):
+        own = sizes.get(k) or {n: at.get(name, p.start[n]) for n, name in p.names.items()}
+        values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
+        named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
+        parameters: dict[str, float | str] = {**values, **named}
+        # What sat behind an effect that is left out sits where that one did.
+        at_slots = tuple(home(model.slots, place) for place in p.use.at)
+        source = home(model.slots, p.use.source) if p.use.source else ""
+        use = EffectUse(p.use.effect, at_slots, FrozenMap(parameters), source=source, expression=p.use.expression)
+        before = set(model.parameters)
+        model = model.with_effects([use])
+        new = [n for n in model.parameters if n not in before]
+        names = dict(zip(p.names, new, strict=True))
+        free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
+        moved = replace(p.candidate, at=at_slots, source=source)
+        again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
+    unsettled = any(effects()[p.use.effect].restless for p in placed)
+    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
+    nuisance = here.theta[len(here.problem.free) :]
+    gains = [at[f.name] for f in first.problem.free]
+    begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])
+    return Job(model, tuple(again), problem, (begin,), here.noise)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from hvdc_ident.discrepancy.akin import as_late, bends, elsewhere, is_akin, leaders, other_forms, with_begun
+from hvdc_ident.discrepancy.akin import as_late, bends, carried, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.closer import closer_look
 from hvdc_ident.discrepancy.filtered import filtered
 from hvdc_ident.discrepancy.law import law
@@ -35,6 +35,8 @@ WIDER = 40
 """Candidates at most that are refitted besides, where none of those picked first comes near the noise."""
 TWINS = 16
 """Candidates at most that are refitted though their traces are another's."""
+BETTER = 0.02
+"""Share by which chi2 is less at another place where a size is looked for there too."""
 CLOSE = 0.01
 """Share of what the model before leaves beyond noise that a refit may leave for a closer look to be saved."""
 
@@ -109,6 +111,8 @@ def looked(
             return stand.opened, stand.trials
     if number > 1 or not stand.anything_told:
         return stand.opened, stand.trials
+    if not stand.far:
+        return stand.opened, _met_elsewhere(stand).trials
     for look in (*WHERE_FAR, *THOROUGH):
         if not stand.far or stand.opened.law:
             break
@@ -215,9 +219,22 @@ def _from_every_size(stand: Stand) -> Stand:
 
 
 def _once_more(stand: Stand) -> Stand:
-    """Sizes that have to be met, beside the gains that refits came to."""
-    again = once_more(stand.search, stand.opened, stand.trials, stand.text("once more"))
-    return replace(stand, trials=tuple(again))
+    """Sizes that have to be met, beside the gains that refits came to; and so where the best of them is better elsewhere."""
+    stand = replace(stand, trials=tuple(_again(stand, stand.trials)))
+    further = _met_elsewhere(stand)
+    best, before = (next(iter(by_cost(s.trials)), None) for s in (further, stand))
+    if best is None or before is None or best.refit.chi2 > (1.0 - BETTER) * before.refit.chi2:
+        return further
+    return further.with_best(_again(further, [best]))
+
+
+def _again(stand: Stand, trials: Sequence[Trial]) -> list[Trial]:
+    return once_more(stand.search, stand.opened, trials, stand.text("once more"))
+
+
+def _met_elsewhere(stand: Stand) -> Stand:
+    """The best, where its size has to be met, with that size at the other places."""
+    return stand.with_best(carried(stand.search, stand.opened, stand.trials, stand.number))
 
 
 ALWAYS: tuple[Look, ...] = (_shortlisted, _beside, _twins, _elsewhere, _other_forms, _as_late, _elsewhere)

@@ -6,22 +6,16 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-import numpy as np
-
-from hvdc_ident.discrepancy.begin import PATIENCE, Placed
+from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.candidates import Candidate
+from hvdc_ident.discrepancy.jobs import job_of
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import closed, one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, at_edge, clear
 from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.discrepancy.trials import is_far
-from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.transform import home
-from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 OTHERS = 6
 """Rivals of each effect in its own round that are tried again once the other effects are in."""
@@ -143,31 +137,3 @@ def _again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
         return run(job_of(first, here, placed, {}))
     except HvdcIdentError as error:
         return replace(here, failure=str(error))
-
-
-def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> Job:
-    """The refit of the nominal model with these effects; sizes: of some, by their place, instead of where they stand."""
-    model, free, again = first.model, list(first.problem.free), []
-    at = here.values
-    for k, p in enumerate(placed):
-        own = sizes.get(k) or {n: at.get(name, p.start[n]) for n, name in p.names.items()}
-        values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
-        named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
-        parameters: dict[str, float | str] = {**values, **named}
-        # What sat behind an effect that is left out sits where that one did.
-        at_slots = tuple(home(model.slots, place) for place in p.use.at)
-        source = home(model.slots, p.use.source) if p.use.source else ""
-        use = EffectUse(p.use.effect, at_slots, FrozenMap(parameters), source=source, expression=p.use.expression)
-        before = set(model.parameters)
-        model = model.with_effects([use])
-        new = [n for n in model.parameters if n not in before]
-        names = dict(zip(p.names, new, strict=True))
-        free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
-        moved = replace(p.candidate, at=at_slots, source=source)
-        again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    unsettled = any(effects()[p.use.effect].restless for p in placed)
-    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
-    nuisance = here.theta[len(here.problem.free) :]
-    gains = [at[f.name] for f in first.problem.free]
-    begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])
-    return Job(model, tuple(again), problem, (begin,), here.noise)

@@ -10,13 +10,14 @@ from cases import experiments
 from refits import beside, plain
 
 from hvdc_ident.discrepancy import settle
+from hvdc_ident.discrepancy.jobs import job_of
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.search import forward
 from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, clear
-from hvdc_ident.discrepancy.settle import _last, job_of, settled
+from hvdc_ident.discrepancy.settle import _last, settled
 from hvdc_ident.discrepancy.state import Round, Search
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.frozen import FrozenMap
