@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from hvdc_ident.discrepancy.adequacy import loud_after_breaks
 from hvdc_ident.discrepancy.constancy import constancy
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Refit, unseen
+from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.search import Outcome
 from hvdc_ident.discrepancy.select import Trial
 from hvdc_ident.discrepancy.state import Round
 from hvdc_ident.discrepancy.trials import LOUD
 from hvdc_ident.effects import effects
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.trajectory import Array
 
 TRIFLE = 0.005
 """Share of what is explained of which nothing is made: of real records no model leaves noise alone."""
@@ -43,6 +47,7 @@ def doubt(
     trifle = TRIFLE * explained
     return (
         _quick(left)
+        or _one_way(outcome.refit)
         or _varying(outcome.refit, left, trifle)
         or _not_foretold(outcome.refit, told, floor)
         or _more(outcome, trifle, options)
@@ -67,6 +72,34 @@ def _quick(left: Nominal) -> Doubt | None:
     return Doubt(
         "the first rows after the inputs' breaks are still louder than the others",
         "The same steps, recorded ten times as densely for the first tenth of a second.",
+    )
+
+
+def _one_way(last: Refit) -> Doubt | None:
+    """That a play was passed in one direction only: whatever shifts a signal once it has moved does the same."""
+    for placed in last.placed:
+        width = last.sizes(placed).get(effects()[placed.candidate.effect].turns)
+        if width is None:
+            continue
+        try:
+            seen = [u for place in placed.candidate.at for u in signal(last, place).values()]
+        except SimulationError:  # of a place whose signal cannot be had nothing is known
+            continue
+        if not any(_turned(u, width) for u in seen):
+            return Doubt(
+                f"in no record does the signal at {placed.candidate.at[0]} turn by more than {width:.3g}",
+                f"{placed.candidate.effect}: {effects()[placed.candidate.effect].excited_by}.",
+            )
+    return None
+
+
+def _turned(u: Array, width: float) -> bool:
+    """Whether a signal that has moved turns and goes back by more than a width."""
+    risen, fallen = u - np.minimum.accumulate(u), np.maximum.accumulate(u) - u
+    # After a turn both are large at once: how far it rose before its highest value yet, and how far it fell from there.
+    return bool(
+        np.any(np.minimum(np.maximum.accumulate(risen), fallen) > width)
+        or np.any(np.minimum(np.maximum.accumulate(fallen), risen) > width)
     )
 
 

@@ -61,7 +61,7 @@ UNSURE = 3.0
 """Standard deviations within which sizes are one to the fitted data."""
 POLISHED = 2
 """Refits, the best, of what has levels that are polished without slopes."""
-ROUGH = 3.0
+ROUGH = 20.0
 """Times its rows: chi2 up to which one is."""
 RUNS = 500
 SIMPLEX = 0.003

@@ -39,6 +39,7 @@ EFFECT = Effect(
     excited_by="slow ramps both ways, with turns at several levels",
     example=FrozenMap({"width": 0.02}),
     states="y, one a slot",
+    turns="width",
     confusable=FrozenMap(
         {
             "deadband": "slow ramps both ways: the deadband is flat at 0 only",

@@ -165,7 +165,8 @@ class Effect:
     restless: whether it moves the model by itself, so that a record of it does not begin at rest. late: by how long, s, it
     delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common. quick: the
     same y of u as the equations, in numpy, where those are too many to be evaluated for thousands of sizes. widens: effects
-    that it turns into where one of its parameters ends: what they explain it explains as well, at the price of that.
+    that it turns into where one of its parameters ends: what they explain it explains as well, at the price of that. turns: the
+    parameter by more than which the slot's signal has to turn for the effect to be more than a shift of what has moved.
     """
 
     name: str
@@ -186,6 +187,7 @@ class Effect:
     late: Callable[[Mapping[str, float]], float] | None = None
     quick: Callable[[Array, Mapping[str, Array]], Array] | None = None
     widens: tuple[str, ...] = ()
+    turns: str = ""
 
     def late_by(self, values: Mapping[str, float]) -> float | None:
         """By how long it delays a slow signal with these values, s; None for what is no delay of any kind."""
