@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import TRUE, experiments, model
+from cases import TRUE, corners, experiments, model
 from refits import answered, beside, plain
 from scipy.stats import kstest
 
+from hvdc_ident import InputSignal
 from hvdc_ident.discrepancy import Options
 from hvdc_ident.discrepancy.constancy import constancy
-from hvdc_ident.discrepancy.doubts import Doubt, doubt
+from hvdc_ident.discrepancy.doubts import Doubt, _turned, doubt
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.search import Outcome
@@ -94,3 +95,28 @@ def test_a_name_is_in_doubt_where_something_beside_it_is_no_noise(gain: float, s
     more = replace(run(beside(refit, "gain", "torque", {"k": 1.01}, {"k": (0.5, 2.0)})), chi2=refit.chi2 - 50.0)
     against = doubted(refit, beside=[Trial(Pick(0, 0, 1.0, score), more, gain, evidence=gain)])
     assert (against is not None and "gain at torque beside it" in against.why) == doubtful
+
+
+@pytest.mark.parametrize(
+    ("course", "turned"),
+    [([0, 1, 2, 3], False), ([0, 1, 0.6], False), ([0, 1, 0.4], True), ([1, 0, 0.6], True), ([0, 0.4, 0, 0.4], False)],
+)
+def test_a_signal_has_turned_where_it_goes_back_by_more_than_a_width(course: list[float], turned: bool) -> None:
+    assert _turned(np.array(course, dtype=float), 0.5) == turned
+    assert _turned(-np.array(course, dtype=float), 0.5) == turned
+
+
+def test_a_play_that_is_passed_in_one_direction_is_doubted() -> None:
+    """In a record that rises only, whatever shifts a signal once it has moved looks like a play."""
+    refits = {}
+    for name, moves in {"up": [0.6], "both": [0.6, -0.9]}.items():
+        held = []
+        for e in experiments():
+            steps = [(0.2 + 0.5 * k, move) for k, move in enumerate(moves)]
+            held.append(replace(e, inputs=FrozenMap({"ref": InputSignal.corners(corners(1.0, steps))})))
+        there = model().with_effects([{"effect": "backlash", "at": ["ref"], "parameters": {"width": 0.2}}])
+        first = plain(answered(there, held, seed=0))
+        refits[name] = run(beside(first, "backlash", "ref", {"width": 0.18}, {"width": (1e-3, 1.0)}))
+    against = doubted(refits["up"])
+    assert against is not None and "turn by more than 0.2" in against.why and "ramps both ways" in against.advice
+    assert doubted(refits["both"]) is None
