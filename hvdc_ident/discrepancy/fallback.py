@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import kind_of, source_signals
+from hvdc_ident.discrepancy.filtered import shape, transfer_function
 from hvdc_ident.discrepancy.formula import Law, filled, labelled
 from hvdc_ident.discrepancy.hidden import Regression, over_signal, over_time, regression
 from hvdc_ident.discrepancy.law import STABLE, law
@@ -98,43 +99,20 @@ def _formula_found(found: Law) -> Fallback:
 
 
 def _filter_found(found: Law) -> Fallback:
-    refit = found.refit
-    places = ", ".join(refit.placed[-1].candidate.at)
-    said = [
-        f"Found from the data, outside the catalogue: {places} passes {_shape(refit)}, H(s) = {transfer_function(refit)}."
-    ]
-    if found.others:
-        said.append(f"As good: one at {listed([', '.join(r.placed[-1].candidate.at) for r in found.others])}.")
-    as_good = tuple(
-        {"at": ", ".join(r.placed[-1].candidate.at), "expression": transfer_function(r)} for r in found.others
-    )
+    refit, others = found.refit, found.others
+    text = f"{_at(refit)} passes {shape(refit)}, H(s) = {transfer_function(refit)}"
+    said = [f"Found from the data, outside the catalogue: {text}."]
+    if others:
+        said.append(f"As good: one at {listed([_at(r) for r in others])}.")
     return Fallback(
-        "filter", places, " ".join(said), transfer_function(refit), _sizes(refit), delta_bic=found.gain, as_good=as_good,
-        refit=refit,
+        "filter", _at(refit), " ".join(said), transfer_function(refit), _sizes(refit), delta_bic=found.gain,
+        as_good=tuple({"at": _at(r), "expression": transfer_function(r)} for r in others), refit=refit,
     )  # fmt: skip
 
 
-def _polynomials(refit: Refit) -> tuple[Array, Array]:
-    """Numerator and denominator of the filter that a refit ends with, the highest power first."""
-    p = refit.sizes(refit.placed[-1])
-    band = 2.0 * p["zeta"] * p["wn"]
-    above, below = 1.0 + p["k"] * p["high"], 1.0 + p["k"] * p["low"]
-    return np.array([above, band * (1.0 + p["k"]), p["wn"] ** 2 * below]), np.array([1.0, band, p["wn"] ** 2])
-
-
-def _shape(refit: Refit) -> str:
-    """Whether the filter lowers or raises most, and where."""
-    omega = refit.sizes(refit.placed[-1])["wn"] * np.geomspace(0.1, 10.0, 2001)
-    numerator, denominator = _polynomials(refit)
-    level = np.log(np.abs(np.polyval(numerator, 1j * omega) / np.polyval(denominator, 1j * omega)))
-    most = np.argmax(np.abs(level))
-    return f"a {'notch' if level[most] < 0 else 'resonance'} around {omega[most]:.3g} rad/s"
-
-
-def transfer_function(refit: Refit) -> str:
-    """The filter that a refit ends with, as a fraction of polynomials in s."""
-    told = [" + ".join((f"{a:.4g} s^2", f"{b:.4g} s", f"{c:.4g}")) for a, b, c in _polynomials(refit)]
-    return "/".join(f"({t.removeprefix('1 ').replace('+ -', '- ')})" for t in told)
+def _at(refit: Refit) -> str:
+    """Where what was put in last sits."""
+    return ", ".join(refit.placed[-1].candidate.at)
 
 
 def _sizes(refit: Refit) -> FrozenMap[Any]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from hvdc_ident.discrepancy.candidates import Candidate, candidates
 from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.law import standing
@@ -19,6 +21,7 @@ from hvdc_ident.discrepancy.select import Trial, best_of
 from hvdc_ident.discrepancy.state import Round, Search, slot_signals
 from hvdc_ident.discrepancy.trials import refitted
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
 
 BESIDES = ("low", "high")
 """Parameters of the filter below and above its band."""
@@ -59,7 +62,33 @@ def _band(candidate: Candidate) -> Candidate:
 
 def _rings(refit: Refit) -> bool:
     """Whether poles and zeros of the filter are complex, as of no chain of lags and lead-lags, and the zeros not a delay's."""
-    own = refit.sizes(refit.placed[-1])
-    high, low = 1.0 + own["k"] * own["high"], 1.0 + own["k"] * own["low"]
-    at = own["zeta"] * (1.0 + own["k"])
-    return own["zeta"] < 1.0 and at**2 < high * low and at / high > LATE * own["zeta"]
+    zeros, poles = _polynomials(refit)
+    return _complex(zeros) and _complex(poles) and zeros[1] / zeros[0] > LATE * poles[1]
+
+
+def _complex(quadratic: Array) -> bool:
+    a, b, c = quadratic
+    return bool(b**2 < 4.0 * a * c)
+
+
+def _polynomials(refit: Refit) -> tuple[Array, Array]:
+    """Numerator and denominator of the filter that a refit ends with, the highest power first."""
+    p = refit.sizes(refit.placed[-1])
+    band = 2.0 * p["zeta"] * p["wn"]
+    above, below = 1.0 + p["k"] * p["high"], 1.0 + p["k"] * p["low"]
+    return np.array([above, band * (1.0 + p["k"]), p["wn"] ** 2 * below]), np.array([1.0, band, p["wn"] ** 2])
+
+
+def shape(refit: Refit) -> str:
+    """Whether the filter that a refit ends with lowers or raises most, and where, in words."""
+    omega = refit.sizes(refit.placed[-1])["wn"] * np.geomspace(0.1, 10.0, 2001)
+    numerator, denominator = _polynomials(refit)
+    level = np.log(np.abs(np.polyval(numerator, 1j * omega) / np.polyval(denominator, 1j * omega)))
+    most = np.argmax(np.abs(level))
+    return f"a {'notch' if level[most] < 0 else 'resonance'} around {omega[most]:.3g} rad/s"
+
+
+def transfer_function(refit: Refit) -> str:
+    """The filter that a refit ends with, as a fraction of polynomials in s."""
+    told = [" + ".join((f"{a:.4g} s^2", f"{b:.4g} s", f"{c:.4g}")) for a, b, c in _polynomials(refit)]
+    return "/".join(f"({t.removeprefix('1 ').replace('+ -', '- ')})" for t in told)

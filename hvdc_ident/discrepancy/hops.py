@@ -108,7 +108,7 @@ def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Re
         here = here | moving
     here = further(here, _Sweep(_closely))
     here |= further({k: here[k] for k in counted}, _Sweep(_other_counts, between=False))
-    best = {k for k in sorted(counted, key=lambda k: _left(here[k]))[:POLISHED] if here[k].chi2 < ROUGH * here[k].rows}
+    best = [k for k in sorted(counted, key=lambda k: _left(here[k]))[:POLISHED] if here[k].chi2 < ROUGH * here[k].rows]
     here |= dict(zip(best, mapped(search.executor, _polished, [here[k] for k in best]), strict=True))
     found = stuck | _agreed(search, here)
     return [found[k] for k in range(len(jobs))]
