@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.discrepancy.akin import as_late, bends, carried, elsewhere, is_akin, leaders, other_forms, with_begun
+from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.closer import closer_look
 from hvdc_ident.discrepancy.filtered import filtered
 from hvdc_ident.discrepancy.law import law
@@ -175,14 +176,19 @@ def _as_late(stand: Stand) -> Stand:
 
 
 def _closer(stand: Stand) -> Stand:
-    """Sizes that a closer look finds: everywhere where nothing explains the data, else at what is akin to the best."""
-    far, leading = all_far(stand.opened.before, stand.trials, CLOSE), leaders(stand.opened, stand.trials)
+    """Sizes that a closer look finds: at what is akin to the best, and everywhere else where still nothing explains the data."""
+    leading = leaders(stand.opened, stand.trials)
+    stand = _looked_closer(stand, lambda c: is_akin(c, leading))
+    if not all_far(stand.opened.before, stand.trials, CLOSE):
+        return stand
+    return _looked_closer(stand, lambda c: not is_akin(c, leading))
+
+
+def _looked_closer(stand: Stand, wanted: Callable[[Candidate], bool]) -> Stand:
+    """The refits of a closer look at the candidates that are wanted, of those within reach."""
+    reached = stand.opened.reaches
     opened, extra = closer_look(
-        stand.search,
-        stand.opened,
-        stand.nominal,
-        stand.number,
-        lambda c: stand.opened.reaches(c) and (far or is_akin(c, leading)),
+        stand.search, stand.opened, stand.nominal, stand.number, lambda c: reached(c) and wanted(c)
     )
     stand = replace(stand, opened=opened)
     return stand.with_best(stand.refits(extra, "refits of the closer look"))

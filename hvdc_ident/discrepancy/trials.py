@@ -74,7 +74,8 @@ def once_more(
 ) -> list[Trial]:
     """The trials, with another size where one is found beside the gains that a refit came to.
 
-    best: the least chi2 of refits done elsewhere; those far behind it are left as they are.
+    best: the least chi2 of refits done elsewhere; those far behind it are left as they are. Of each effect the best comes
+    first, and the others where still nothing comes near the noise.
     """
     found, was = opened.candidates, opened.before.chi2
     order = by_cost(trials)
@@ -84,9 +85,18 @@ def once_more(
         effect = found[t.pick.candidate].effect
         if effects()[effect].scanned and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < most:
             chosen[effect].append(t)
-    again = [t for group in chosen.values() for t in group]
+    kept = list(trials)
+    for heat in ([group[:1] for group in chosen.values()], [group[1:] for group in chosen.values()]):
+        kept = _resized(search, opened, kept, [t for group in heat for t in group], text)
+        if not all_far(opened.before, kept):
+            break
+    return kept
+
+
+def _resized(search: Search, opened: Round, trials: Sequence[Trial], again: Sequence[Trial], text: str) -> list[Trial]:
+    """The trials, some of them with another size where one is found."""
     jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
-    refits = hopped(search, jobs, [f"{text}: {found[t.pick.candidate].label}" for t in again])
+    refits = hopped(search, jobs, [f"{text}: {opened.candidates[t.pick.candidate].label}" for t in again])
     better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
     return [better.get(id(t), t) for t in trials]
 

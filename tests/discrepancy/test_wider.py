@@ -24,7 +24,7 @@ from hvdc_ident.discrepancy.refit import Job, Refit, run
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.select import Pick, Trial, clear
 from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.trials import on_bound, refitted
+from hvdc_ident.discrepancy.trials import on_bound, once_more, refitted
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
@@ -257,6 +257,30 @@ def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
     best = {opened.candidates[t.pick.candidate].at: t.refit for t in moved}
     assert set(best) == {("wm",), ("ref",)}
     assert best[("wm",)].chi2 < 1.2 * best[("wm",)].rows < near.chi2
+
+
+@pytest.mark.parametrize(("least", "places"), [(1e-3, ["wm"]), (0.3, ["wm", "err"])])
+def test_of_one_effect_the_best_is_looked_for_again_first(least: float, places: list[str]) -> None:
+    """And the others only where it comes to nothing: within its bounds is no period that fits."""
+    looks: list[str] = []
+    search = Search(
+        ("sample-hold",), ("wm", "err"), FrozenMap(), Options(bootstraps=100), seed=0,
+        progress=lambda _done, _total, text: looks.append(text),
+    )  # fmt: skip
+    first = plain(records(sampled))
+    opened = replace(one_round(search, first, 1), trials=())
+    at = {c.at[0]: k for k, c in enumerate(opened.candidates)}
+    begun = [
+        run(beside(first, "sample-hold", p, {"Ts": 0.4, "compute": 0.0}, {"Ts": (least, 1.0)})) for p in ("wm", "err")
+    ]
+    # Both are worth it, that at the speed more: what they came to is said here, for it is the order that is tested.
+    fall = first.chi2 - first.rows
+    said = [replace(r, chi2=first.chi2 - share * fall) for r, share in zip(begun, (0.8, 0.7), strict=True)]
+    trials = [Trial(Pick(at[r.placed[0].use.at[0]], 0, 1.0, 0.0), r, 0.0) for r in said]
+    looks.clear()
+    again = once_more(search, opened, trials, "once more")[0].refit
+    assert list(dict.fromkeys(text.partition(" at ")[2] for text in looks)) == places
+    assert (again.chi2 < 1.2 * again.rows) == (places == ["wm"])
 
 
 def test_a_refit_of_levels_is_polished_without_slopes() -> None:
