@@ -40,8 +40,8 @@ def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
     placed = winner.refit.placed[-1]
     effect = effects()[placed.candidate.effect]
     if effect.late is not None and not effect.scanned:
-        here = filters(search, found, found.before.nominal())
-        return tuple(gained(t, found.before, found.ruler) for t in here)
+        tried = filters(search, found, found.before.nominal()) if found.filters is None else found.filters
+        return tuple(gained(t, found.before, found.ruler) for t in tried)
     # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
     remembers = effect.states != "none" and not effect.needs_source
     if remembers or effect.scanned or additive(effect):

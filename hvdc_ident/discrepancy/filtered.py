@@ -7,6 +7,7 @@ noise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,16 +33,16 @@ LATE = -0.5
 notch's or a resonance's."""
 
 
-def filtered(search: Search, found: Round, nominal: Nominal, best: Refit) -> Law | None:
+def filtered(search: Search, found: Round, trials: Sequence[Trial], best: Refit) -> Law | None:
     """The filter that comes near the noise, clearly nearer than `best`, the best refit of the catalogue; None where there is
-    none. nominal: the model before the round, projected."""
-    refits = [t.refit for t in filters(search, found, nominal)]
+    none. trials: those of `filters`."""
+    refits = [t.refit for t in trials]
     return standing(search, found, refits, [None] * len(refits), best)[1]
 
 
-def filters(search: Search, found: Round, nominal: Nominal) -> list[Trial]:
+def filters(search: Search, found: Round, nominal: Nominal) -> tuple[Trial, ...]:
     """Filters refitted where they score best, those that no chain of the catalogue's effects is: first a band alone, then one
-    that is off below and above it too."""
+    that is off below and above it too. nominal: the model before the round, projected."""
     paths, before = found.answers(), found.before
     signals, times = slot_signals(paths, before.placed), [path.time for path in paths.values()]
     everywhere = candidates(before.model, signals, times, ("filter",), search.places)
@@ -51,7 +52,7 @@ def filters(search: Search, found: Round, nominal: Nominal) -> list[Trial]:
     both = replace(found, candidates=(*map(_band, whole), *whole), scores=scores)
     wider = [replace(p, candidate=p.candidate + len(whole)) for p in picks]
     trials = refitted(search, both, [*picks, *wider], "outside the catalogue")
-    return [t for t in trials if not t.refit.failure and _rings(t.refit)]
+    return tuple(t for t in trials if not t.refit.failure and _rings(t.refit))
 
 
 def _band(candidate: Candidate) -> Candidate:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from hvdc_ident.discrepancy.akin import as_late, bends, carried, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.closer import closer_look
-from hvdc_ident.discrepancy.filtered import filtered
+from hvdc_ident.discrepancy.filtered import filtered, filters
 from hvdc_ident.discrepancy.law import law
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.race import Race
@@ -199,8 +199,10 @@ def _as_a_filter(stand: Stand) -> Stand:
     best = next((t.refit for t in by_cost(stand.trials)), None)
     if best is None or not stand.search.options.fallback or is_noise(best, stand.search.seed):
         return stand
-    found = filtered(stand.search, stand.opened, stand.nominal, best)
-    return stand if found is None else replace(stand, opened=replace(stand.opened, laws=(found,)))
+    tried = filters(stand.search, stand.opened, stand.nominal)
+    opened = replace(stand.opened, filters=tried)
+    found = filtered(stand.search, opened, tried, best)
+    return replace(stand, opened=opened if found is None else replace(opened, laws=(found,)))
 
 
 def _as_a_law(stand: Stand) -> Stand:

@@ -51,8 +51,8 @@ class Round:
 
     trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
     reach: what of the gap could be made good at each slot; None where that is not known. laws: the formula outside the
-    catalogue that explains most, or nothing; None where none was looked for. spared: whether nothing came near the noise and
-    what a thorough search would refit was not.
+    catalogue that explains most, or nothing; None where none was looked for. filters: the refits of linear filters; None
+    where there are none. spared: whether nothing came near the noise and what a thorough search would refit was not.
     """
 
     before: Refit
@@ -68,6 +68,7 @@ class Round:
     ruler: Ruler | None
     reach: Reach | None = None
     laws: tuple[Law, ...] | None = None
+    filters: tuple[Trial, ...] | None = None
     spared: bool = False
 
     @property
