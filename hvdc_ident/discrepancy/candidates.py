@@ -50,12 +50,15 @@ class Candidate:
 
 
 def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:
-    """The effects of the catalogue to try; forms that have to be found first are not among them."""
+    """The effects of the catalogue to try; forms that have to be found first are not among them. A name may be "all", too:
+    those that a search for every effect tries, beside which others may be named."""
     catalogue = effects()
-    chosen = [n for n, e in catalogue.items() if e.sought] if names == "all" else list(names)
-    for name in chosen:
-        if name not in catalogue:
+    sought = [n for n, e in catalogue.items() if e.sought]
+    chosen: dict[str, None] = {}
+    for name in ["all"] if names == "all" else names:
+        if name != "all" and name not in catalogue:
             raise unknown_name("effect", name, catalogue)
+        chosen |= dict.fromkeys(sought if name == "all" else [name])
     return tuple(catalogue[n] for n in chosen if not catalogue[n].needs_expression)
 
 

@@ -62,8 +62,9 @@ def diagnose(
 
     subject: a model; or anything that can be simulated, with effects at its inputs and outputs only.
     experiments: with measured outputs; those of role "holdout" judge, the others are fitted. parameters: what may be
-    fitted, with start (the given gains) and bounds. effects: names of the catalogue to try. places: slots to try them
-    at, a tuple for one effect at several slots with shared parameters (default: every slot, and families of like slots).
+    fitted, with start (the given gains) and bounds. effects: names of the catalogue to try, "all" beside others for what is
+    tried by default. places: slots to try them at, a tuple for one effect at several slots with shared parameters (default:
+    every slot, and families of like slots).
     material: by output, an error (in its unit) below which a gap is of no interest. held: values of other parameters.
     report: `IdentifiabilityReport.to_dict()` of these data, whose identifiable set is fitted; without one, the set that
     the sensitivities at the pilot fit can tell apart.

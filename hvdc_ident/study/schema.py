@@ -260,8 +260,8 @@ class Fit(Table):
 
 
 class Diagnose(Table):
-    """[diagnose]: which effects to try, what is too small to matter, how many effects may be missing at most, and whether what
-    the scores tell little of is refitted too where nothing else comes near the noise."""
+    """[diagnose]: which effects to try ("all" may stand beside others), what is too small to matter, how many effects may be
+    missing at most, and whether what the scores tell little of is refitted too where nothing else comes near the noise."""
 
     effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = "all"
     material: dict[Name, Positive] = {}

@@ -222,7 +222,7 @@ def _check_questions(study: Study, where: str) -> None:
         if s.diagnose.effects != "all":
             from hvdc_ident.effects import effects
 
-            _all_known("effect", s.diagnose.effects, effects(), f"{where}, diagnose.effects")
+            _all_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
 
 
 def _check_sweep(line: schema.Sweep, model: AnyModel, where: str) -> None:

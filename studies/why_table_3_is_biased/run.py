@@ -88,21 +88,22 @@ def causes(names: Sequence[str] = (), count: int = hypotheses.RUNS, executor: An
 
 
 def told_nothing(executor: Any = None) -> dict[str, Any]:
-    """The diagnoses by what was recorded, with more noise too, and Fig. 8 with what was named."""
-    found = {signals: diagnosed.diagnosis(signals, executor=executor) for signals in diagnosed.RECORDED}
+    """The diagnoses by what was asked, told nothing with more noise too, and Fig. 8 with what was named."""
+    found, offered = (
+        {name: diagnosed.diagnosis(name, executor=executor) for name in asked}
+        for asked in (diagnosed.TOLD_NOTHING, diagnosed.OFFERED)
+    )
     louder = {
-        signals: {
-            f"{noise:g}": diagnosed.diagnosis(signals, noise=noise, executor=executor) for noise in diagnosed.LOUDER
-        }
-        for signals in diagnosed.RECORDED
+        name: {f"{noise:g}": diagnosed.diagnosis(name, noise=noise, executor=executor) for noise in diagnosed.LOUDER}
+        for name in found
     }
-    return {"told nothing": found, "louder": louder} | after(found)
+    return {"told nothing": found, "louder": louder, "offered": offered} | after(found | offered)
 
 
 def after(found: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said to be missing, or the best of the first round, does to the gains and to Fig. 8, by what was recorded."""
-    put_in = {signals: diagnosed.put_in(told, signals) for signals, told in found.items()}
-    return {"put in": put_in, "figure 8": {s: diagnosed.figure_8(told) for s, told in put_in.items()}}
+    """What is said to be missing, or the best of the first round, does to the gains and to Fig. 8, by what was asked."""
+    put_in = {name: diagnosed.put_in(told, name) for name, told in found.items()}
+    return {"put in": put_in, "figure 8": {name: diagnosed.figure_8(told) for name, told in put_in.items()}}
 
 
 def planted() -> dict[str, Any]:

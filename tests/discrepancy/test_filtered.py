@@ -5,23 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cases import FREE, TIME, TRUE, experiments, model
-from scipy.signal import TransferFunction, lsim
+from meters import filtered
 
-from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.model import Model, parse_card
 from hvdc_ident.model.card import write_card
-from hvdc_ident.trajectory import Array
-
-
-def filtered(numerator: list[float], denominator: list[float]) -> tuple[Experiment, ...]:
-    """Records of the drive whose torque is shown by a meter with this transfer function."""
-
-    def meter(torque: Array) -> Array:
-        shown = lsim(TransferFunction(numerator, denominator), torque - torque[0], TIME)[1]
-        return np.asarray(torque[0] * numerator[-1] / denominator[-1] + shown)
-
-    return experiments(meter=meter)
 
 
 def polynomials(told: str) -> list[list[float]]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, model
+from cases import EVENT, FREE, SIGMA, TIME, TRUE, experiments, model
+from meters import noisy, records
 from refits import answered, beside, plain
 from scipy.integrate import solve_ivp
 
-from hvdc_ident import Experiment, InputSignal, Trajectory, simulate
+from hvdc_ident import InputSignal, simulate
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.adequacy import loud_after_breaks
 from hvdc_ident.discrepancy.akin import as_late, carried, with_begun
@@ -37,25 +38,6 @@ WINDOW = 0.05
 def beginning(before: Refit, effect: str, at: str, values: dict[str, float]) -> Job:
     """The refit of the drive with one effect, from a size."""
     return beside(before, effect, at, values, dict.fromkeys((n for n in values if n != "compute"), (1e-3, 0.3)))
-
-
-def records(course: Callable[[dict[str, InputSignal]], Array]) -> tuple[Experiment, ...]:
-    """What `course` (inputs to (n, 2) speed and torque) makes of the three runs, with white noise."""
-    random = np.random.default_rng(0)
-    found = []
-    for name, (role, moves) in RUNS.items():
-        inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
-        measured = noisy(course(inputs), random)
-        found.append(
-            Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
-        )
-    return tuple(found)
-
-
-def noisy(y: Array, random: np.random.Generator) -> Trajectory:
-    """The course of speed and torque as it is recorded."""
-    seen = y + random.standard_normal(y.shape) * list(SIGMA.values())
-    return Trajectory(TIME, seen, tuple(SIGMA), ("", ""))
 
 
 def sampled(inputs: dict[str, InputSignal]) -> Array:

@@ -57,6 +57,8 @@ def linear(numerator, denominator):
         ("inductance", {"L": 0.02, "R": 0.5}, [1.0], [0.04, 1.0]),
         ("second-order", {"wn": 60.0, "zeta": 0.3}, [60.0**2], [1.0, 36.0, 60.0**2]),
         ("second-order", {"wn": 60.0, "zeta": 1.4}, [60.0**2], [1.0, 168.0, 60.0**2]),
+        ("inner-loop", {"wn": 60.0, "zeta": 0.3}, [36.0, 60.0**2], [1.0, 36.0, 60.0**2]),
+        ("inner-loop", {"wn": 60.0, "zeta": 1.4}, [168.0, 60.0**2], [1.0, 168.0, 60.0**2]),
         ("lead-lag", {"T1": 0.05, "T2": 0.02}, [0.05, 1.0], [0.02, 1.0]),
         ("lead-lag", {"T1": 0.005, "T2": 0.02}, [0.005, 1.0], [0.02, 1.0]),
     ],
@@ -190,6 +192,7 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
         ("lag", {"T": 0.02}, lambda s: 1 / (1 + 0.02 * s)),
         ("inductance", {"L": 0.02, "R": 4.0}, lambda s: 1 / (1 + 0.005 * s)),
         ("second-order", {"wn": 50.0, "zeta": 0.2}, lambda s: 2500 / (s * s + 20 * s + 2500)),
+        ("inner-loop", {"wn": 50.0, "zeta": 0.2}, lambda s: (2500 + 20 * s) / (s * s + 20 * s + 2500)),
         ("lead-lag", {"T1": 0.03, "T2": 0.01}, lambda s: (1 + 0.03 * s) / (1 + 0.01 * s)),
         (
             "filter",
@@ -304,11 +307,12 @@ LATE = {
     "window-mean": {"T": 0.02},
     "sample-hold": {"Ts": 0.02, "compute": 0.005},
     "second-order": {"wn": 80.0, "zeta": 0.6},
+    "inner-loop": {"wn": 80.0, "zeta": 0.6},
     "lead-lag": {"T1": 0.01, "T2": 0.03},
 }
 
 
-@pytest.mark.parametrize("name", [n for n, e in effects().items() if e.late])
+@pytest.mark.parametrize("name", [n for n, e in effects().items() if e.late is not None])
 def test_how_late_a_slow_signal_comes(name: str) -> None:
     """Behind a ramp of slope 1 the effect's output lags by as much, on average over a sampling period."""
     late = effects()[name].late

@@ -71,10 +71,10 @@ def test_figure_8_follows_from_what_was_put_in():
 
 
 def test_the_diagnosed_records_are_five_to_fit_and_three_held_out():
-    for outputs in WHY.diagnosed.RECORDED.values():
-        found = WHY.diagnosed.experiments(outputs)
+    for asked in WHY.diagnosed.TOLD_NOTHING.values():
+        found = WHY.diagnosed.experiments(asked.outputs)
         assert [e.role for e in found].count("fit") == 5 and [e.role for e in found].count("holdout") == 3
-        assert all(e.outputs == tuple(outputs) for e in found)
+        assert all(e.outputs == asked.outputs for e in found)
 
 
 @needs_tools

@@ -11,10 +11,13 @@ from common.ending import markdown, number
 
 from bias import diagnosed, hypotheses
 
+COLOURS = ("#1f5fa8", "#3a9d5d", "#a03a8c")
+"""Of the augmented links, by what was asked."""
+
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
     """The README's tables by name."""
-    told = values["told nothing"]
+    told = values["told nothing"] | values["offered"]
     return {
         "verdicts": _verdicts(told, values["louder"]),
         "places": "\n\n".join(f"{signals}:\n\n{_places(t)}" for signals, t in told.items()),
@@ -38,7 +41,7 @@ def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
     ]
     rows = []
     for signals, t in told.items():
-        for noise, found in {f"{diagnosed.NOISE:g}": t, **louder[signals]}.items():
+        for noise, found in {f"{diagnosed.NOISE:g}": t, **louder.get(signals, {})}.items():
             delay = diagnosed.delay(diagnosed.sized(found))
             rows.append(
                 [
@@ -151,14 +154,12 @@ def _bias(axes: Any, told: Mapping[str, Any]) -> None:
     series = {"the paper": {n: paper.TABLE_3[n]["II"]["mean"] for n in diagnosed.FREE}, "plain link": first["refitted"]}
     series |= {f"augmented: {signals}": t["augmented"] for signals, t in told.items()}
     width = 0.8 / len(series)
-    for k, ((name, gains), colour) in enumerate(
-        zip(series.items(), ("#d08020", "#888888", "#1f5fa8", "#3a9d5d"), strict=True)
-    ):
+    for k, ((name, gains), colour) in enumerate(zip(series.items(), ("#d08020", "#888888", *COLOURS), strict=True)):
         bias = [100 * (gains[n] / paper.TABLE_1[n] - 1) for n in diagnosed.FREE]
         axes.bar(np.arange(len(bias)) + k * width, bias, width, label=name, color=colour)
     axes.axhline(0, color="black", lw=0.8)
     axes.set(ylabel="off Table I, %")
-    axes.set_xticks(np.arange(len(diagnosed.FREE)) + 1.5 * width, diagnosed.FREE)
+    axes.set_xticks(np.arange(len(diagnosed.FREE)) + (len(series) - 1) / 2 * width, diagnosed.FREE)
     axes.margins(y=0.5)  # room for the legend
     axes.legend(fontsize=8, loc="upper left")
 
@@ -166,7 +167,7 @@ def _bias(axes: Any, told: Mapping[str, Any]) -> None:
 def _curves(axes: Any, lines: Mapping[str, Any]) -> None:
     plain = next(iter(lines.values()))["plain link"]
     axes.plot([float(k) for k in plain], [1e3 * v for v in plain.values()], color="#888888", label="plain link")
-    for (signals, by), colour in zip(lines.items(), ("#1f5fa8", "#3a9d5d"), strict=True):
+    for (signals, by), colour in zip(lines.items(), COLOURS, strict=True):
         line = by["augmented link"]
         axes.plot(
             [float(k) for k in line], [1e3 * v for v in line.values()], color=colour, label=f"augmented: {signals}"

@@ -1,0 +1,49 @@
+"""A closed loop with integral action: y'' = wn^2 (u - y) + 2 zeta wn (u' - y')."""
+
+import math
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.frozen import FrozenMap
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """y of the pair y' = wn (i + 2 zeta (u - y)), i' = wn (u - y): i, the integral's part, is in the unit of y."""
+    wn, zeta = p["wn"], p["zeta"]
+    y, _ = add.states(("y", "i"), lambda s: (wn * (s[1] + 2 * zeta * (u - s[0])), wn * (u - s[0])))
+    return y
+
+
+EFFECT = Effect(
+    name="inner-loop",
+    summary="closed loop with integral action, y'' = wn^2 (u - y) + 2 zeta wn (u' - y')",
+    parameters=FrozenMap(
+        {
+            "wn": EffectParameter(
+                1000.0,
+                neutral=math.inf,
+                unit="rad/s",
+                min=1e-9,
+                description="natural frequency",
+                measure="rate",
+                probes=(0.7, 0.45, 0.2),
+            ),
+            "zeta": EffectParameter(0.7, description="damping ratio", probes=(0.4, 1.0), search=(0.02, 5.0)),
+        }
+    ),
+    rewrite=rewrite,
+    late=lambda p: 0.0,
+    sentence="{at} is reached through a loop with integral action of {wn} and damping {zeta}",
+    excited_by="a step through the slot, recorded at several samples per 1/wn",
+    example=FrozenMap({"wn": 400.0, "zeta": 0.7}),
+    states="y and the integral's part i, one pair a slot",
+    sought=False,
+    confusable=FrozenMap(
+        {
+            "second-order": "excitation up to wn: the loop answers at once, overshoots, and slow signals pass it undelayed",
+            "lag": "a ramp: behind the loop nothing stays of a lag's error",
+        }
+    ),
+)
