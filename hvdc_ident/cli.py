@@ -450,10 +450,12 @@ def models(json: Json = False, quiet: Quiet = False) -> None:
 @app.command()
 @guarded
 def effects(json: Json = False, quiet: Quiet = False) -> None:
-    """The catalogue of effects, one line each, with sizes that show on a per-unit signal."""
+    """The catalogue of effects, one line each, with sizes that show on a per-unit signal. Those that `diagnose` tries
+    only where they are named say so."""
     from hvdc_ident.effects import effects as known
 
-    lines = {name: effect.summary if json else f"{effect.summary}; {effect.shown}" for name, effect in known().items()}
+    asked = {name: "" if e.sought else " (diagnose: tried where it is named)" for name, e in known().items()}
+    lines = {name: e.summary if json else f"{e.summary}; {e.shown}{asked[name]}" for name, e in known().items()}
     _catalogue("effects", lines, json=json)
 
 
