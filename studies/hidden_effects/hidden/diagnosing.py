@@ -88,7 +88,8 @@ def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
         "truth": case.truth,
     }
     model, experiments, free = model_of(design.plant), experiments_of(case), free_of(case)
-    tried: Any = [n for n in effects() if n not in design.effects] if design.part == "left-out" else "all"
+    others = [n for n, e in effects().items() if e.sought and n not in design.effects]
+    tried: Any = others if design.part == "left-out" else "all"
     begin = time.perf_counter()
     try:
         found = diagnose(model, experiments, free, effects=tried, seed=seed)
