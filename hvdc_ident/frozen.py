@@ -29,7 +29,12 @@ class FrozenMap(Mapping[str, V]):
     def __contains__(self, name: object) -> bool:
         return name in self._items
 
-    # The mixin's views go through __iter__ and __getitem__ for every item.
+    # The mixin's methods go through __iter__ and __getitem__ for every item.
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, FrozenMap):
+            return self is other or self._items == other._items
+        return super().__eq__(other)
+
     def keys(self) -> KeysView[str]:
         return self._items.keys()
 

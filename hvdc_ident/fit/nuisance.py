@@ -126,37 +126,48 @@ def observe(
     Raises SimulationError where the run fails, has no steady start or returns a value that is not finite.
     """
     given = dict(nuisance or {})
-    tau = given.get(TIME_SHIFT, 0.0)
-    grid, rows = _shifted(experiment.time, tau)
-    asked = experiment if tau == 0.0 else _on(grid, experiment)
-    own = {n: v for n, v in given.items() if n in simulator.parameters}
-    starts = {n: v for n, v in given.items() if n in _states(simulator) and n not in own}
-    offsets = {n: v for n, v in given.items() if n != TIME_SHIFT and n not in own and n not in starts}
-    if starts:
-        asked = asked.with_(starts=asked.starts | starts)
-    if offsets:
-        asked = asked.with_(offsets=asked.offsets | {n: asked.offsets.get(n, 0.0) + v for n, v in offsets.items()})
+    asked, own, rows = _asked(simulator, experiment, given) if given else (experiment, {}, None)
     wanted = (*sensitivities, *(n for n in given if n != TIME_SHIFT)) if derivatives else ()
     try:
         run = simulator.simulate(asked, {**values, **own}, wanted)
     except SteadyStateError as error:
         raise SimulationError(f"no steady start: {error}") from error
-    before = experiment.time - tau < experiment.time[0]
-    place = len(sensitivities) + list(given).index(TIME_SHIFT) if TIME_SHIFT in given else -1
-    outputs: dict[str, Array] = {}
-    gradients: dict[str, Array] = {}
-    for output in experiment.outputs:
-        y = np.asarray(run.trajectory[output], dtype=float)
-        dy = np.asarray(run.gradient(output), dtype=float) if wanted else np.empty((y.size, 0))
-        outputs[output], gradients[output] = y[rows], dy[rows]
-        if derivatives and place >= 0:
-            slope = np.where(before, 0.0, -_slope(grid, y, experiment)[rows])
-            gradients[output] = np.insert(gradients[output], place, slope, axis=1)
-        if not (np.isfinite(outputs[output]).all() and np.isfinite(gradients[output]).all()):
+    outputs = {o: np.asarray(run.trajectory[o], dtype=float) for o in experiment.outputs}
+    none = np.empty((asked.time.size, 0))
+    gradients = {o: np.asarray(run.gradient(o), dtype=float) if wanted else none for o in experiment.outputs}
+    if rows is not None:
+        gradients = {o: g[rows] for o, g in gradients.items()}
+        if derivatives:
+            place = len(sensitivities) + list(given).index(TIME_SHIFT)
+            before = experiment.time - given[TIME_SHIFT] < experiment.time[0]
+            slopes = {o: np.where(before, 0.0, -_slope(asked.time, y, experiment)[rows]) for o, y in outputs.items()}
+            gradients = {o: np.insert(g, place, slopes[o], axis=1) for o, g in gradients.items()}
+        outputs = {o: y[rows] for o, y in outputs.items()}
+    for output, y in outputs.items():
+        if not (np.isfinite(y).all() and (not derivatives or np.isfinite(gradients[output]).all())):
             raise SimulationError(
                 f"output '{output}' or its sensitivity is not finite", where=f"experiment '{experiment.name}'"
             )
     return Observation(outputs, gradients)
+
+
+def _asked(
+    simulator: Simulator, experiment: Experiment, given: Mapping[str, float]
+) -> tuple[Experiment, dict[str, float], NDArray[np.intp] | None]:
+    """What is run for an experiment with nuisances: it, the parameters it has of its own, and with a late clock for each row
+    the place of its instant."""
+    own = {n: v for n, v in given.items() if n in simulator.parameters}
+    starts = {n: v for n, v in given.items() if n in _states(simulator) and n not in own}
+    offsets = {n: v for n, v in given.items() if n != TIME_SHIFT and n not in own and n not in starts}
+    asked, rows = experiment, None
+    if TIME_SHIFT in given:
+        grid, rows = _shifted(experiment.time, given[TIME_SHIFT])
+        asked = experiment if given[TIME_SHIFT] == 0.0 else _on(grid, experiment)
+    if starts:
+        asked = asked.with_(starts=asked.starts | starts)
+    if offsets:
+        asked = asked.with_(offsets=asked.offsets | {n: asked.offsets.get(n, 0.0) + v for n, v in offsets.items()})
+    return asked, own, rows
 
 
 def _shifted(time: Array, tau: float) -> tuple[Array, NDArray[np.intp]]:

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -16,7 +17,7 @@ from hvdc_ident.fit.loss import LOSSES, Loss
 from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
 from hvdc_ident.fit.nuisance import unknown_of, unknowns
 from hvdc_ident.fit.prior import Prior, prior_rows
-from hvdc_ident.fit.residual import Block, Treatment, residual_blocks
+from hvdc_ident.fit.residual import Block, Record, Treatment, records, residual_blocks
 from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band
@@ -67,6 +68,10 @@ class Problem:
         for name in ("held", "why", "conditional_on", "rho", "weights", "priors", "rounding"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         self._check()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Only the definition travels to another process: the rest is worked out anew there."""
+        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
 
     def _check(self) -> None:
         known = self.simulator.parameters
@@ -159,21 +164,27 @@ class Problem:
         even where the fit is of spectra. Raises SimulationError where a run fails: theta is then inadmissible.
         """
         treatment = replace(self.treatment, band=None) if in_time else self.treatment
-        names = self.names
+        width = len(self.names)
         parts: list[Block] = []
         for e in self.fitted_experiments:
-            local = [*(f.name for f in self.free), *(unknown_of(e.name, n) for n in e.nuisance)]
-            columns = [names.index(n) for n in local]
+            columns = self._columns[e.name]
             found = self._experiment(e, theta, derivatives, treatment)
-            if derivatives and len(local) == len(names):  # every unknown is one of this experiment's, in their order
-                parts += found
-                continue
-            for block in found:
-                jacobian = np.zeros((block.residual.size, len(names)))
-                if derivatives:
-                    jacobian[:, columns] = block.jacobian
-                parts.append(replace(block, jacobian=jacobian))
+            # Where every unknown is one of this experiment's they are in their order.
+            whole = derivatives and len(columns) == width
+            parts += found if whole else [b.among(columns if derivatives else (), width) for b in found]
         return tuple(parts)
+
+    @cached_property
+    def _columns(self) -> dict[str, list[int]]:
+        """By experiment the places among all unknowns of those that it answers."""
+        free = [f.name for f in self.free]
+        local = {e.name: [*free, *(unknown_of(e.name, n) for n in e.nuisance)] for e in self.fitted_experiments}
+        return {name: [self.names.index(n) for n in own] for name, own in local.items()}
+
+    @cached_property
+    def _records(self) -> dict[str, tuple[Record, ...]]:
+        """By fitted experiment what of its records is compared with every run."""
+        return {e.name: records(e, self.guard) for e in self.fitted_experiments}
 
     def starts(self, theta: Array) -> Array:
         """(N, k): how the residuals answer the states' starts that are not known, one column a state and experiment."""
@@ -187,7 +198,7 @@ class Problem:
         def blocks(at: Experiment) -> tuple[Block, ...]:
             return residual_blocks(
                 self.simulator, at, own, loose, self.sigma[e.name], nuisance=nuisance,
-                treatment=treatment or self.treatment,
+                treatment=treatment or self.treatment, compared=self._compared(e, treatment or self.treatment),
             )  # fmt: skip
 
         at = centred(self.simulator, e, own, loose, nuisance) if loose else e
@@ -208,10 +219,17 @@ class Problem:
             treatment=treatment,
             derivatives=derivatives,
             loose=loose,
+            compared=self._compared(e, treatment),
         )
+
+    def _compared(self, e: Experiment, treatment: Treatment) -> tuple[Record, ...] | None:
+        """The records of an experiment, where it is one of the fit and compared as there."""
+        return self._records.get(e.name) if treatment.guard == self.guard else None
 
     def nuisances(self, e: Experiment, theta: Array) -> dict[str, float]:
         """The value of each nuisance of an experiment of the fit; a held-out one has none."""
+        if not e.nuisance:
+            return {}
         at = dict(zip(self.names, theta, strict=True))
         return {n: float(at[k]) for n in e.nuisance if (k := unknown_of(e.name, n)) in at}
 

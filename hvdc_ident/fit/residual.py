@@ -50,6 +50,16 @@ class Block:
         """Root mean square of the misfit, in the output's unit."""
         return float(np.sqrt(np.mean(self.misfit**2)))
 
+    def among(self, columns: Sequence[int], width: int) -> Block:
+        """The block with a jacobian of `width` columns, its own at these places, if any, and 0 elsewhere."""
+        jacobian = np.zeros((self.residual.size, width))
+        if columns:
+            jacobian[:, columns] = self.jacobian
+        return Block(
+            self.experiment, self.output, self.rows, self.misfit, self.sigma, self.residual, jacobian, self.taken,
+            self.slope, self.spare,
+        )  # fmt: skip
+
     @property
     def squares(self) -> Array:
         """(n,) squared residuals, of mean 1 under noise: their sums differ from -2 log likelihood by a constant."""
@@ -86,6 +96,32 @@ def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> ND
             got=f"window {experiment.window}, guard {guard:g} s",
         )
     return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What of an output's record is compared with every run: (m,) rows, and values in its unit at instants in s.
+
+    whole: whether it is every row.
+    """
+
+    output: str
+    rows: NDArray[np.intp]
+    values: Array
+    time: Array
+    whole: bool
+
+
+def records(experiment: Experiment, guard: float = 0.0) -> tuple[Record, ...]:
+    """One record for each measured output. guard: as in `compared_rows`. Raises StudyError where nothing can be compared."""
+    return tuple(_record(experiment, o, guard) for o in experiment.outputs)
+
+
+def _record(experiment: Experiment, output: str, guard: float) -> Record:
+    rows = compared_rows(experiment, output, guard)
+    assert experiment.measured is not None
+    values, time = experiment.measured[output][rows], experiment.time[rows]
+    return Record(output, rows, values, time, rows.size == experiment.time.size)
 
 
 @dataclass(frozen=True)
@@ -126,11 +162,13 @@ def residual_blocks(
     treatment: Treatment | None = None,
     derivatives: bool = True,
     loose: Sequence[str] = (),
+    compared: Sequence[Record] | None = None,
 ) -> tuple[Block, ...]:
     """One block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
 
     sigma: standard deviation by output, in its unit. derivatives: whether jacobians are wanted; else they have no column.
     loose: states, given starts by the experiment, that are taken for unknown and eliminated (`fit.unsettled`).
+    compared: the experiment's records with the treatment's guard, where they are at hand.
     Raises SimulationError where the run fails, StudyError where nothing can be compared.
     """
     treatment = treatment or Treatment()
@@ -139,23 +177,22 @@ def residual_blocks(
     given = dict(nuisance or {})
     seen = observe(simulator, experiment, values, (*wanted, *loose), given, derivatives=derivatives or bool(loose))
     blocks, raw = [], []
-    for output in experiment.outputs:
-        rows = compared_rows(experiment, output, treatment.guard)
-        assert experiment.measured is not None
-        misfit = experiment.measured[output][rows] - seen.values[output][rows]
-        weight, time, where = sigma[output], experiment.time[rows], f"experiment '{experiment.name}'"
-        slopes = -seen.gradient[output][rows]
+    for record in compared if compared is not None else records(experiment, treatment.guard):
+        output, weight = record.output, sigma[record.output]
+        y, dy = seen.values[output], seen.gradient[output]
+        misfit = record.values - (y if record.whole else y[record.rows])
+        slopes = -(dy if record.whole else dy[record.rows])
         rounding = treatment.rounded(output)
         if rounding is not None:
             residual, slope = rounding.residual(misfit)
             jacobian, spare = slopes * slope[:, None], rounding.spare
         else:
-            both = np.empty((rows.size, 1 + slopes.shape[1]))
+            both = np.empty((misfit.size, 1 + slopes.shape[1]))
             both[:, 0], both[:, 1:] = misfit / weight, slopes / weight
-            treated = treatment.applied(both, time, output, where)
+            treated = treatment.applied(both, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
         block = Block(
-            experiment.name, output, rows, misfit, weight, residual, jacobian, slope=slope, spare=spare
+            experiment.name, output, record.rows, misfit, weight, residual, jacobian, slope=slope, spare=spare
         )  # fmt: skip
         blocks.append(block)
         raw.append(slopes[:, k : k + len(loose)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -363,9 +364,9 @@ def simulate(
     plant, parameter = with_own(plant, [n for n in (*plant.inputs, *plant.states) if n in own or n in sensitivities])
     given |= {parameter[n]: v for n, v in own.items()}
     code = engine(plant, [parameter.get(n, n) for n in sensitivities], outputs)
-    p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
-    if not np.isfinite(p).all():
-        bad = [n for n, v in zip(plant.parameters, p, strict=True) if not np.isfinite(v)]
+    p = [float(given.get(n, q.value)) for n, q in plant.parameters.items()]
+    if not all(map(math.isfinite, p)):
+        bad = [n for n, v in zip(plant.parameters, p, strict=True) if not math.isfinite(v)]
         raise ModelError(
             f"the value of parameter '{bad[0]}' is not finite",
             where=f"model '{model.name}'",
@@ -373,9 +374,9 @@ def simulate(
         )
     signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
     tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
-    scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities] or [1.0])
+    scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities]) if sensitivities else None
     try:
-        out, statistics = code.run(p, signals, experiment.time, tol, method, scale)
+        out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale)
     except (SimulationError, SteadyStateError) as e:
         raise e.at(f"experiment '{experiment.name}'") from None
     return _simulation(plant, code, experiment, out, statistics, tuple(sensitivities))

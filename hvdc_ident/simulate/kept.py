@@ -20,7 +20,9 @@ class _Key:
     others: tuple[Any, ...]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self.others == other.others and self.model.structure == other.model.structure
+        if not isinstance(other, _Key) or self.others != other.others:
+            return False
+        return self.model is other.model or self.model.structure == other.model.structure
 
     def __hash__(self) -> int:
         return hash((self.model.structure, self.others))

@@ -14,6 +14,8 @@ from hvdc_ident.simulate.linear import lu, solve
 from hvdc_ident.simulate.rest import REST_JAC, residual
 from hvdc_ident.simulate.structure import ACCURACY, TINY
 
+EPSILON = float(np.finfo(float).eps)
+
 
 @kernel()
 def equations(address, y, w, wd, p, m, inner, first, v, r, jac):  # type: ignore[no-untyped-def]
@@ -187,7 +189,20 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
                 if h < 1e-12:
                     return
 
-    return follow, nearest, slide
+    @njit(cache=True, error_model="numpy")
+    def judge(address, inner, nu, y, w, p, m, size, v, r, jac, shares):  # type: ignore[no-untyped-def]
+        """Writes the rest residual at v (n,) into r (n,), its Jacobian into jac (n, n), zeros where that has none, and into
+        shares (n,) the residuals by their own measures, less what rounding alone leaves."""
+        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  as above
+        equations(address, y, w, wd, p, m, inner, 1 + nu, v, r, jac)
+        measures(jac, v, size, shares)
+        for i in range(n):
+            rounding = 0.0
+            for j in range(n):
+                rounding += abs(jac[i, j]) * abs(v[j])
+            shares[i] = 0.0 if abs(r[i]) <= 16.0 * EPSILON * rounding else abs(r[i]) / shares[i]
+
+    return follow, nearest, slide, judge
 
 
-follow, nearest, slide = _entries(stamp())
+follow, nearest, slide, judge = _entries(stamp())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.simulate.structure import ACCURACY, TINY, Structure
+from hvdc_ident.simulate.structure import ACCURACY, Structure
 from hvdc_ident.trajectory import Array
 
 CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
@@ -20,23 +20,14 @@ def fallback(
     """The flat vectors y and w of the steady state, or SteadyStateError with the worst equation named."""
     # Compiled when it is needed first: who never needs it does not wait for the compiler.
     from hvdc_ident.simulate.machine import evaluate
-    from hvdc_ident.simulate.patient import follow, nearest, slide
-    from hvdc_ident.simulate.rest import MODES, RESIDUAL, REST_JAC, REST_P
+    from hvdc_ident.simulate.patient import follow, judge, nearest, slide
+    from hvdc_ident.simulate.rest import REST_P
 
     s = structure.sizes
     inner, extra = s.nx + s.nz, s.nd + s.nq
     n = inner + extra
     y, w, m = np.zeros(inner * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width)), np.zeros(max(s.ns, 1))
     w[0], w[1 : 1 + s.nu] = time, u
-
-    def equations(v: Array) -> tuple[Array, Array]:
-        y[:inner], w[1 + s.nu : 1 + s.nu + extra] = v[:inner], v[inner:]
-        r, jac = np.zeros(n), np.zeros(n * n)
-        evaluate(address[MODES], y, w, p, m, m)
-        evaluate(address[RESIDUAL], y, w, p, m, r)
-        evaluate(address[REST_JAC], y, w, p, m, jac)
-        return r, jac.reshape(n, n)
-
     near = _Region.of(structure, guess, extra)
     begin = np.concatenate([guess, np.zeros(extra)])
     model = (y, w, np.ascontiguousarray(p, dtype=float), m, near.size)
@@ -51,18 +42,24 @@ def fallback(
     def slid(v: Array) -> None:
         slide(address, inner, s.nu, s.nx, *model, v)
 
+    def judged(v: Array) -> tuple[Array, Array, Array]:
+        r, jac, shares = np.zeros(n), np.zeros((n, n)), np.zeros(n)
+        judge(address, inner, s.nu, *model, v, r, jac, shares)
+        return r, jac, shares
+
     ends: list[Array] = []
     with np.errstate(all="ignore"):
         # The rest next to the guess comes first; where there are several, following the model may end at a far one.
         for way in (closest, followed, slid):
             v = begin.copy()
             way(v)
-            r, jac = equations(v)
-            if near.is_rest(r, jac, v):
+            _, jac, shares = judged(v)
+            if near.is_rest(shares, v):
                 break
             ends.append(v)
         else:
-            raise _refused(structure, near, *equations(ends[1]), ends[1])  # where the model went is what tells most
+            r, _, shares = judged(ends[1])  # where the model went is what tells most
+            raise _refused(structure, near, r, shares, ends[1])
     if s.width:
         rows = np.zeros(n * s.width)
         evaluate(address[REST_P], y, w, p, m, rows)
@@ -91,27 +88,13 @@ class _Region:
         unknown = np.full(rest.size + extra, np.inf)
         return cls(np.concatenate([sizes, rest, np.full(extra, 1 / CLOSE)]), np.concatenate([limits, unknown]))
 
-    def weights(self, jac: Array, v: Array) -> Array:
-        """What each equation's residual is measured by."""
-        return _positive(np.abs(jac) @ np.clip(np.abs(v), TINY, self.size))
-
-    def shares(self, r: Array, jac: Array, v: Array) -> Array:
-        """The scaled residuals, less what rounding alone leaves."""
-        rounding = 16 * np.finfo(float).eps * (np.abs(jac) @ np.abs(v))
-        return np.asarray(np.where(np.abs(r) <= rounding, 0.0, np.abs(r) / self.weights(jac, v)))
-
-    def is_rest(self, r: Array, jac: Array, v: Array) -> bool:
-        """Whether v solves the equations, within the limits."""
-        return bool((self.shares(r, jac, v) < ACCURACY).all() and (np.abs(v) <= self.limit).all())
+    def is_rest(self, shares: Array, v: Array) -> bool:
+        """Whether v solves the equations, by the scaled residuals there, within the limits."""
+        return bool((shares < ACCURACY).all() and (np.abs(v) <= self.limit).all())
 
 
-def _positive(size: Array) -> Array:
-    return np.where(size > 0, size, 1.0)
-
-
-def _refused(structure: Structure, near: _Region, r: Array, jac: Array, v: Array) -> SteadyStateError:
+def _refused(structure: Structure, near: _Region, r: Array, shares: Array, v: Array) -> SteadyStateError:
     """The error that names the state that runs away, or else the worst equation."""
-    shares = near.shares(r, jac, v)
     worst = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
     got = f"{_equation(structure, worst)} left with {r[worst]:.3g} (scaled {shares[worst]:.2g})"
     far = np.abs(v) / near.limit
