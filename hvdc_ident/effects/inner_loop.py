@@ -30,16 +30,15 @@ EFFECT = Effect(
                 measure="rate",
                 probes=(0.7, 0.45, 0.2),
             ),
-            "zeta": EffectParameter(0.7, description="damping ratio", probes=(0.4, 1.0), search=(0.02, 5.0)),
+            # Damped by much more a loop is a lag, and a slow rest of next to nothing beside it.
+            "zeta": EffectParameter(0.7, description="damping ratio", probes=(0.4, 1.0), search=(0.02, 1.5)),
         }
     ),
     rewrite=rewrite,
-    late=lambda p: 0.0,
     sentence="{at} is reached through a loop with integral action of {wn} and damping {zeta}",
     excited_by="a step through the slot, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.7}),
     states="y and the integral's part i, one pair a slot",
-    sought=False,
     confusable=FrozenMap(
         {
             "second-order": "excitation up to wn: the loop answers at once, overshoots, and slow signals pass it undelayed",

@@ -89,15 +89,15 @@ def causes(names: Sequence[str] = (), count: int = hypotheses.RUNS, executor: An
 
 def told_nothing(executor: Any = None) -> dict[str, Any]:
     """The diagnoses by what was asked, told nothing with more noise too, and Fig. 8 with what was named."""
-    found, offered = (
+    found, finer = (
         {name: diagnosed.diagnosis(name, executor=executor) for name in asked}
-        for asked in (diagnosed.TOLD_NOTHING, diagnosed.OFFERED)
+        for asked in (diagnosed.TOLD_NOTHING, diagnosed.FINER)
     )
     louder = {
         name: {f"{noise:g}": diagnosed.diagnosis(name, noise=noise, executor=executor) for noise in diagnosed.LOUDER}
         for name in found
     }
-    return {"told nothing": found, "louder": louder, "offered": offered} | after(found | offered)
+    return {"told nothing": found, "louder": louder, "finer": finer} | after(found | finer)
 
 
 def after(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -62,6 +62,7 @@ TOGETHER = {
     "sample-hold": ("Pm", "", {"Ts": 0.0124, "compute": 0.0042}, 1e-4),
     "saturation": ("current", "", {"level": 1.5}, 1e-4),
     "second-order": ("order", "", {"wn": 150.0, "zeta": 0.4}, 1e-4),
+    "inner-loop": ("current", "", {"wn": 120.0, "zeta": 0.5}, 1e-4),
     "window-mean": ("Pm", "", {"T": 0.02}, 1e-3),
 }
 
@@ -194,7 +195,7 @@ def test_designs_are_seeded_and_balanced():
             levels = [getattr(d, key) for d in of]
             assert max(map(levels.count, set(levels))) - min(map(levels.count, set(levels))) <= 1
     clean = cases.designs("clean", 3)
-    assert len({(d.effects, d.plant, d.size, d.noise) for d in cases.factorial(3)}) == (2 * 20 - 1) * 4 * 3
+    assert len({(d.effects, d.plant, d.size, d.noise) for d in cases.factorial(3)}) == (2 * 21 - 1) * 4 * 3
     assert {d.noise for d in clean} == {*noise.KINDS, *noise.WRONG, "unreached"}
 
 

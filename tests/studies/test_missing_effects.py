@@ -71,7 +71,7 @@ def test_figure_8_follows_from_what_was_put_in():
 
 
 def test_the_diagnosed_records_are_five_to_fit_and_three_held_out():
-    for asked in WHY.diagnosed.TOLD_NOTHING.values():
+    for asked in WHY.diagnosed.ASKED.values():
         found = WHY.diagnosed.experiments(asked.outputs)
         assert [e.role for e in found].count("fit") == 5 and [e.role for e in found].count("holdout") == 3
         assert all(e.outputs == asked.outputs for e in found)

@@ -25,7 +25,7 @@ FIRM = 1.0
 """Units by which the answer may change at half the step."""
 LOUDNESS = (math.log(2e-3), math.log(2e-2))
 """Of the noise: its standard deviation in shares of an output's range, as logarithms."""
-PARTS = {"single": 340, "pair": 60, "clean": 400, "outside": 50, "left-out": 60}
+PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60}
 """How many cases each part has."""
 
 

@@ -19,9 +19,10 @@ SUMS: Mapping[str, Sequence[set[str]]] = {
 """Slots that only enter one sum together: what is added at one might as well be added at another."""
 ADDED = ("offset", "disturbance", "coupling", "droop", "conductance", "loss")
 MAIN = {
-    "lag": "T", "delay": "T", "window-mean": "T", "sample-hold": "Ts", "second-order": "wn", "lead-lag": "T1", "limit": "level",
-    "saturation": "level", "rate-limit": "rate", "deadband": "width", "backlash": "width", "quantisation": "step", "gain": "k",
-    "offset": "c", "coupling": "k", "droop": "k", "conductance": "g", "inductance": "L", "disturbance": "amplitude",
+    "lag": "T", "delay": "T", "window-mean": "T", "sample-hold": "Ts", "second-order": "wn", "inner-loop": "wn",
+    "lead-lag": "T1", "limit": "level", "saturation": "level", "rate-limit": "rate", "deadband": "width",
+    "backlash": "width", "quantisation": "step", "gain": "k", "offset": "c", "coupling": "k", "droop": "k",
+    "conductance": "g", "inductance": "L", "disturbance": "amplitude",
 }  # fmt: skip
 """The parameter that measures the effect."""
 OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")

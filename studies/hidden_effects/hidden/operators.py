@@ -152,6 +152,22 @@ class SecondOrder(Operator):
         return [z[1], wn * wn * (u - z[0]) - 2.0 * self.p["zeta"] * wn * z[1]]
 
 
+class InnerLoop(Operator):
+    """A feedback of proportional and integral action around an integrator, in the form of an observer."""
+
+    states = 2
+
+    def begin(self, u, other):  # type: ignore[no-untyped-def]
+        return [u.copy(), np.zeros_like(u)]
+
+    def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
+        return z[0]
+
+    def rates(self, u, z):  # type: ignore[no-untyped-def]
+        wn, off = self.p["wn"], u - z[0]
+        return [z[1] + 2.0 * self.p["zeta"] * wn * off, wn * wn * off]
+
+
 class LeadLag(Operator):
     states = 1
 
@@ -342,6 +358,7 @@ CATALOGUE: dict[str, type[Operator]] = {
     "droop": Droop,
     "gain": Gain,
     "inductance": Inductance,
+    "inner-loop": InnerLoop,
     "lag": Lag,
     "lead-lag": LeadLag,
     "limit": Limit,

@@ -61,6 +61,7 @@ SPANS: Mapping[str, tuple[float, float]] = {
     "window-mean": (4e-4, 0.3),
     "sample-hold": (1e-3, 0.2),
     "second-order": (2e-4, 0.1),
+    "inner-loop": (4e-4, 0.2),
     "lead-lag": (0.01, 0.9),
     "limit": (0.02, 0.9),
     "saturation": (0.05, 1.5),
@@ -73,7 +74,7 @@ SPANS: Mapping[str, tuple[float, float]] = {
 }
 """From the smallest to the largest size tried, in what `parameters` counts sizes in; (1e-3, 1) where not listed."""
 
-TIMES = ("lag", "delay", "window-mean", "sample-hold", "second-order", "inductance")
+TIMES = ("lag", "delay", "window-mean", "sample-hold", "second-order", "inner-loop", "inductance")
 """Sized by a time, which the simulator's step bounds from below."""
 
 
@@ -90,6 +91,8 @@ def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, re
             return {"Ts": (1 + LATE) * STEP * (2 * np.round((x / STEP - 1) / 2) + 1), "compute": 0 * one}
         case "second-order":
             return {"wn": 1 / x, "zeta": rng.uniform(0.2, 0.9) * one}
+        case "inner-loop":
+            return {"wn": 1 / x, "zeta": rng.uniform(0.3, 1.2) * one}
         case "lead-lag":
             t2 = rng.uniform(0.01, 0.04) * one
             return {"T1": t2 * (1 + sign * x), "T2": t2}

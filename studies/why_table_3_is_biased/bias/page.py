@@ -17,7 +17,7 @@ COLOURS = ("#1f5fa8", "#3a9d5d", "#a03a8c")
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
     """The README's tables by name."""
-    told = values["told nothing"] | values["offered"]
+    told = values["told nothing"] | values["finer"]
     return {
         "verdicts": _verdicts(told, values["louder"]),
         "places": "\n\n".join(f"{signals}:\n\n{_places(t)}" for signals, t in told.items()),
