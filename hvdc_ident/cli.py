@@ -452,11 +452,13 @@ def models(json: Json = False, quiet: Quiet = False) -> None:
 def effects(json: Json = False, quiet: Quiet = False) -> None:
     """The catalogue of effects, one line each, with sizes that show on a per-unit signal. Those that `diagnose` tries
     only where they are named say so."""
+    from hvdc_ident.effects import Effect
     from hvdc_ident.effects import effects as known
 
-    asked = {name: "" if e.sought else " (diagnose: tried where it is named)" for name, e in known().items()}
-    lines = {name: e.summary if json else f"{e.summary}; {e.shown}{asked[name]}" for name, e in known().items()}
-    _catalogue("effects", lines, json=json)
+    def line(e: Effect) -> str:
+        return f"{e.summary}; {e.shown}" + ("" if e.sought else " (diagnose: tried where it is named)")
+
+    _catalogue("effects", {name: e.summary if json else line(e) for name, e in known().items()}, json=json)
 
 
 @app.command()

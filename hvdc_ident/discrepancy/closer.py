@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 
 from hvdc_ident.discrepancy.candidates import Candidate
 from hvdc_ident.discrepancy.dense import bent, every_size, widened
@@ -21,9 +22,12 @@ from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.model.definition import Model
 
+Views = Callable[[], Sequence[View]]
+"""The models that are looked at, worked out when they are asked for first."""
+
 
 def closer_look(
-    search: Search, opened: Round, nominal: Nominal, number: int, wanted: Callable[[Candidate], bool] = lambda _: True
+    search: Search, opened: Round, views: Views, number: int, wanted: Callable[[Candidate], bool] = lambda _: True
 ) -> tuple[Round, tuple[Pick, ...]]:
     """The round with the sizes that a closer look found, and the picks to refit for them. wanted: what is looked at."""
     before, found, options = opened.before, opened.candidates, search.options
@@ -38,7 +42,7 @@ def closer_look(
     text = f"round {number}: a closer look at {', '.join(dict.fromkeys(d.candidate.effect for d in dense))}"
     seen = scan(
         before,
-        _views(before, nominal, opened.paths),
+        views(),
         dense,
         options.bootstraps,
         search.seed + number,
@@ -57,6 +61,11 @@ def closer_look(
         for c, s in zip(columns, seen.spots, strict=True)
     ]
     return replace(opened, candidates=found, scores=scores), tuple(picks)
+
+
+def views_of(opened: Round, nominal: Nominal) -> Views:
+    """The views of a round's closer looks."""
+    return cache(lambda: _views(opened.before, nominal, opened.paths))
 
 
 def _views(before: Refit, nominal: Nominal, paths: Mapping[str, Path]) -> list[View]:

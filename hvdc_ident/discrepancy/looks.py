@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from hvdc_ident.discrepancy.akin import as_late, bends, carried, elsewhere, is_akin, leaders, other_forms, with_begun
 from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.closer import Views, closer_look, views_of
 from hvdc_ident.discrepancy.filtered import filtered, filters
 from hvdc_ident.discrepancy.law import law
 from hvdc_ident.discrepancy.nominal import Nominal
@@ -178,18 +178,17 @@ def _as_late(stand: Stand) -> Stand:
 def _closer(stand: Stand) -> Stand:
     """Sizes that a closer look finds: at what is akin to the best, and everywhere else where still nothing explains the data."""
     leading = leaders(stand.opened, stand.trials)
-    stand = _looked_closer(stand, lambda c: is_akin(c, leading))
+    views = views_of(stand.opened, stand.nominal)
+    stand = _looked_closer(stand, views, lambda c: is_akin(c, leading))
     if not all_far(stand.opened.before, stand.trials, CLOSE):
         return stand
-    return _looked_closer(stand, lambda c: not is_akin(c, leading))
+    return _looked_closer(stand, views, lambda c: not is_akin(c, leading))
 
 
-def _looked_closer(stand: Stand, wanted: Callable[[Candidate], bool]) -> Stand:
+def _looked_closer(stand: Stand, views: Views, wanted: Callable[[Candidate], bool]) -> Stand:
     """The refits of a closer look at the candidates that are wanted, of those within reach."""
     reached = stand.opened.reaches
-    opened, extra = closer_look(
-        stand.search, stand.opened, stand.nominal, stand.number, lambda c: reached(c) and wanted(c)
-    )
+    opened, extra = closer_look(stand.search, stand.opened, views, stand.number, lambda c: reached(c) and wanted(c))
     stand = replace(stand, opened=opened)
     return stand.with_best(stand.refits(extra, "refits of the closer look"))
 

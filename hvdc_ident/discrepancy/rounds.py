@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from hvdc_ident.discrepancy.candidates import candidates
-from hvdc_ident.discrepancy.closer import closer_look
+from hvdc_ident.discrepancy.closer import closer_look, views_of
 from hvdc_ident.discrepancy.looks import looked
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.objections import evidence, objections
@@ -71,7 +71,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
 def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
     """The round after a closer look alone, where nothing else has a score though more than noise is left."""
     text = "round 1: refits of the closer look"
-    seen, picks = closer_look(search, opened, nominal, 1)
+    seen, picks = closer_look(search, opened, views_of(opened, nominal), 1)
     if not picks or seen.scores.p(max(p.score for p in picks)) > search.options.significance:
         return opened
     trials = refitted(search, seen, picks, text)
