@@ -120,48 +120,40 @@ class Disturbance(Operator):
         return u + p["amplitude"] * np.sin(2.0 * np.pi * p["frequency"] * t + p["phase"])
 
 
-class Lag(Operator):
+class Follower(Operator):
+    """y is the first state, which rests at u; the others rest at 0."""
+
     states = 1
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
-        return [u.copy()]
+        return [u.copy(), *(np.zeros_like(u) for _ in range(self.states - 1))]
 
     def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
         return z[0]
 
+
+class Lag(Follower):
     def rates(self, u, z):  # type: ignore[no-untyped-def]
         return [(u - z[0]) / self.p["T"]]
 
 
-class Inductance(Lag):
+class Inductance(Follower):
     def rates(self, u, z):  # type: ignore[no-untyped-def]
         return [self.p["R"] * (u - z[0]) / self.p["L"]]
 
 
-class SecondOrder(Operator):
+class SecondOrder(Follower):
     states = 2
-
-    def begin(self, u, other):  # type: ignore[no-untyped-def]
-        return [u.copy(), np.zeros_like(u)]
-
-    def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
-        return z[0]
 
     def rates(self, u, z):  # type: ignore[no-untyped-def]
         wn = self.p["wn"]
         return [z[1], wn * wn * (u - z[0]) - 2.0 * self.p["zeta"] * wn * z[1]]
 
 
-class InnerLoop(Operator):
+class InnerLoop(Follower):
     """A feedback of proportional and integral action around an integrator, in the form of an observer."""
 
     states = 2
-
-    def begin(self, u, other):  # type: ignore[no-untyped-def]
-        return [u.copy(), np.zeros_like(u)]
-
-    def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
-        return z[0]
 
     def rates(self, u, z):  # type: ignore[no-untyped-def]
         wn, off = self.p["wn"], u - z[0]
