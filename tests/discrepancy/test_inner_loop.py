@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import FREE, TIME, TRUE, model
+from cases import FREE, TIME, TRUE, experiments, model
 from meters import records
 from scipy.integrate import solve_ivp
 
@@ -53,6 +53,15 @@ def test_a_loop_is_named() -> None:
     sizes = found.effects[0].parameters
     assert sizes["wn"].value == pytest.approx(WN, rel=0.02) and sizes["zeta"].value == pytest.approx(ZETA, rel=0.05)
     assert found.parameters_after["Ki"] == pytest.approx(TRUE["Ki"], rel=0.02)
+
+
+def test_a_lag_is_no_loop() -> None:
+    """A heavily damped loop is nearly one: its damping ends before that."""
+    found = diagnose(
+        model(), experiments(lag=0.03), FREE, effects=["lag", "inner-loop"], options=Options(bootstraps=100)
+    )
+    told = {e.effect for e in found.effects} | {r.effect for group in found.ambiguity for r in group}
+    assert found.verdict in ("named", "ambiguous") and told == {"lag"}
 
 
 def test_all_may_stand_beside_others() -> None:
