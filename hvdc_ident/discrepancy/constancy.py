@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from hvdc_ident.discrepancy.begin import Placed
 from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
@@ -47,7 +47,7 @@ def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
     remains = left.projected(left.residual)
     told = float(np.sum((more.T @ remains) ** 2))
     share = told / max(float(remains @ remains) - told, np.finfo(float).tiny)
-    return Constancy(told, float(f_distribution.sf(share * spare / more.shape[1], more.shape[1], spare)))
+    return Constancy(told, float(fdtrc(more.shape[1], spare, share * spare / more.shape[1])))
 
 
 def _by_experiment(left: Nominal, own: list[int]) -> Array:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc, fdtrc, stdtrit
 
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.noise import GIVEN
@@ -117,11 +118,9 @@ def curves(
 
     held_out: nuisances of held-out experiments, None where they could not be estimated.
     """
-    from scipy.stats import t
-
     table: dict[str, dict[str, Curve]] = {}
     known = result.covariance
-    quantile = float(t.ppf(0.975, known.dof)) if known is not None else np.nan
+    quantile = float(stdtrit(known.dof, 0.975)) if known is not None else np.nan
     for e in problem.experiments:
         if not e.outputs or e.measured is None:
             continue
@@ -158,8 +157,6 @@ def goodness(problem: Problem, result: FitResult, found: Mapping[str, Mapping[st
     residuals are worth; None, with the reason, where the noise came from the misfit. noise_dof: samples behind a noise
     that was estimated; the p is then that of F(dof, noise_dof), else of chi-square. outputs: see `_quality`.
     """
-    from scipy.stats import chi2, f
-
     table: dict[str, dict[str, Any]] = {}
     for experiment, line in found.items():
         for output, c in line.items():
@@ -177,7 +174,7 @@ def goodness(problem: Problem, result: FitResult, found: Mapping[str, Mapping[st
         dof = max(effective - len(result.fitted), 1.0)
         value = result.chi2_per_dof * dof
         known = not np.isfinite(behind)
-        p = chi2.sf(value, dof) if known else f.sf(result.chi2_per_dof, dof, behind)
+        p = chdtrc(dof, value) if known else fdtrc(dof, behind, result.chi2_per_dof)
         overall |= {"chi2": value, "dof": dof, "p": float(p), "noise_dof": None if known else behind}
     return {**overall, "outputs": table}
 

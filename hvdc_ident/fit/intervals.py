@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import stdtrit
 
 from hvdc_ident.fit.nuisance import unit_of, unknown_of
 from hvdc_ident.fit.problem import Problem, stacked
@@ -53,12 +54,10 @@ def _with(e: Estimate, unit: str, conditional_on: tuple[str, ...]) -> Estimate:
 
 def _inside(unknown: Free, value: float, known: Uncertainty) -> Estimate:
     """Value, std and t interval; a reason where the interval is wider than the bounds."""
-    from scipy.stats import t
-
     std = known.std(unknown.name)
     if std is None:
         return Estimate(value, reason=known.reasons[unknown.name])
-    half = float(t.ppf(0.975, known.dof)) * std
+    half = float(stdtrit(known.dof, 0.975)) * std
     width = unknown.max - unknown.min
     reason = "the interval is wider than the bounds" if math.isfinite(width) and 2.0 * half > width else ""
     raw = known.std(unknown.name, raw=True)

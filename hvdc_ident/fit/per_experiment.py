@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.fit.estimate import fit
@@ -106,6 +107,4 @@ def spread(values: Array) -> dict[str, Any]:
 
 def half_width(std: float, n: int) -> float:
     """t std/sqrt(n): half the 95 % interval of the mean of n values with that standard deviation, in its unit."""
-    from scipy.stats import t
-
-    return float(t.ppf(0.975, n - 1)) * std / math.sqrt(n)
+    return float(stdtrit(n - 1, 0.975)) * std / math.sqrt(n)

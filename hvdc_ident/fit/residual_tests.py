@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.residual import Block
@@ -45,8 +46,6 @@ def _tests(block: Block, experiment: Experiment) -> dict[str, Any]:
 
 def ljung_box(r: Array, lags: int | None = None) -> dict[str, Any]:
     """Ljung and Box's (1978) statistic over the first lags (default: 10, or a fifth of the rows), with its p."""
-    from scipy.stats import chi2
-
     n = r.size
     lags = min(10, n // 5) if lags is None else lags
     centred = r - r.mean()
@@ -55,7 +54,7 @@ def ljung_box(r: Array, lags: int | None = None) -> dict[str, Any]:
         return {"statistic": None, "lags": lags, "p": None}
     acf = np.array([float(centred[k:] @ centred[:-k]) / power for k in range(1, lags + 1)])
     statistic = float(n * (n + 2) * np.sum(acf**2 / (n - np.arange(1, lags + 1))))
-    return {"statistic": statistic, "lags": lags, "p": float(chi2.sf(statistic, lags))}
+    return {"statistic": statistic, "lags": lags, "p": float(chdtrc(lags, statistic))}
 
 
 def runs(r: Array) -> dict[str, Any]:
@@ -80,8 +79,6 @@ def cross_correlation(r: Array, u: Array, lags: int | None = None) -> dict[str, 
     Both are first filtered by their own AR(1) coefficient, so that two slow signals do not count as related; the
     statistic n sum(ccf^2) over lags 0 to 20 (or a fifth of the rows) is chi-square (Box and Jenkins, section 11.3).
     """
-    from scipy.stats import chi2
-
     n = r.size
     lags = min(20, n // 5) if lags is None else lags
     a, b = _innovation(r), _innovation(u)
@@ -90,7 +87,7 @@ def cross_correlation(r: Array, u: Array, lags: int | None = None) -> dict[str, 
         return {"correlation": None, "lag": None, "p": None}
     ccf = np.array([float(a[k:] @ b[: b.size - k]) / power for k in range(lags + 1)])
     lag = int(np.argmax(np.abs(ccf)))
-    return {"correlation": float(ccf[lag]), "lag": lag, "p": float(chi2.sf(n * float(ccf @ ccf), lags + 1))}
+    return {"correlation": float(ccf[lag]), "lag": lag, "p": float(chdtrc(lags + 1, n * float(ccf @ ccf)))}
 
 
 def _innovation(signal: Array) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from hvdc_ident.fit.noise import MISFIT
 from hvdc_ident.fit.problem import stacked
@@ -163,9 +164,9 @@ def score_covariance(jacobian: Array, rho: float) -> Array:
     """J'RJ with R_ij = rho^|i-j|, (p, p)."""
     if rho == 0.0:
         return jacobian.T @ jacobian
-    from scipy.signal import lfilter
-
-    past = lfilter([0.0, rho], [1.0, -rho], jacobian, axis=0)
+    before = np.zeros_like(jacobian)
+    before[1:] = rho * jacobian[:-1]
+    past = solve_banded((1, 0), np.array([[1.0], [-rho]]).repeat(len(jacobian), axis=1), before, check_finite=False)
     cross = jacobian.T @ past
     return jacobian.T @ jacobian + cross + cross.T
 

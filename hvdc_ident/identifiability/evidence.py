@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import stdtrit
 
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Free, Problem
@@ -42,10 +43,8 @@ def spreads(optimum: Optimum) -> dict[str, Spread]:
     2007, doi 10.1093/biomet/asm015): the wider of the AR(1) sandwich times the excess misfit and, where the misfit
     shows model error, the sandwich over experiments with t(n - 1).
     """
-    from scipy.stats import t
-
     u = optimum.uncertainty
-    quantile = 0.5 * float(t.ppf(0.975, u.dof)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
+    quantile = 0.5 * float(stdtrit(u.dof, 0.975)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
     raw = np.diag(u.raw)
     safe = np.where(raw > 0, raw, 1.0)
     factor = np.maximum(np.where(raw > 0, np.diag(u.corrected) / safe, 1.0) * optimum.excess, 1.0)
@@ -53,7 +52,7 @@ def spreads(optimum: Optimum) -> dict[str, Spread]:
     if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
         covariance, dof = cluster_sandwich(optimum.blocks)
         scatter = np.where(raw > 0, np.diag(covariance) / safe, 0.0)
-        wider = 0.5 * float(t.ppf(0.975, dof)) ** 2 * scatter
+        wider = 0.5 * float(stdtrit(dof, 0.975)) ** 2 * scatter
         factor = np.where(wider > limits, scatter, factor)
         limits = np.maximum(limits, wider)
     stds = np.sqrt(raw * factor)

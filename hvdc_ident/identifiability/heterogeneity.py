@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc
 
 from hvdc_ident.fit.uncertainty import score_covariance
 from hvdc_ident.frozen import FrozenMap
@@ -39,8 +40,6 @@ def heterogeneity(optimum: Optimum) -> FrozenMap[Heterogeneity]:
     common fit leaves; AR(1) within a record is allowed for as in the standard deviations. What a single parameter of
     its own per experiment would gain is g' V^+ g, chi-square under agreement.
     """
-    from scipy.stats import chi2
-
     names = list(dict.fromkeys(b.experiment for b in optimum.blocks))
     scores, informations, covariance = _stacked(optimum, names)
     found: dict[str, Heterogeneity] = {}
@@ -64,7 +63,7 @@ def heterogeneity(optimum: Optimum) -> FrozenMap[Heterogeneity]:
         scatter = float(np.sqrt(weights @ (moves - weights @ moves) ** 2))
         estimates = {names[e]: optimum.value(name) + float(m) for e, m in zip(tell, moves, strict=True)}
         found[name] = Heterogeneity(
-            q, dof, float(chi2.sf(q, dof)), max(0.0, (q - dof) / q) if q > 0 else 0.0, scatter, FrozenMap(estimates)
+            q, dof, float(chdtrc(dof, q)), max(0.0, (q - dof) / q) if q > 0 else 0.0, scatter, FrozenMap(estimates)
         )
     return FrozenMap(found)
 
