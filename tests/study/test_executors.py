@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pool_jobs
 import pytest
@@ -56,12 +61,36 @@ def test_nothing_to_do_and_nothing_that_works():
 
 
 @pytest.mark.parametrize(("told", "expected"), [({}, ["1", "1", None]), ({"OMP_NUM_THREADS": "3"}, ["3", None, None])])
-def test_workers_compute_in_one_thread_unless_told_otherwise(told, expected, monkeypatch):
-    """And the parent's own environment stays as it is."""
+def test_workers_compute_in_one_thread_unless_told_otherwise(told, expected):
+    """As the environment of the first pool of a process says; the parent's own stays as it is."""
     names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NO_SUCH_NUM_THREADS"]
-    for name in (*names, "MKL_NUM_THREADS"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in told.items():
-        monkeypatch.setenv(name, value)
-    assert list(LocalPool(1).map(pool_jobs.environment, names)) == expected
-    assert [os.environ.get(n) for n in names] == [told.get(n) for n in names]
+    code = f"""
+import os, pool_jobs
+from hvdc_ident.study.executors import LocalPool
+print([list(LocalPool(1).map(pool_jobs.environment, {names})), [os.environ.get(n) for n in {names}]])
+"""
+    bare = {n: v for n, v in os.environ.items() if not n.endswith("_NUM_THREADS")}
+    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**bare, **told, "PYTHONPATH": here},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ast.literal_eval(done.stdout) == [expected, [told.get(n) for n in names]]
+
+
+def test_workers_end_with_a_parent_that_is_killed():
+    """Though they are at work."""
+    code = """
+import os, pool_jobs
+from hvdc_ident.study.executors import LocalPool
+list(LocalPool(1).run(pool_jobs.end_and_hang, [os.getpid()]))
+"""
+    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": here}, stdout=subprocess.PIPE, text=True
+    )
+    parent.communicate(timeout=120.0)  # ends when the last process that has its output does
+    assert parent.returncode == -signal.SIGKILL

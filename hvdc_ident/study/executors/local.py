@@ -1,8 +1,9 @@
 """Where many runs are done: a pool of local processes that outlives any of them.
 
 A worker that dies or hangs costs the item it was at, which becomes a failure with a reason; everything else is done.
-Workers are started afresh (spawn), so that no lock, thread or compiled state of the parent is shared; they end with
-the parent, even where that is killed.
+Workers share no lock, thread or compiled state with the parent: they are forked from a server, a process that has loaded
+the package and does nothing else, or started afresh where forking is not safe. They end with the parent, even where that
+is killed.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -30,6 +32,9 @@ START = 180.0  # s a worker may take to begin
 MOST = 1000  # items sent to a worker at a time
 DEATHS = 2  # of workers at the same item before it is given up
 IDLE = -1
+START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+LOADED = ["hvdc_ident.discrepancy"]
+"""What the server loads, once for all workers: it imports what nearly any work needs."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -79,7 +84,11 @@ class LocalPool:
 
     @contextlib.contextmanager
     def open(self) -> Iterator[OpenPool]:
-        """The pool with workers that stay from one run to the next, until the context ends."""
+        """The pool with workers that stay from one run to the next, until the context ends.
+
+        What they need is loaded from now on, beside what the caller does.
+        """
+        _serving()
         pool = OpenPool(self)
         try:
             yield pool
@@ -88,7 +97,7 @@ class LocalPool:
 
 
 class OpenPool:
-    """A pool whose workers wait for the next run: starting one takes a second or two."""
+    """A pool whose workers wait for the next run, with all they have compiled."""
 
     def __init__(self, settings: LocalPool) -> None:
         self._settings = settings
@@ -269,14 +278,25 @@ class _Session:
 
 
 def _started(memory: int | None) -> _Worker:
-    context = multiprocessing.get_context("spawn")
+    context: Any = multiprocessing.get_context(START_METHOD)
     current = context.RawValue("q", IDLE)
     here, there = context.Pipe()
-    process = context.Process(target=_serve, args=(there, current, memory, os.getpid()), daemon=True)
+    process = context.Process(target=_serve, args=(there, current, memory), daemon=True)
     with _one_thread():
         process.start()
     there.close()
     return _Worker(process, here, current, time.monotonic())
+
+
+def _serving() -> None:
+    """Nothing; the server that workers are forked from begins to load, if it has not, with the environment of now."""
+    if START_METHOD != "forkserver":
+        return
+    from multiprocessing import forkserver
+
+    forkserver.set_forkserver_preload(LOADED)
+    with _one_thread():
+        forkserver.ensure_running()
 
 
 @contextlib.contextmanager
@@ -318,9 +338,9 @@ def _exit(code: int | None) -> str:
 # --- inside a worker ---
 
 
-def _serve(connection: Connection, current: Any, memory: int | None, parent: int) -> None:
+def _serve(connection: Connection, current: Any, memory: int | None) -> None:
     """Nothing; loads each function sent and runs batches with it until the parent closes the connection or ends."""
-    _end_with(parent)
+    _end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if memory is not None:
         with contextlib.suppress(ImportError, ValueError):
@@ -362,13 +382,13 @@ def _run_batch(connection: Connection, work: Callable[[Any], Any], batch: list[t
     current.value = IDLE
 
 
-def _end_with(parent: int) -> None:
-    """Nothing; on Linux the process ends when its parent does, however that ends."""
-    if sys.platform != "linux":
-        return
-    import ctypes
+def _end_with_parent() -> None:
+    """Nothing; the process ends when the pool's does, however that ends. Only the server ends by itself, after the last."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
 
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-    if os.getppid() != parent:
+    def watch() -> None:
+        parent.join()
         os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
