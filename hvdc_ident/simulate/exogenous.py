@@ -53,8 +53,9 @@ def _inputs(r, t):  # type: ignore[no-untyped-def]
         k = at[i]
         while k + 1 < last and (times[k + 1] < t or (times[k + 1] == t and t < r.tb)):
             k += 1
-        while k > first and (times[k] > t or (times[k] == t and t >= r.tb and k > first)):
+        while k > first and (times[k] > t or (times[k] == t and t >= r.tb)):
             k -= 1
+        at[i] = k  # where the next instant is looked for: a record may have thousands of rows
         if k + 1 < last and t >= times[k] and times[k + 1] > times[k]:
             slope = (values[k + 1] - values[k]) / (times[k + 1] - times[k])
             w[1 + i] = values[k] + slope * (t - times[k])
