@@ -18,6 +18,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
+import descendants
 import numpy as np
 
 from hvdc_ident.discrepancy import diagnose
@@ -87,14 +88,14 @@ def recorded(count: int) -> tuple[Experiment, ...]:
     return tuple(found)
 
 
-def peak(who: int) -> float:
-    """The most memory of this process, or of the largest of those that ended, MiB."""
-    return resource.getrusage(who).ru_maxrss / 1024
+def peak() -> float:
+    """The most memory of this process, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def cpu(who: int) -> float:
-    """Processor time, s."""
-    used = resource.getrusage(who)
+def cpu() -> float:
+    """Processor time of this process, s."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
@@ -107,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     experiments = recorded(asked.outputs)
     effects: Any = asked.effects if asked.effects == "all" else asked.effects.split(",")
-    before, begin, watch = cpu(resource.RUSAGE_SELF), time.perf_counter(), Watch(asked.quiet)
+    before, begin, watch = cpu(), time.perf_counter(), Watch(asked.quiet)
     pool = LocalPool(asked.workers).open() if asked.workers > 1 else nullcontext()
     with pool as executor:
         found = diagnose(
@@ -115,12 +116,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         watch(1, 1, "end")
         wall = time.perf_counter() - begin
+        there, largest = descendants.cpu(), descendants.peak()
     for phase, (seconds, own) in watch.spent.items():
         print(f"{seconds:8.1f} s  {own:8.1f} s  {phase}")
-    here, there = cpu(resource.RUSAGE_SELF) - before, cpu(resource.RUSAGE_CHILDREN)
+    here = cpu() - before
     print(f"{wall:8.1f} s  in all; processor time {here:.1f} s here, {there:.1f} s in {asked.workers} workers")
-    memory = peak(resource.RUSAGE_SELF), peak(resource.RUSAGE_CHILDREN)
-    print(f"memory at most: {memory[0]:.0f} MiB here, {memory[1]:.0f} MiB in the larger worker")
+    print(f"memory at most: {peak():.0f} MiB here, {largest:.0f} MiB in the larger worker")
     print(f"{len(found.candidates)} candidates; {found.verdict}: {found.text}")
     for effect in found.effects:
         print(f"  {effect.text}")

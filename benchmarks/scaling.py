@@ -22,6 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import descendants
 import numpy as np
 
 from hvdc_ident.experiment import InputSignal, experiment
@@ -109,10 +110,9 @@ def of_sweep(points: int, workers: int) -> dict[str, float]:
         again = spent(lambda: run_stage(study, "sweep", folder / "out", Options(workers=workers)))[0]
         store = sum(f.stat().st_size for f in (folder / "out" / ".store").iterdir())
         tables = sum((folder / "out" / n).stat().st_size for n in ("sweep.json", "sweep.csv"))
-        workers_cpu = resource.getrusage(resource.RUSAGE_CHILDREN)
         return {
             "points": count,
-            "cpu": cpu + (workers_cpu.ru_utime + workers_cpu.ru_stime if workers > 1 else 0.0),
+            "cpu": cpu + (descendants.cpu() if workers > 1 else 0.0),
             "wall": wall,
             "again": again,
             "memory": peak() - base,
