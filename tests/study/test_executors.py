@@ -60,6 +60,14 @@ def test_nothing_to_do_and_nothing_that_works():
         LocalPool(0)
 
 
+def _script(code, environment):
+    """A process of its own that runs the code, with the jobs at hand."""
+    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    return subprocess.Popen(
+        [sys.executable, "-c", code], env={**environment, "PYTHONPATH": here}, stdout=subprocess.PIPE, text=True
+    )
+
+
 @pytest.mark.parametrize(("told", "expected"), [({}, ["1", "1", None]), ({"OMP_NUM_THREADS": "3"}, ["3", None, None])])
 def test_workers_compute_in_one_thread_unless_told_otherwise(told, expected):
     """As the environment of the first pool of a process says; the parent's own stays as it is."""
@@ -70,15 +78,10 @@ from hvdc_ident.study.executors import LocalPool
 print([list(LocalPool(1).map(pool_jobs.environment, {names})), [os.environ.get(n) for n in {names}]])
 """
     bare = {n: v for n, v in os.environ.items() if not n.endswith("_NUM_THREADS")}
-    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**bare, **told, "PYTHONPATH": here},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert ast.literal_eval(done.stdout) == [expected, [told.get(n) for n in names]]
+    process = _script(code, {**bare, **told})
+    found, _ = process.communicate()
+    assert process.returncode == 0
+    assert ast.literal_eval(found) == [expected, [told.get(n) for n in names]]
 
 
 def test_workers_end_with_a_parent_that_is_killed():
@@ -88,9 +91,6 @@ import os, pool_jobs
 from hvdc_ident.study.executors import LocalPool
 list(LocalPool(1).run(pool_jobs.end_and_hang, [os.getpid()]))
 """
-    here = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    parent = subprocess.Popen(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": here}, stdout=subprocess.PIPE, text=True
-    )
+    parent = _script(code, dict(os.environ))
     parent.communicate(timeout=120.0)  # ends when the last process that has its output does
     assert parent.returncode == -signal.SIGKILL
