@@ -10,7 +10,6 @@ every slot. Phases are as progress is told: wall time, then processor time of th
 from __future__ import annotations
 
 import argparse
-import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -18,8 +17,8 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
-import descendants
 import numpy as np
+import usage
 
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse
@@ -88,17 +87,6 @@ def recorded(count: int) -> tuple[Experiment, ...]:
     return tuple(found)
 
 
-def peak() -> float:
-    """The most memory of this process, MiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def cpu() -> float:
-    """Processor time of this process, s."""
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, default=2)
@@ -108,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     experiments = recorded(asked.outputs)
     effects: Any = asked.effects if asked.effects == "all" else asked.effects.split(",")
-    before, begin, watch = cpu(), time.perf_counter(), Watch(asked.quiet)
+    before, begin, watch = time.process_time(), time.perf_counter(), Watch(asked.quiet)
     pool = LocalPool(asked.workers).open() if asked.workers > 1 else nullcontext()
     with pool as executor:
         found = diagnose(
@@ -116,12 +104,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         watch(1, 1, "end")
         wall = time.perf_counter() - begin
-        there, largest = descendants.cpu(), descendants.peak()
+        there, largest = usage.cpu_below(), usage.peak_below()
     for phase, (seconds, own) in watch.spent.items():
         print(f"{seconds:8.1f} s  {own:8.1f} s  {phase}")
-    here = cpu() - before
+    here = time.process_time() - before
     print(f"{wall:8.1f} s  in all; processor time {here:.1f} s here, {there:.1f} s in {asked.workers} workers")
-    print(f"memory at most: {peak():.0f} MiB here, {largest:.0f} MiB in the larger worker")
+    print(f"memory at most: {usage.peak():.0f} MiB here, {largest:.0f} MiB in the larger worker")
     print(f"{len(found.candidates)} candidates; {found.verdict}: {found.text}")
     for effect in found.effects:
         print(f"  {effect.text}")

@@ -22,8 +22,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import descendants
 import numpy as np
+from usage import cpu_below, peak
 
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.models import load_model
@@ -42,11 +42,6 @@ def spent(run: Callable[[], Any]) -> tuple[float, float, Any]:
 def least(run: Callable[[], Any], count: int) -> float:
     """The least processor time of several runs, s."""
     return min(spent(run)[0] for _ in range(count))
-
-
-def peak() -> float:
-    """The most memory this process has had, MiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def of_states(terminals: int) -> dict[str, float]:
@@ -112,7 +107,7 @@ def of_sweep(points: int, workers: int) -> dict[str, float]:
         tables = sum((folder / "out" / n).stat().st_size for n in ("sweep.json", "sweep.csv"))
         return {
             "points": count,
-            "cpu": cpu + (descendants.cpu() if workers > 1 else 0.0),
+            "cpu": cpu + (cpu_below() if workers > 1 else 0.0),
             "wall": wall,
             "again": again,
             "memory": peak() - base,
