@@ -109,12 +109,15 @@ class _Batch:
             count += operator.states
         self.count = count
         self.inputs = self._inputs(runs)
-        self.raw = (*plant.inputs, *plant.states)
+        self.states = {name: k for k, name in enumerate(plant.states)}
         self.seen: dict[str, Array] = {}
 
     def _inputs(self, runs: Sequence[Run]) -> dict[str, Array]:
         """(steps, 3, runs): at the beginning, the middle and just before the end of every step."""
-        t = (np.arange(self.steps) - self.lead) * self.h
+        # To a picosecond: by rounding the end of a step may lie behind a jump that stands there, and see it one step early.
+        t, middle, end = (
+            np.round((np.arange(self.steps) - self.lead + share) * self.h, 12) for share in (0.0, 0.5, 1.0)
+        )
         found = {}
         for name, value in self.plant.inputs.items():
             table = np.full((self.steps, 3, self.n), value)
@@ -122,24 +125,37 @@ class _Batch:
                 if name in run.inputs:
                     signal = run.inputs[name]
                     table[:, 0, k] = signal.at(t)
-                    table[:, 1, k] = signal.at(t + 0.5 * self.h)
-                    table[:, 2, k] = signal.at(t + self.h, before=True)
+                    table[:, 1, k] = signal.at(middle)
+                    table[:, 2, k] = signal.at(end, before=True)
             found[name] = table
         return found
 
     # --- one evaluation ---
 
-    def _flow(self, mode: str, x: list[Array], inputs: Mapping[str, Array], t: float, share: float) -> list[Array]:
+    def _flow(
+        self, mode: str, x: list[Array], inputs: Mapping[str, Array], t: float, share: float
+    ) -> list[Array | None]:
         """Rates of all states. mode: "rest" (operators as they are at rest), "begin" (they set themselves up) or "run"."""
-        rates: dict[int, Array] = {}
-        seen = self.seen
-        own = {**inputs, **dict(zip(self.plant.states, x, strict=False))}
+        own = len(self.plant.states)
+        rates: list[Array | None] = [None] * (self.count - own)
+        chains, seen = self.chains, self.seen
 
         def see(slot: str, u: Array) -> Array:
-            own[slot] = u
-            for operator, first, source in self.chains.get(slot, ()):
+            chain = chains.get(slot)
+            if chain is None:  # nearly all slots, and this is called a million times a case
+                seen[slot] = u
+                return u
+            raw = u
+            for operator, first, source in chain:
                 # Of an input or a state the value itself is brought in, of a signal what its readers get.
-                other = None if not source else own[source] if source == slot or source in self.raw else seen[source]
+                if not source:
+                    other = None
+                elif source == slot:
+                    other = raw
+                elif source in inputs:
+                    other = inputs[source]
+                else:
+                    other = x[self.states[source]] if source in self.states else seen[source]
                 if mode != "run":
                     if mode == "begin":
                         x[first : first + operator.states] = operator.begin(u, other)
@@ -147,14 +163,13 @@ class _Batch:
                     continue
                 z = x[first : first + operator.states]
                 y = operator.value(u, z, t, share, other)
-                for k, rate in enumerate(operator.rates(u, z)):
-                    rates[first + k] = rate
+                if operator.states:
+                    rates[first - own : first - own + operator.states] = operator.rates(u, z)
                 u = y
             seen[slot] = u
             return u
 
-        plant = self.plant.flow(x, inputs, self.p, see)
-        return plant + [rates[k] for k in sorted(rates)]
+        return [*self.plant.flow(x, inputs, self.p, see), *rates]
 
     def _rest(self) -> list[Array]:
         """The states at which nothing moves, by Newton's method with differences; operators are set up there."""
@@ -193,16 +208,16 @@ class _Batch:
             t = (step - self.lead) * h
             total, rate = np.zeros_like(x), x
             row = step >= self.lead and (step - self.lead) % self.every == 0
+            inputs = [{n: v[step, place] for n, v in self.inputs.items()} for place in range(3)]
             if row and self.ticks and step:
                 # The end of the last step: as things stand before what ticks now. A row on a tick is thus read before it.
-                self._flow("run", list(x), {n: v[step, 0] for n, v in self.inputs.items()}, t, 1.0)
+                self._flow("run", list(x), inputs[0], t, 1.0)
                 out[(step - self.lead) // self.every] = np.array([self.seen[n] for n in self.watch]).T
                 row = False
             for stage in range(4):
-                share, place = STAGES[stage], places[stage]
+                share = STAGES[stage]
                 at = x + (share * h) * rate if stage else x
-                inputs = {n: v[step, place] for n, v in self.inputs.items()}
-                rate = np.array(self._flow("run", list(at), inputs, t + share * h, share))
+                rate = np.array(self._flow("run", list(at), inputs[places[stage]], t + share * h, share))
                 if stage == 0 and row:
                     out[(step - self.lead) // self.every] = np.array([self.seen[n] for n in self.watch]).T
                 total += WEIGHTS[stage] * rate
