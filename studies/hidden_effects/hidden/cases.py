@@ -192,7 +192,7 @@ def _drawn(
             hidden.append(found)
         if len(hidden) < len(design.effects):
             continue
-        clean = simulate(base.plant, base.runs, hidden)
+        clean = simulate(base.plant, base.runs, hidden) if hidden else base.outputs
         if not np.isfinite(clean).all() or (hidden and not _firm(base, hidden, clean, sigma, kind, channels)):
             continue
         size = float(units(base, clean[:, :2, None], sigma, kind, channels)[0])
@@ -208,8 +208,10 @@ def _firm(
     """Whether the answer is the plant's and not the integrator's: at half its step the same to FIRM units.
 
     A quantised loop that comes to rest between two levels chatters from step to step, and which of them a row catches is
-    no truth that could be found.
+    no truth that could be found. A curve or a filter has no such thing, and is followed to far less than a unit.
     """
+    if not any((CATALOGUE | OUTSIDE)[h.effect].stepped for h in hidden):
+        return True
     off = simulate(base.plant, base.runs, hidden, step=0.5 * STEP) - clean
     return float(np.linalg.norm(whitened(off, sigma, kind)[..., list(channels)])) < FIRM * UNIT
 

@@ -21,6 +21,7 @@ class Operator:
     states = 0
     waits_for_rest = False  # whether a steady start cannot be computed: it has to be waited for
     ticks = False  # whether it jumps at instants of its own: a row at such an instant is read before the jump
+    stepped = False  # whether it jumps, or remembers from step to step: its answer may hang on where the steps fall
 
     def __init__(self, p: Values, h: float, steps: int) -> None:
         self.p, self.h, self.steps = p, h, steps
@@ -107,6 +108,7 @@ class Droop(Change):
 
 class Quantisation(Operator):
     waits_for_rest = True
+    stepped = True
 
     def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
         return np.round(u / self.p["step"]) * self.p["step"]
@@ -199,6 +201,8 @@ class History:
 class Delay(Operator):
     """From the values at both ends of every step: a jump between two steps stays one."""
 
+    stepped = True
+
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.begins, self.ends = np.empty((2, self.steps + 2, u.size))
         self.begins[0] = self.ends[0] = u
@@ -224,6 +228,7 @@ class WindowMean(Operator):
     """From the integral of u: its growth over the window."""
 
     states = 1
+    stepped = True
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.first = u.copy()
@@ -243,6 +248,8 @@ class WindowMean(Operator):
 class RateLimit(Operator):
     """The ideal one: towards u by at most rate times the time since the last whole step."""
 
+    stepped = True
+
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.y = u.copy()
         return []
@@ -257,6 +264,8 @@ class RateLimit(Operator):
 
 class Backlash(Operator):
     """The play operator of Krasnosel'skii: the least movement that keeps u within the play."""
+
+    stepped = True
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.y = u.copy()
@@ -274,6 +283,7 @@ class SampleHold(Operator):
     """Samples at whole multiples of the period, counted in steps from the start."""
 
     ticks = True
+    stepped = True
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.every = np.maximum(np.round(self.p["Ts"] / self.h), 1.0)
@@ -299,6 +309,8 @@ class Cubic(Static):
 
 class Relay(Static):
     """Outside the catalogue: dry friction, a step of either sign around 0 of another signal, rounded over a tenth."""
+
+    stepped = True
 
     def value(self, u, z, t, share, other):  # type: ignore[no-untyped-def]
         return u - self.p["k"] * np.tanh((other - self.p["centre"]) / self.p["width"])
