@@ -147,15 +147,7 @@ class _Batch:
                 return u
             raw = u
             for operator, first, source in chain:
-                # Of an input or a state the value itself is brought in, of a signal what its readers get.
-                if not source:
-                    other = None
-                elif source == slot:
-                    other = raw
-                elif source in inputs:
-                    other = inputs[source]
-                else:
-                    other = x[self.states[source]] if source in self.states else seen[source]
+                other = raw if source == slot else self._brought_in(source, x, inputs)
                 if mode != "run":
                     if mode == "begin":
                         x[first : first + operator.states] = operator.begin(u, other)
@@ -170,6 +162,14 @@ class _Batch:
             return u
 
         return [*self.plant.flow(x, inputs, self.p, see), *rates]
+
+    def _brought_in(self, source: str, x: list[Array], inputs: Mapping[str, Array]) -> Array | None:
+        """Of an input or a state the value itself, of a signal what its readers get; None without a source."""
+        if not source:
+            return None
+        if source in inputs:
+            return inputs[source]
+        return x[self.states[source]] if source in self.states else self.seen[source]
 
     def _rest(self) -> list[Array]:
         """The states at which nothing moves, by Newton's method with differences; operators are set up there."""
