@@ -30,10 +30,10 @@ def packed(value: Any) -> bytes:
 
 
 def unpacked(content: bytes) -> Any:
-    """The value again. Raises ComputationError where the bytes are none that `packed` made."""
+    """The value again. Raises ComputationError where the bytes are none that `packed` made, or one of another release did."""
     try:
         return _value(json.loads(content))
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, ImportError) as error:
         raise ComputationError(
             "a kept result cannot be read", got=f"{type(error).__name__}: {error}", hint="remove the folder .store"
         ) from None

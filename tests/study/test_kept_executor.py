@@ -98,7 +98,10 @@ def test_arrays_and_results_come_back_bit_for_bit():
     assert scalar == 0.1
 
 
-@pytest.mark.parametrize("name", ["os:system", "hvdc_ident.study.packing:json", "subprocess:Popen", "hvdc_ident:os"])
+@pytest.mark.parametrize(
+    "name",
+    ["os:system", "hvdc_ident.study.packing:json", "subprocess:Popen", "hvdc_ident:os", "hvdc_ident.moved.away:Refit"],
+)
 def test_only_dataclasses_of_the_package_are_made(name):
     content = json.dumps({"!": "o", "of": name, "v": {}}).encode()
     with pytest.raises(ComputationError, match="cannot be read"):
