@@ -6,12 +6,17 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
 errors files frozen words notebook parameters trajectory axes experiment waveform phases expression model effects models
 formats simulate fmu linearize sensitivity fit identifiability discrepancy report study cli
 """.split()  # noqa: SIM905 - one list of words, read as such
+
+# Rooms with rooms inside, and the order of those.
+INSIDE = {"discrepancy": "options noise signatures refits scores trials outside search findings verdict diagnosis"}
 
 ALLOWED = {
     # (from, to): why
@@ -70,3 +75,20 @@ def test_imports_run_down() -> None:
 def test_only_what_is_needed_is_allowed() -> None:
     used = {(_room(p), m.split(".")[1]) for p in PACKAGE.rglob("*.py") for m in _imports(p) if m.count(".")}
     assert set(ALLOWED) <= used
+
+
+@pytest.mark.parametrize("room", INSIDE)
+def test_imports_run_down_within_a_room(room: str) -> None:
+    order = INSIDE[room].split()
+    files = sorted((PACKAGE / room).rglob("*.py"))
+    inner = {path: path.relative_to(PACKAGE / room).parts[0].removesuffix(".py") for path in files}
+    there = set(inner.values()) - {"__init__"}
+    assert there == set(order), f"in the list or in the room alone: {sorted(there ^ set(order))}"
+    upward = [
+        f"{path.relative_to(PACKAGE)} imports {module}"
+        for path in files
+        for module in _imports(path)
+        if inner[path] != "__init__" and module.startswith(f"hvdc_ident.{room}.")
+        if order.index(module.split(".")[2]) > order.index(inner[path])
+    ]
+    assert not upward, "\n".join(upward)

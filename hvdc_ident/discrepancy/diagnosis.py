@@ -7,22 +7,22 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from hvdc_ident.discrepancy.adequacy import Binned
-from hvdc_ident.discrepancy.ambiguity import separating
-from hvdc_ident.discrepancy.bode import responses
-from hvdc_ident.discrepancy.candidates import entries
-from hvdc_ident.discrepancy.explain import found_of
-from hvdc_ident.discrepancy.fallback import Fallback, fallback, law_found
-from hvdc_ident.discrepancy.gap import gap, with_given
-from hvdc_ident.discrepancy.lines import detectable, lines
-from hvdc_ident.discrepancy.localise import localise
-from hvdc_ident.discrepancy.nominal import Nominal, nominal
+from hvdc_ident.discrepancy.findings.ambiguity import separating
+from hvdc_ident.discrepancy.findings.bode import responses
+from hvdc_ident.discrepancy.findings.explain import found_of
+from hvdc_ident.discrepancy.findings.gap import gap, with_given
+from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Refit, judged
-from hvdc_ident.discrepancy.result import Diagnosis, Found
-from hvdc_ident.discrepancy.search import Outcome, forward
-from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.verdict import Judgement, judge, tests_of
+from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
+from hvdc_ident.discrepancy.refits.adequacy import Binned
+from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
+from hvdc_ident.discrepancy.refits.refit import Refit, judged
+from hvdc_ident.discrepancy.scores.localise import localise
+from hvdc_ident.discrepancy.search.forward import Outcome, forward
+from hvdc_ident.discrepancy.signatures.candidates import entries
+from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
+from hvdc_ident.discrepancy.verdict.lines import detectable, lines
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator

@@ -9,10 +9,10 @@ import numpy as np
 from cases import FREE, SIGMA, TRUE, model
 
 from hvdc_ident import Experiment, Model, simulate
-from hvdc_ident.discrepancy.begin import added
-from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.refit import Job, Refit, judged
+from hvdc_ident.discrepancy.refits.begin import added
+from hvdc_ident.discrepancy.refits.nominal import nominal
+from hvdc_ident.discrepancy.refits.refit import Job, Refit, judged
+from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator

@@ -14,12 +14,12 @@ from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, Model
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
-from hvdc_ident.discrepancy.ambiguity import formula_rivals
-from hvdc_ident.discrepancy.formula import formula_job
-from hvdc_ident.discrepancy.library import Term
-from hvdc_ident.discrepancy.refit import run
-from hvdc_ident.discrepancy.select import Pick, Ruler, Trial
-from hvdc_ident.discrepancy.state import Round
+from hvdc_ident.discrepancy.findings.ambiguity import formula_rivals
+from hvdc_ident.discrepancy.refits.refit import run
+from hvdc_ident.discrepancy.trials.formula import formula_job
+from hvdc_ident.discrepancy.trials.library import Term
+from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
+from hvdc_ident.discrepancy.trials.state import Round
 from hvdc_ident.frozen import FrozenMap
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from hvdc_ident.discrepancy.block import block, parameter
+from hvdc_ident.discrepancy.signatures.block import block, parameter
 
 T = np.linspace(0.0, 0.5, 1001)
 U = np.interp(T, [0.0, 0.1, 0.15, 0.3, 0.5], [0.2, 0.2, 0.9, -0.4, -0.4])

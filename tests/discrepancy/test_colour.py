@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
-from hvdc_ident.discrepancy.colour import RHO, TANH, likelihood, together, without_common
-from hvdc_ident.discrepancy.noise import Noise, draws, noise_of
+from hvdc_ident.discrepancy.noise.colour import RHO, TANH, likelihood, together, without_common
+from hvdc_ident.discrepancy.noise.records import Noise, draws, noise_of
 from hvdc_ident.fit import Problem
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array

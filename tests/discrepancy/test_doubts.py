@@ -13,13 +13,13 @@ from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
 from hvdc_ident.discrepancy import Options
-from hvdc_ident.discrepancy.constancy import constancy
-from hvdc_ident.discrepancy.doubts import Doubt, _turned, doubt
-from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.search import Outcome
-from hvdc_ident.discrepancy.select import Pick, Trial
-from hvdc_ident.discrepancy.state import Search
+from hvdc_ident.discrepancy.refits.constancy import constancy
+from hvdc_ident.discrepancy.refits.refit import Refit, run
+from hvdc_ident.discrepancy.search.forward import Outcome
+from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.trials.select import Pick, Trial
+from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.verdict.doubts import Doubt, _turned, doubt
 from hvdc_ident.frozen import FrozenMap
 
 

@@ -13,11 +13,11 @@ from refits import plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
-from hvdc_ident.discrepancy.hidden import Regression
-from hvdc_ident.discrepancy.law import _levels, law
-from hvdc_ident.discrepancy.library import hats
-from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.state import Search
+from hvdc_ident.discrepancy.outside.hidden import Regression
+from hvdc_ident.discrepancy.outside.law import _levels, law
+from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.trials.library import hats
+from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.expression.parser import parse
 from hvdc_ident.frozen import FrozenMap

@@ -10,9 +10,9 @@ from cases import experiments
 from refits import beside, plain
 
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import Job, Refit, run
-from hvdc_ident.discrepancy.state import Search
+from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
+from hvdc_ident.discrepancy.trials.race import Race
+from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 

@@ -12,10 +12,10 @@ from scipy.linalg import block_diag
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.discrepancy.inversion import Inversion
-from hvdc_ident.discrepancy.reach import SHARE, reach
-from hvdc_ident.discrepancy.response import Along
-from hvdc_ident.discrepancy.scores import Whitening, runs
+from hvdc_ident.discrepancy.scores.inversion import Inversion
+from hvdc_ident.discrepancy.scores.reach import SHARE, reach
+from hvdc_ident.discrepancy.scores.scored import Whitening, runs
+from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import SlotSignal, effects, scanned
 
 

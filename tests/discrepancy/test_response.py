@@ -8,9 +8,9 @@ from cases import TIME, TRUE, experiments, model
 from scipy.signal import StateSpace, lsim
 
 from hvdc_ident import Experiment, InputSignal, simulate
-from hvdc_ident.discrepancy.block import block
-from hvdc_ident.discrepancy.grid import instants
-from hvdc_ident.discrepancy.response import along
+from hvdc_ident.discrepancy.signatures.block import block
+from hvdc_ident.discrepancy.signatures.grid import instants
+from hvdc_ident.discrepancy.signatures.response import along
 from hvdc_ident.frozen import FrozenMap
 
 

@@ -12,17 +12,17 @@ from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.discrepancy.adequacy import Binned
-from hvdc_ident.discrepancy.ambiguity import _as_loss
-from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.objections import as_recorded, objections
-from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.rounds import against, one_round
-from hvdc_ident.discrepancy.select import Pick, Trial, behinds, shortlist
-from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.trials import excess, like_noise, misses
-from hvdc_ident.discrepancy.verdict import _half_told, _named
+from hvdc_ident.discrepancy.findings.ambiguity import _as_loss
+from hvdc_ident.discrepancy.findings.result import Rival
+from hvdc_ident.discrepancy.refits.adequacy import Binned
+from hvdc_ident.discrepancy.refits.refit import Refit, run
+from hvdc_ident.discrepancy.search.rounds import against, one_round
+from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.trials.objections import as_recorded, objections
+from hvdc_ident.discrepancy.trials.refitted import excess, like_noise, misses
+from hvdc_ident.discrepancy.trials.select import Pick, Trial, behinds, shortlist
+from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.verdict.judge import _half_told, _named
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 

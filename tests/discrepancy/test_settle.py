@@ -9,16 +9,16 @@ import pytest
 from cases import experiments
 from refits import beside, plain
 
-from hvdc_ident.discrepancy import settle
-from hvdc_ident.discrepancy.jobs import job_of
 from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.scores import runs
-from hvdc_ident.discrepancy.search import forward
-from hvdc_ident.discrepancy.select import Pick, Ruler, Trial, clear
-from hvdc_ident.discrepancy.settle import _last, settled
-from hvdc_ident.discrepancy.state import Round, Search
+from hvdc_ident.discrepancy.refits.refit import Refit, run
+from hvdc_ident.discrepancy.scores.scored import runs
+from hvdc_ident.discrepancy.search import settle
+from hvdc_ident.discrepancy.search.forward import forward
+from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.search.settle import _last, settled
+from hvdc_ident.discrepancy.trials.jobs import job_of
+from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial, clear
+from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.transform import home

@@ -15,17 +15,17 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal, simulate
 from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.discrepancy.adequacy import loud_after_breaks
-from hvdc_ident.discrepancy.akin import as_late, carried, with_begun
-from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.hops import _polished, hopped
-from hvdc_ident.discrepancy.jobs import as_given, job
-from hvdc_ident.discrepancy.looks import Stand, _twins
-from hvdc_ident.discrepancy.refit import Job, Refit, run
-from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.select import Pick, Trial, clear
-from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.trials import on_bound, once_more, refitted
+from hvdc_ident.discrepancy.refits.adequacy import loud_after_breaks
+from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
+from hvdc_ident.discrepancy.search.akin import as_late, carried, with_begun
+from hvdc_ident.discrepancy.search.looks import Stand, _twins
+from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.trials.hops import _polished, hopped
+from hvdc_ident.discrepancy.trials.jobs import as_given, job
+from hvdc_ident.discrepancy.trials.refitted import on_bound, once_more, refitted
+from hvdc_ident.discrepancy.trials.select import Pick, Trial, clear
+from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel

@@ -12,16 +12,16 @@ import pytest
 
 from hvdc_ident import simulate as package
 from hvdc_ident.discrepancy import Options
-from hvdc_ident.discrepancy.akin import bends
-from hvdc_ident.discrepancy.begin import added
-from hvdc_ident.discrepancy.candidates import Candidate
-from hvdc_ident.discrepancy.hops import hopped
-from hvdc_ident.discrepancy.jobs import job
-from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.refit import Job, Refit, judged, run
-from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.state import Search
-from hvdc_ident.discrepancy.trials import PROMISING, refitted
+from hvdc_ident.discrepancy.refits.begin import added
+from hvdc_ident.discrepancy.refits.nominal import nominal
+from hvdc_ident.discrepancy.refits.refit import Job, Refit, judged, run
+from hvdc_ident.discrepancy.search.akin import bends
+from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.trials.hops import hopped
+from hvdc_ident.discrepancy.trials.jobs import job
+from hvdc_ident.discrepancy.trials.refitted import PROMISING, refitted
+from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import EffectUse, Probe, effects
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem

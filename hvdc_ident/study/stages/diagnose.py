@@ -16,7 +16,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.discrepancy import Options as Budget
     from hvdc_ident.discrepancy import diagnose
-    from hvdc_ident.discrepancy.sizes import size_curves
+    from hvdc_ident.discrepancy.findings.sizes import size_curves
     from hvdc_ident.model.definition import Model
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start

@@ -1,0 +1,191 @@
+"""What a diagnosis found, and its JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from hvdc_ident.effects import effects
+from hvdc_ident.fit.result import plain
+from hvdc_ident.frozen import FrozenMap
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from hvdc_ident.model.external import AnyModel
+
+Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
+AUGMENTED = "augmented-model.toml"
+Table = Mapping[str, Mapping[str, float | None]]
+"""By output and experiment, in the output's unit; None where the run fails."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """A parameter of an effect, in `unit`. ci95: its 95 % interval; an end that is None is not known."""
+
+    value: float
+    ci95: tuple[float | None, float | None] | None = None
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was put into the model.
+
+    at: its slots. parameters: by the effect's own parameter names. text: one sentence. chosen_from: how many candidates
+    it was refitted against. source: the signal it brings in, for those that do.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    parameters: FrozenMap[Size]
+    text: str
+    chosen_from: int
+    source: str = ""
+
+    @property
+    def late(self) -> float | None:
+        """By how long it delays a slow signal, s; None for what is no delay of any kind."""
+        return effects()[self.effect].late_by({n: size.value for n, size in self.parameters.items()})
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A member of an ambiguity set. delta_bic: how far it is behind the best, 0 for the best itself.
+
+    refitted: whether that comes from a refit, or from the best one's with which its signature is the same. expression: of
+    a formula outside the catalogue, with its coefficients' names.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    delta_bic: float
+    parameters: FrozenMap[float] = field(default_factory=FrozenMap)
+    source: str = ""
+    refitted: bool = True
+    expression: str = ""
+
+    @property
+    def late(self) -> float | None:
+        """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
+        return effects()[self.effect].late_by(self.parameters) if self.parameters else None
+
+
+@dataclass(frozen=True)
+class Line:
+    """What was found about one candidate.
+
+    score: T = (s'Mr)^2/(s'Ms) at its best size. p: chance of such a score anywhere, under the noise. delta_bic: gain over
+    the refitted nominal, None where not refitted. holdout_rmse: pooled in noise units. absorbed: share of its signature
+    that the fitted parameters take up. status: refitted, scored, not-excited, absorbed or failed: REASON.
+    detectable: the smallest size that would have been seen, None where none would.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    score: float
+    p: float
+    status: str
+    size: FrozenMap[float] = field(default_factory=FrozenMap)
+    delta_bic: float | None = None
+    holdout_rmse: float | None = None
+    absorbed: float | None = None
+    detectable: FrozenMap[float] | None = None
+    source: str = ""
+    round: int = 1
+
+
+@dataclass(frozen=True)
+class Gap:
+    """RMSE of three models against the data.
+
+    nominal: with the given gains; refitted: the same model, fitted; augmented: with the effects, fitted. Each by "fit"
+    and "holdout". noise_floor: standard deviation of the noise by output, in its unit. pooled: the same three by "fit"
+    and "holdout" in noise units. shrink_holdout: 1 - augmented/refitted on the held-out experiments, pooled.
+    held_out: what "holdout" is: experiments, or (with none of that role) parts of the fitted ones, predicted from the rest.
+    """
+
+    nominal: Mapping[str, Table]
+    refitted: Mapping[str, Table]
+    augmented: Mapping[str, Table]
+    noise_floor: FrozenMap[float]
+    pooled: Mapping[str, Mapping[str, float | None]]
+    shrink_holdout: float | None
+    held_out: str = "experiments"
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """The outcome of a diagnosis; `to_dict` is the JSON.
+
+    verdict: named, no-evidence, not-excited, ambiguous or unnameable; text: why, in one or two sentences.
+    effects: those put into the model. ambiguity: for each of them the candidates that are as good, the best first, where
+    there is more than one, or where that one is in doubt. doubt: what tells that something else stands behind the effects,
+    though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would tell them
+    apart, or show what was not excited or is in doubt.
+    candidates: every candidate's line, the best first. location: where model and data differ. detectable: smallest size
+    by candidate. gap: before and after. remaining: what is left. parameters_*: by name; `parameters_refitted` are the
+    nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.
+    fallback: the form found outside the catalogue, if one was looked for. bode: responses of nominal and augmented
+    models with the data's. noise: standard deviation and AR coefficient by output, and where they come from.
+    """
+
+    verdict: Verdict
+    text: str
+    effects: tuple[Found, ...]
+    ambiguity: tuple[tuple[Rival, ...], ...]
+    separating_experiment: Mapping[str, Any]
+    candidates: tuple[Line, ...]
+    location: Mapping[str, Any]
+    detectable: Mapping[str, Any]
+    gap: Gap
+    remaining: Mapping[str, Any]
+    parameters_before: FrozenMap[float]
+    parameters_refitted: FrozenMap[float]
+    parameters_after: FrozenMap[float]
+    augmented: AnyModel | None = None
+    fallback: Mapping[str, Any] | None = None
+    bode: tuple[Mapping[str, Any], ...] = ()
+    noise: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    doubt: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The diagnosis as JSON takes it; `augmented_model` is the name of the card that `files` holds."""
+        out = {
+            name: plain(getattr(self, name))
+            for name in self.__dataclass_fields__
+            if name not in ("augmented", "candidates", "effects", "ambiguity")
+        }
+        out["effects"] = [_member(e) for e in self.effects]
+        out["ambiguity"] = [[_member(r) for r in group] for group in self.ambiguity]
+        out["candidates"] = [_named(line) for line in self.candidates]
+        out["augmented_model"] = next(iter(self.files), None)
+        return out
+
+    @property
+    def files(self) -> dict[str, str]:
+        """The augmented model's card by its file name; empty where nothing was put in, or the model has no card (an FMU)."""
+        from hvdc_ident.model import Model, write_card
+
+        return {AUGMENTED: write_card(self.augmented)} if isinstance(self.augmented, Model) else {}
+
+    def plot(self) -> Figure:
+        """The gap before and after by output, and the best candidates."""
+        from hvdc_ident.discrepancy.findings.plots import overview
+
+        return overview(self)
+
+
+def _named(value: Found | Rival | Line) -> dict[str, Any]:
+    """A line with `from` only where a signal is brought in."""
+    out = {k: plain(getattr(value, k)) for k in value.__dataclass_fields__ if k != "source"}
+    return out | ({"from": value.source} if value.source else {})
+
+
+def _member(value: Found | Rival) -> dict[str, Any]:
+    """The same, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
+    out = {k: v for k, v in _named(value).items() if k != "expression" or v}
+    return out | ({} if value.late is None else {"late": value.late})

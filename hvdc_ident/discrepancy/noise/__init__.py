@@ -1,0 +1,1 @@
+"""What the records say of their own noise: how large, how correlated, how coarse."""

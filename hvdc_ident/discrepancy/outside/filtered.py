@@ -1,0 +1,95 @@
+"""A linear filter that no chain of the catalogue's effects is: a notch or a resonance somewhere in the model.
+
+What passes a band of frequencies differently leaves a trace that lags and lead-lags come near to and never explain. The
+filter of second order is looked for as any effect is, by its scores at finite sizes and by refits, where none of them leaves
+noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.outside.law import standing
+from hvdc_ident.discrepancy.refits.nominal import Nominal
+from hvdc_ident.discrepancy.refits.refit import Refit
+from hvdc_ident.discrepancy.scores.scored import scored
+from hvdc_ident.discrepancy.signatures.candidates import Candidate, candidates
+from hvdc_ident.discrepancy.trials.formula import Law
+from hvdc_ident.discrepancy.trials.refitted import refitted
+from hvdc_ident.discrepancy.trials.select import Trial, best_of
+from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+BESIDES = ("low", "high")
+"""Parameters of the filter below and above its band."""
+PLACES = 4
+"""Places, the best by score, at which the filter is refitted."""
+LATE = -0.5
+"""Real part of the zeros, from -1 (those of a filter that only delays, in place of its poles) to 1, from which they are a
+notch's or a resonance's."""
+
+
+def filtered(search: Search, found: Round, trials: Sequence[Trial], best: Refit) -> Law | None:
+    """The filter that comes near the noise, clearly nearer than `best`, the best refit of the catalogue; None where there is
+    none. trials: those of `filters`."""
+    refits = [t.refit for t in trials]
+    return standing(search, found, refits, [None] * len(refits), best)[1]
+
+
+def filters(search: Search, found: Round, nominal: Nominal) -> tuple[Trial, ...]:
+    """Filters refitted where they score best, those that no chain of the catalogue's effects is: first a band alone, then one
+    that is off below and above it too. nominal: the model before the round, projected."""
+    paths, before = found.answers(), found.before
+    signals, times = slot_signals(paths, before.placed), [path.time for path in paths.values()]
+    everywhere = candidates(before.model, signals, times, ("filter",), search.places)
+    whole = tuple(c for c in everywhere if found.reaches(c))
+    scores = scored(nominal, whole, paths, bootstraps=0, seed=search.seed, executor=search.executor)
+    picks = best_of(scores, whole)[:PLACES]
+    both = replace(found, candidates=(*map(_band, whole), *whole), scores=scores)
+    wider = [replace(p, candidate=p.candidate + len(whole)) for p in picks]
+    trials = refitted(search, both, [*picks, *wider], "outside the catalogue")
+    return tuple(t for t in trials if not t.refit.failure and _rings(t.refit))
+
+
+def _band(candidate: Candidate) -> Candidate:
+    """The filter that changes nothing but a band."""
+    free = [FrozenMap({n: b for n, b in p.free.items() if n not in BESIDES}) for p in candidate.probes]
+    return replace(candidate, probes=tuple(replace(p, free=f) for p, f in zip(candidate.probes, free, strict=True)))
+
+
+def _rings(refit: Refit) -> bool:
+    """Whether poles and zeros of the filter are complex, as of no chain of lags and lead-lags, and the zeros not a delay's."""
+    zeros, poles = _polynomials(refit)
+    return _complex(zeros) and _complex(poles) and zeros[1] / zeros[0] > LATE * poles[1]
+
+
+def _complex(quadratic: Array) -> bool:
+    a, b, c = quadratic
+    return bool(b**2 < 4.0 * a * c)
+
+
+def _polynomials(refit: Refit) -> tuple[Array, Array]:
+    """Numerator and denominator of the filter that a refit ends with, the highest power first."""
+    p = refit.sizes(refit.placed[-1])
+    band = 2.0 * p["zeta"] * p["wn"]
+    above, below = 1.0 + p["k"] * p["high"], 1.0 + p["k"] * p["low"]
+    return np.array([above, band * (1.0 + p["k"]), p["wn"] ** 2 * below]), np.array([1.0, band, p["wn"] ** 2])
+
+
+def shape(refit: Refit) -> str:
+    """Whether the filter that a refit ends with lowers or raises most, and where, in words."""
+    omega = refit.sizes(refit.placed[-1])["wn"] * np.geomspace(0.1, 10.0, 2001)
+    numerator, denominator = _polynomials(refit)
+    level = np.log(np.abs(np.polyval(numerator, 1j * omega) / np.polyval(denominator, 1j * omega)))
+    most = np.argmax(np.abs(level))
+    return f"a {'notch' if level[most] < 0 else 'resonance'} around {omega[most]:.3g} rad/s"
+
+
+def transfer_function(refit: Refit) -> str:
+    """The filter that a refit ends with, as a fraction of polynomials in s."""
+    told = [" + ".join((f"{a:.4g} s^2", f"{b:.4g} s", f"{c:.4g}")) for a, b, c in _polynomials(refit)]
+    return "/".join(f"({t.removeprefix('1 ').replace('+ -', '- ')})" for t in told)

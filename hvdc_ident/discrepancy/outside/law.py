@@ -1,0 +1,240 @@
+"""A law found from the records: terms of the model's own signals, chosen by sparse regression at each slot, and refitted.
+
+For what the catalogue has no name for. A formula is a claim: by full simulation it has to stand the tests that an effect of
+the catalogue has to, and to leave noise of the fitted records and of the others, or its terms to be chosen from other noise too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from hvdc_ident.discrepancy.noise.records import draws
+from hvdc_ident.discrepancy.outside.hidden import Regression, regression
+from hvdc_ident.discrepancy.refits.adequacy import adequacy
+from hvdc_ident.discrepancy.refits.nominal import Nominal
+from hvdc_ident.discrepancy.refits.refit import Refit, unseen
+from hvdc_ident.discrepancy.signatures.candidates import source_signals
+from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.discrepancy.trials.formula import Law, at_run, formula_job
+from hvdc_ident.discrepancy.trials.library import Term, hats, terms
+from hvdc_ident.discrepancy.trials.refitted import RACE, is_far
+from hvdc_ident.discrepancy.trials.select import Ruler
+from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.fit.executor import mapped
+from hvdc_ident.trajectory import Array
+
+MOST = 3
+"""Terms of one formula."""
+STABLE = 0.8
+"""Share of noise records from which the same terms have to be chosen where more than noise is left."""
+AGAIN = 25
+CLOSE = 2.0
+"""What a formula may leave, in noise units (of chi2 a row, and held out)."""
+PLACES = 6
+"""Places, the best by regression, at which the form is tried by full simulation."""
+KNOTS = 11
+"""Of a curve: a tenth of what its signal travels from one to the next."""
+CURVES = 2
+"""Curves, the best by regression, that are tried by full simulation where no formula comes near the noise."""
+MOSTLY = 0.75
+"""Share of what is beyond noise that a form has to explain to first order to be tried by full simulation."""
+OVER = 6
+"""Signals that a curve at a slot may be over."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Slot:
+    """What is regressed at one slot: a library, and curves, each of hats over a signal's levels.
+
+    noise: (N, B) records of it, projected; price: what a term has to bring.
+    """
+
+    nominal: Nominal
+    paths: Mapping[str, Along]
+    place: str
+    library: tuple[Term, ...]
+    curves: tuple[tuple[Term, ...], ...]
+    noise: Array
+    price: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """Terms chosen at a slot with their coefficients. fall: of chi2, to first order. stability: None of the hats of a curve,
+    which were not chosen."""
+
+    place: str
+    terms: tuple[Term, ...]
+    coefficients: Array
+    fall: float
+    stability: float | None
+
+    def worth(self, price: float) -> float:
+        """The fall less the price of the terms."""
+        return self.fall - len(self.terms) * price
+
+    @property
+    def label(self) -> str:
+        """What is put in, and where."""
+        what = (
+            " + ".join(t.text for t in self.terms)
+            if self.stability is not None
+            else f"a curve over {self.terms[0].signals[0]}"
+        )
+        return f"{what} at {self.place}"
+
+    def less(self) -> list[_Form]:
+        """It, and without its last term where that came to a pair: linear in a bias of the gains, it may not be needed."""
+        shorter = replace(self, terms=self.terms[:-1], coefficients=self.coefficients[:-1])
+        return [self, shorter] if len(self.terms) == MOST else [self]
+
+
+def law(search: Search, found: Round, best: Refit | None = None) -> Law | None:
+    """The formula that explains most of what the model before a round lacks; None where none stands every test.
+
+    Looked for within reach, as the round has it. None, too, for a model that is closed inside. best: of the refits of the
+    catalogue, which a formula has to beat to be near the noise where they are not.
+    """
+    before, paths = found.before, {n: p for n, p in found.answers().items() if isinstance(p, Along)}
+    if len(paths) < len(before.problem.fitted_experiments):
+        return None
+    gap = before.chi2 - before.rows
+    forms = [f for f in _forms(search, found, paths) if f.fall > MOSTLY * gap]
+    formulas = [shorter for form in [f for f in forms if f.stability is not None][:PLACES] for shorter in form.less()]
+    told = _best(search, found, formulas, best)
+    if told is not None and told.near:
+        return told
+    return _best(search, found, [f for f in forms if f.stability is None][:CURVES], best) or told
+
+
+def _best(search: Search, found: Round, forms: Sequence[_Form], best: Refit | None) -> Law | None:
+    """The form, refitted, that leaves least for the price of its terms; None where none stands every test."""
+    before, jobs, of = found.before, [], []
+    for form in forms:
+        with suppress(HvdcIdentError):  # it cannot sit there: a loop through itself, or no name of the model's
+            jobs.append(formula_job(before, form.place, form.terms, form.coefficients))
+            of.append(form)
+    texts = [f"outside the catalogue: {form.label}" for form in of]
+    refits = RACE.run(search, before.chi2, jobs, texts)
+    k, one = standing(search, found, refits, [form.stability for form in of], best)
+    return one and replace(one, terms=of[k].terms)
+
+
+def standing(
+    search: Search, found: Round, refits: Sequence[Refit], stable: Sequence[float | None], best: Refit | None
+) -> tuple[int, Law | None]:
+    """Of the forms that were refitted the one that leaves least for the price of its terms, of those that stand every test,
+    and which it is; None where none does. stable: the share of noise records that each was chosen from."""
+    costs = {k: r.chi2 + r.count * _price(search, found) for k, r in enumerate(refits) if not r.failure}
+    for k in sorted(costs, key=lambda k: costs[k]):
+        one = _tested(search, found.before, refits[k], stable[k], best)
+        if one is not None:
+            alike = [j for j in costs if j != k and costs[j] - costs[k] <= search.options.set_bic]
+            return k, replace(one, others=tuple(refits[j] for j in alike))
+    return -1, None
+
+
+def _price(search: Search, found: Round) -> float:
+    return search.options.named_bic + float(np.log(found.before.rows))
+
+
+def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Form]:
+    """Of every slot the terms that are chosen there; what brings most first."""
+    before, nominal = found.before, found.before.nominal()
+    signals = slot_signals(paths, before.placed)
+    sources = source_signals(before.model, signals)
+    drawn = draws(before.problem, nominal.blocks, before.noise, nominal.fitted(), AGAIN, search.seed + 77)
+    noise, price = nominal.projected(np.vstack(drawn)), _price(search, found)
+
+    @cache
+    def curve(signal: str) -> tuple[Term, ...]:
+        return hats(signal, _levels([p.values[signal] for p in paths.values()]))
+
+    jobs = []
+    for place in signals:
+        if search.looks_at(place) and (found.reach is None or place in found.reach.enough):
+            own = [n for n in (place.removeprefix("outputs."),) if all(n in p.values for p in paths.values())]
+            near = list(dict.fromkeys([*own, *sources]))
+            library, curves = terms(near), tuple(curve(n) for n in near[:OVER])
+            used = {n for t in (*library, *(t for c in curves for t in c)) for n in t.signals}
+            slim = {
+                n: replace(p.only(place), values={s: v for s, v in p.values.items() if s in used})
+                for n, p in paths.items()
+            }
+            jobs.append(_Slot(nominal, slim, place, library, curves, noise, price))
+    forms = []
+    for k, own_forms in enumerate(mapped(search.executor, _at_slot, jobs)):
+        search.tell(k + 1, len(jobs), f"hidden input at {jobs[k].place}")
+        forms += own_forms
+    return sorted(forms, key=lambda f: -f.worth(price))
+
+
+def _levels(signals: Sequence[Array]) -> Array:
+    """Levels of a signal, one array an experiment, with as much travelled between any two neighbours: more where it moves more."""
+    ends = np.sort(np.concatenate([np.column_stack([u[:-1], u[1:]]) for u in signals]), axis=1)
+    edges = np.unique(ends)
+    # Each level between two edges is passed by the steps that begin below and end above it.
+    passed = np.searchsorted(np.sort(ends[:, 0]), edges[:-1], "right") - np.searchsorted(
+        np.sort(ends[:, 1]), edges[:-1], "right"
+    )
+    travelled = np.concatenate([[0.0], np.cumsum(passed * np.diff(edges))])
+    return np.interp(np.linspace(0.0, travelled[-1], KNOTS), travelled, edges)
+
+
+def _at_slot(slot: _Slot) -> list[_Form]:
+    """What is chosen at a slot from its library, and its best curve; as far as they are worth their price."""
+    curves = [f for c in slot.curves if len(c) > 2 and (f := _curve(slot, c)) is not None]
+    best = max(curves, key=lambda f: f.worth(slot.price), default=None)
+    return [f for f in (_formula(slot), best) if f is not None]
+
+
+def _curve(slot: _Slot, curve: tuple[Term, ...]) -> _Form | None:
+    """A curve at a slot; None where it is not worth its price, or its signal skips a level, as one that steps does."""
+    found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in curve])
+    if np.linalg.norm(found.columns, axis=0).min() < 1e-6 * np.linalg.norm(found.columns):
+        return None
+    values, gain = found.solved(range(len(curve)))
+    form = _Form(slot.place, curve, values, gain, None)
+    return form if form.worth(slot.price) > 0 else None
+
+
+def _formula(slot: _Slot) -> _Form | None:
+    """What is chosen at a slot from its library; None where nothing is worth its price."""
+    found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in slot.library])
+    chosen = found.selected(MOST, slot.price)
+    if not chosen:
+        return None
+    coefficients, gain = found.solved(chosen)
+    stability = _stability(found, chosen, coefficients, slot)
+    return _Form(slot.place, tuple(slot.library[j] for j in chosen), coefficients, gain, stability)
+
+
+def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, slot: _Slot) -> float:
+    """The share of records, the terms' answer with other noise, from which the same terms are chosen."""
+    explained = found.columns[:, list(chosen)] @ coefficients
+    again = [found.selected(MOST, slot.price, explained + noise) for noise in slot.noise.T]
+    return sum(set(a) == set(chosen) for a in again) / len(again)
+
+
+def _tested(search: Search, before: Refit, refit: Refit, stability: float | None, best: Refit | None) -> Law | None:
+    """The law; None where it does not stand the tests an effect of the catalogue has to."""
+    ruler = Ruler.of(refit)
+    gain = ruler.gain(before.chi2, refit.chi2, refit.count - before.count)
+    was, now = unseen(before), unseen(refit)
+    if was is None or now is None or gain <= search.options.named_bic or was - now <= search.options.holdout_share:
+        return None
+    if refit.chi2 / refit.rows > CLOSE or now > CLOSE:
+        return None  # what it leaves has to be next to noise
+    explained = before.chi2 - refit.chi2
+    tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
+    if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):
+        return None
+    ahead = best is None or ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic
+    near = ahead and not is_far(before, refit)
+    return Law(refit, gain, stability, near) if near or (stability or 0.0) >= STABLE else None

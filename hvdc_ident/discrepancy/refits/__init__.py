@@ -1,0 +1,1 @@
+"""Gains and effects fitted together, and whether what a fit leaves looks like noise."""

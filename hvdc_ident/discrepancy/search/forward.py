@@ -1,0 +1,62 @@
+"""Forward addition round by round, and pairs where one masks the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hvdc_ident.discrepancy.refits.refit import Refit
+from hvdc_ident.discrepancy.search.pairs import pair
+from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.search.settle import settled
+from hvdc_ident.discrepancy.trials.refitted import is_noise
+from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.errors import SimulationError
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Where the search ended.
+
+    rounds: all of them; kept: by effect of the final model, the round that judges its rivals; notes: what could not be done.
+    """
+
+    refit: Refit
+    rounds: tuple[Round, ...]
+    kept: tuple[Round, ...]
+    notes: tuple[str, ...] = ()
+
+
+def forward(search: Search, first: Refit) -> Outcome:
+    """The effects that are added one after the other, each with all others refitted, until nothing is worth adding."""
+    rounds: list[Round] = []
+    kept: list[Round] = []
+    here = first
+    notes: tuple[str, ...] = ()
+    for number in range(1, search.options.most + 1):
+        if kept:
+            rounds[-1] = kept[-1] = kept[-1].light()
+        try:
+            found = one_round(search, here, number)
+        except SimulationError as error:
+            if number == 1:
+                raise
+            notes = (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
+            break
+        rounds.append(found)
+        if found.winner is None:
+            hopeful = found.significant and found.law is None and number < search.options.most
+            both = pair(search, here, found) if hopeful else None
+            if both is None:
+                break
+            rounds[-1] = both[0]
+            kept += [both[0], both[1]]
+            here = both[1].winner.refit if both[1].winner else here
+            break
+        kept.append(found)
+        here = found.winner.refit
+        if is_noise(here, search.seed):
+            break
+    if len(kept) > 1:
+        here, kept, more = settled(search, first, here, kept, len(rounds))
+        notes += more
+    return Outcome(here, tuple(rounds), tuple(kept), notes)

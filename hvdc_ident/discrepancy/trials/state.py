@@ -1,0 +1,108 @@
+"""What a search carries from room to room: what stays the same over its rounds, and what one of them found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.refits.begin import Placed
+from hvdc_ident.discrepancy.refits.refit import Refit
+from hvdc_ident.discrepancy.scores.reach import Reach
+from hvdc_ident.discrepancy.scores.scored import Path, Scores, runs
+from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.trials.formula import Law
+from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
+from hvdc_ident.fit.executor import Executor, Progress
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+
+
+@dataclass(frozen=True)
+class Search:
+    """What stays the same over the rounds."""
+
+    effects: tuple[str, ...] | Literal["all"]
+    places: tuple[str | tuple[str, ...], ...] | None
+    material: FrozenMap[float]
+    options: Options
+    seed: int
+    executor: Executor | None = None
+    progress: Progress | None = None
+
+    def tries(self, effect: str) -> bool:
+        """Whether an effect is among those looked for."""
+        return self.effects == "all" or effect in self.effects
+
+    def looks_at(self, slot: str) -> bool:
+        """Whether a slot is among those looked at."""
+        return self.places is None or any(slot in ((g,) if isinstance(g, str) else g) for g in self.places)
+
+    def tell(self, done: int, total: int, text: str) -> None:
+        """Nothing; whoever watches is told."""
+        if self.progress:
+            self.progress(done, total, text)
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """What one round found. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
+
+    trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
+    reach: what of the gap could be made good at each slot; None where that is not known. laws: the formula outside the
+    catalogue that explains most, or nothing; None where none was looked for. filters: the refits of linear filters; None
+    where there are none. spared: whether nothing came near the noise and what a thorough search would refit was not.
+    """
+
+    before: Refit
+    paths: Mapping[str, Path]
+    candidates: tuple[Candidate, ...]
+    scores: Scores
+    trials: tuple[Trial, ...]
+    failed: tuple[Trial, ...]
+    same: Mapping[int, list[Pick]]
+    winner: Trial | None
+    why: str
+    significant: bool
+    ruler: Ruler | None
+    reach: Reach | None = None
+    laws: tuple[Law, ...] | None = None
+    filters: tuple[Trial, ...] | None = None
+    spared: bool = False
+
+    @property
+    def law(self) -> Law | None:
+        """The formula that leaves next to nothing but noise, where no effect that was refitted does."""
+        return next((one for one in self.laws or () if one.near), None)
+
+    def reaches(self, candidate: Candidate) -> bool:
+        """Whether a candidate sits where enough of the gap could be made good."""
+        return self.reach is None or any(p in self.reach.enough for p in candidate.at)
+
+    def answers(self) -> Mapping[str, Path]:
+        """How the model answers at its slots, by experiment: worked out again where the round has let go of that."""
+        return self.paths or runs(self.before.model, self.before.nominal())
+
+    def light(self) -> Round:
+        """The round without those answers, which are hundreds of MiB of a large model."""
+        return replace(self, paths={})
+
+    def score_p(self, candidate: int) -> tuple[float, float, int]:
+        """The best score of a candidate, its p, and the column it stands in (-1: none)."""
+        t = self.scores.t
+        own = [k for k, c in enumerate(self.scores.columns) if c.candidate == candidate]
+        if not own:
+            return 0.0, 1.0, -1
+        k = max(own, key=lambda j: t[j])
+        return float(t[k]), self.scores.p(float(t[k])), k
+
+
+def slot_signals(paths: Mapping[str, Path], placed: Sequence[Placed] = ()) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot that all experiments have, one array an experiment.
+
+    placed: effects that are in the model already; nothing is looked for inside them.
+    """
+    common = [p for p in next(iter(paths.values())).slots if all(p in a.slots for a in paths.values())]
+    outer = [p for p in common if not any(one.use.made(p) for one in placed)]
+    return {p: tuple(a.signal(p) for a in paths.values()) for p in outer}

@@ -1,0 +1,1 @@
+"""What is said in the end, and what speaks against saying it."""
