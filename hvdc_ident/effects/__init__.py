@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.effects.placing import EffectUse, apply
+from hvdc_ident.effects.placing import EffectUse, apply, each_its_own, joined
 from hvdc_ident.effects.probing import Probe, SlotSignal, alone, clearance, probes, resistances, scanned, sources
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
@@ -25,7 +25,9 @@ __all__ = [
     "alone",
     "apply_effects",
     "clearance",
+    "each_its_own",
     "effects",
+    "joined",
     "probes",
     "resistances",
     "scanned",

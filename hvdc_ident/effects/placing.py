@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,8 +26,9 @@ class EffectUse:
     """An effect at one or more slots that share its parameters.
 
     parameters: values that differ from the effect's own; a text is the name of a parameter of the model that stands
-    in for it. source: the other signal that the effect brings in (`from` in a study file): any slot. prefix: of its
-    names in the model; default EFFECT_SLOT. expression: the term, where the effect is one.
+    in for it. source: the other signal that the effect brings in (`from` in a study file): any slot; or, joined by commas,
+    one for each of its places, as each station brings in a signal of its own. prefix: of its names in the model; default
+    EFFECT_SLOT. expression: the term, where the effect is one.
     """
 
     effect: str
@@ -52,21 +53,28 @@ class EffectUse:
                 expected="effect = NAME, at = SLOT or [SLOT, ...]",
                 got=str(dict(given)),
             )
-        at = given["at"]
+        at, source = given["at"], given.get("from", "")
         return cls(
             str(given["effect"]),
             (at,) if isinstance(at, str) else tuple(at),
             FrozenMap(given.get("parameters", {})),
             str(given.get("prefix", "")),
-            str(given.get("from", "")),
+            source if isinstance(source, str) else joined(source),
             str(given.get("expression", "")),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """The use as it stands in a study file; `of` gives it back."""
         result: dict[str, Any] = {"effect": self.effect, "at": list(self.at), "parameters": dict(self.parameters)}
-        extra = {"from": self.source, "expression": self.expression, "prefix": self.prefix}
-        return result | {key: text for key, text in extra.items() if text}
+        source = list(self.sources) if "," in self.source else self.source
+        extra = {"from": source, "expression": self.expression, "prefix": self.prefix}
+        return result | {key: told for key, told in extra.items() if told}
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """By place the signal that is brought in there; () where the effect brings none in. Raises ModelError where they
+        are neither one for all places nor one for each."""
+        return each_its_own(self.source, self.at)
 
     @property
     def label(self) -> str:
@@ -85,6 +93,25 @@ class EffectUse:
     def prefix_at(self, place: str) -> str:
         """What the names begin with of all that the effect adds at a place."""
         return f"{self.label}_{place.replace('.', '_')}"
+
+
+def joined(sources: Iterable[str]) -> str:
+    """One text of what is brought in by place: of one signal its name."""
+    own = list(sources)
+    return ", ".join(own[:1] if len(set(own)) == 1 else own)
+
+
+def each_its_own(source: str, at: Sequence[str]) -> tuple[str, ...]:
+    """By place what `joined` put into one text: one signal for all, or one for each."""
+    names = tuple(name.strip() for name in source.split(",")) if source else ()
+    if len(names) > 1 and len(names) != len(at):
+        raise ModelError(
+            "an effect brings in one signal, or one for each of its places",
+            where=f"the effect at {', '.join(at)}, from",
+            expected=f"1 or {len(at)} names",
+            got=source,
+        )
+    return names * len(at) if len(names) == 1 else names
 
 
 def apply(model: Model, use: EffectUse, effect: Effect) -> Model:
@@ -121,15 +148,21 @@ def apply(model: Model, use: EffectUse, effect: Effect) -> Model:
             raise e.at(f"{where}, parameter '{n}'") from None
         symbols[n] = symbol(name)
     model = replace(model, parameters=model.parameters | added)
-    for place in use.at:
-        model = _at_one(model, place, use, effect, symbols, where)
+    for place, source in zip(use.at, use.sources or ("",) * len(use.at), strict=True):
+        model = _at_one(model, place, source, use, effect, symbols, where)
     return model
 
 
 def _at_one(
-    model: Model, place: str, use: EffectUse, effect: Effect, symbols: Mapping[str, sp.Expr], where: str
+    model: Model,
+    place: str,
+    source: str,
+    use: EffectUse,
+    effect: Effect,
+    symbols: Mapping[str, sp.Expr],
+    where: str,
 ) -> Model:
-    """The model with the effect at one of its slots."""
+    """The model with the effect at one of its slots. source: what is brought in there."""
     kind, name = slot(model, place)
     circular = kind in ("signal", "algebraic") and _leads_back(model, name)
 
@@ -138,7 +171,7 @@ def _at_one(
         # The slot's own name stands for what it was before the effect: after it, it would run in a circle.
         own = {symbol(name): u} if kind in ("signal", "algebraic") else {}
         if effect.needs_source:
-            p["from"] = _source(m, use.source, where).xreplace(own)
+            p["from"] = _source(m, source, where).xreplace(own)
         if effect.needs_expression:
             p["expression"] = _term(use, symbols, where).xreplace(own)
         add = Additions(m, use.prefix_at(place), kind, circular)

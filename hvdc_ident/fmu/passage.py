@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, effects, joined
 from hvdc_ident.effects.placing import apply
 from hvdc_ident.errors import InputError, ModelError, unknown_name
 from hvdc_ident.expression.functions import symbol
@@ -75,12 +75,13 @@ def _check(model: FmuModel, use: EffectUse) -> None:
                 expected="a number",
                 got=repr(value),
             )
-    read = [(use.source, "from")] if use.source else []
+    brought = use.sources
+    read = []
     if use.expression:
         names = {s.name for s in parse(use.expression, where=f"{where}, expression").free_symbols}
-        read += [(n, "expression") for n in sorted(names - use.parameters.keys() - {"time"})]
-    for place in use.at:
-        for name, key in read:
+        read = sorted(names - use.parameters.keys() - {"time"})
+    for k, place in enumerate(use.at):
+        for name, key in [*((n, "from") for n in brought[k : k + 1]), *((n, "expression") for n in read)]:
             _check_reading(model, place, name, f"{where}, {key}")
 
 
@@ -110,15 +111,17 @@ def _at(model: FmuModel, end: End) -> tuple[EffectUse, ...]:
     """The effects with those of their places that lie at one end, in the passage's names."""
     found = []
     for use in model.effects:
-        places = [e for p in use.at if (e := end_of(model, p)) is not None and e[0] == end]
+        ends = [end_of(model, p) for p in use.at]
+        here = [k for k, e in enumerate(ends) if e is not None and e[0] == end]
+        places = [e for k in here if (e := ends[k]) is not None]
         letter = "u" if end == "input" else "y"
         if places:
-            source = end_of(model, use.source) if use.source else None
+            read = [e for k in here if use.source and (e := end_of(model, use.sources[k])) is not None]
             found.append(
                 replace(
                     use,
                     at=tuple(f"{letter}{k}" for _, k in places),
-                    source=f"{letter}{source[1]}" if source else "",
+                    source=joined(f"{letter}{k}" for _, k in read),
                     expression=_renamed(model, use),
                 )
             )

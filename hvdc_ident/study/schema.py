@@ -62,7 +62,7 @@ class Effect(Table):
     effect: Name
     at: Annotated[Names, BeforeValidator(lambda v: [v] if isinstance(v, str) else v)]
     parameters: dict[Name, FiniteFloat | Name] = {}
-    source: Name | None = Field(default=None, alias="from")
+    source: Name | Names | None = Field(default=None, alias="from")
     expression: Annotated[str, StringConstraints(max_length=2000)] | None = None
 
 

@@ -212,6 +212,25 @@ def test_one_effect_on_several_slots_shares_its_parameter():
     assert len(model.states) == len(LINK.states) + 2
 
 
+def test_one_effect_on_several_slots_may_bring_in_a_signal_of_each():
+    shared = {"effect": "droop", "at": ["Pref2", "Qref1"], "from": ["Vdc2", "Vdc1"], "parameters": {"k": 2.0}}
+    model = LINK.with_effects([shared])
+    assert [n for n in model.parameters if n not in LINK.parameters] == ["droop_Pref2_k"]
+    one_by_one = LINK.with_effects(
+        [
+            {"effect": "droop", "at": at, "from": seen, "parameters": {"k": 2.0}}
+            for at, seen in zip(shared["at"], shared["from"], strict=True)
+        ]
+    )
+    mine, theirs = (simulate(m, CASE).trajectory.values for m in (model, one_by_one))
+    np.testing.assert_array_equal(mine, theirs)
+    assert np.abs(mine - simulate(LINK, CASE).trajectory.values).max() > 1e-4
+    assert parse_card(write_card(model)) == model
+    assert EffectUse.of(shared).to_dict() == shared
+    with pytest.raises(ModelError, match=r"one for each of its places.*1 or 2 names, got Vdc2, Vdc1, Vdc1"):
+        LINK.with_effects([{**shared, "from": ["Vdc2", "Vdc1", "Vdc1"]}])
+
+
 def test_a_resistance_of_the_model_stands_in():
     model = LINK.with_effects([{"effect": "inductance", "at": "Idc", "parameters": {"L": 1e-6, "R": "Rdc"}}])
     assert [n for n in model.parameters if n not in LINK.parameters] == ["inductance_Idc_L"]

@@ -8,6 +8,7 @@ from c_fmu import needs_compiler
 from c_models import FAULTY, TWIN, spring
 
 from hvdc_ident import simulate
+from hvdc_ident.discrepancy.signatures.candidates import candidates
 from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.frozen import FrozenMap
@@ -42,6 +43,10 @@ CASES = [
     ([{"effect": "quantisation", "at": "u", "parameters": {"step": 0.3}}], ["quantisation_u_step"]),
     ([{"effect": "quantisation", "at": "y", "parameters": {"step": 0.3}}], ["quantisation_y_step"]),
     ([{"effect": "coupling", "at": "y", "from": "twice", "parameters": {"k": 0.3}}], ["coupling_y_k"]),
+    (
+        [{"effect": "coupling", "at": ["y", "twice"], "from": ["twice", "y"], "parameters": {"k": 0.3}}],
+        ["coupling_y_k"],
+    ),
     ([{"effect": "term", "at": "u", "expression": "c*u**2", "parameters": {"c": 0.3}}], ["term_u_c"]),
 ]
 EDGES = {"sample_hold_u_Ts": {"twice"}}
@@ -78,6 +83,16 @@ def test_a_term_and_a_droop_read_the_outputs_under_the_names_of_the_fmu(fmu):
     droop = {"effect": "droop", "at": "outputs.y", "from": "outputs.twice", "parameters": {"k": 0.2}}
     found = simulate(fmu(spring()).with_effects([droop]), RUN)["y"]
     assert found == pytest.approx(y - 0.2 * (twice - twice[0]), abs=1e-5)
+
+
+def test_what_is_looked_for_at_the_ends_can_sit_there(fmu):
+    model = fmu(spring())
+    run = simulate(model, RUN)
+    signals = {"u": (RUN.inputs["u"](TIME),), "y": (run["y"],), "twice": (run["twice"],)}
+    found = [c for c in candidates(model, signals, [TIME], "all", None) if c.source]
+    assert {(c.at, c.source) for c in found} == {(("y",), "twice"), (("twice",), "y")}
+    for c in found:
+        model.with_effects([c.use(c.probes[0])])
 
 
 REFUSED = [

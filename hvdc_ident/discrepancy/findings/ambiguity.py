@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Trial, at_edge, behinds, best_gain, best_of
 from hvdc_ident.discrepancy.trials.state import Round
-from hvdc_ident.effects import effects
+from hvdc_ident.effects import each_its_own, effects
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -144,7 +144,7 @@ def _as_loss(found: Round, group: Sequence[Rival]) -> list[Rival]:
     return [
         replace(r, effect="loss", parameters=FrozenMap(), refitted=False)
         for r in leaks
-        if all(r.source in p.slots and _keeps_sign(p.signal(r.source)) for p in paths)
+        if all(s in p.slots and _keeps_sign(p.signal(s)) for p in paths for s in each_its_own(r.source, r.at))
     ]
 
 

@@ -41,7 +41,9 @@ def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
     units = {n: q.unit for n, q in entry.parameters.items()}
     words = {n: quantity(v, units.get(n, "")) for n, v in sizes.items()}
     at = placed.candidate.at
-    words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": placed.candidate.source}
+    own = dict.fromkeys(placed.candidate.sources)
+    brought = f"its own of {listed(tuple(own))}" if len(own) > 1 else placed.candidate.source
+    words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought}
     if (late := entry.late_by(sizes)) is not None:
         words["late"] = quantity(late, "s")
     text = entry.sentence

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.effects import Effect, EffectUse, Probe, SlotSignal, effects, probes, resistances, sources
+from hvdc_ident.effects import (
+    Effect,
+    EffectUse,
+    Probe,
+    SlotSignal,
+    each_its_own,
+    effects,
+    joined,
+    probes,
+    resistances,
+    sources,
+)
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
@@ -27,7 +38,8 @@ STILL = 1e-9
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect at one place, or at several that share its parameters. source: the signal it brings in.
+    """One effect at one place, or at several that share its parameters. source: the signal it brings in, or, joined by
+    commas, one for each place.
 
     named: parameters of the model that stand in for some of its own. still: whether its signal never moves.
     """
@@ -43,6 +55,11 @@ class Candidate:
     def label(self) -> str:
         """What tables call it."""
         return f"{self.effect} at {', '.join(self.at)}" + (f" from {self.source}" if self.source else "")
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """By place the signal that is brought in there; () where none is."""
+        return each_its_own(self.source, self.at)
 
     def use(self, probe: Probe) -> EffectUse:
         """The effect as the model takes it."""
@@ -75,6 +92,8 @@ def candidates(
     groups = places_of(model, live, places)
     about = {p: SlotSignal.of(times, signals[p], tones) for p in live}
     brought = source_signals(model, signals)
+    if not isinstance(model, Model):
+        brought += tuple(p for p in live if kind_of(model, p) == "output")
     tried = entries(names)
     doubled = any(e.name == "coupling" for e in tried)
     found: list[Candidate] = []
@@ -114,14 +133,34 @@ def _at(
         ]  # fmt: skip
     if not effect.needs_source:
         return [Candidate(effect.name, at, probes(effect, signal), still=still and not additive(effect))]
-    if len(at) > 1:
-        return []
-    open_to = set(sources(model, at[0])) if isinstance(model, Model) else set(_open_ends(model, at[0]))
+    open_to = [_open_to(model, p, [*about]) for p in at]
+    seen = {
+        own: SlotSignal.joined([about[s] for s in own])
+        for own in own_sources(at, brought, about)
+        if all(s in may for s, may in zip(own, open_to, strict=True))
+    }
     return [
-        Candidate(effect.name, at, _halved(probes(effect, signal, about[s])), source=s)
-        for s in brought
-        if s in open_to and s != at[0] and not (still and about[s].high == about[s].low)
+        Candidate(effect.name, at, _halved(probes(effect, signal, other)), source=joined(own))
+        for own, other in seen.items()
+        if not (still and other.high == other.low)
     ]
+
+
+def own_sources(at: Sequence[str], brought: Sequence[str], known: Collection[str]) -> list[tuple[str, ...]]:
+    """By place what an effect brings in: any signal at one place; at one slot of each of several stations, told by a number
+    in its name, the same signal of each station. known: signals there are, of which some are not worth bringing in alone.
+    """
+    if len(at) == 1:
+        return [(s,) for s in brought]
+    numbers = [re.findall(r"\d+", p) for p in at]
+    alike = len({re.sub(r"\d+", "#", p) for p in at}) == 1
+    if not alike or any(len(n) != 1 for n in numbers) or len({n for (n,) in numbers}) < len(at):
+        return []
+    stations = [n for (n,) in numbers]
+    families = {
+        tuple(re.sub(r"\d+", n, s) for n in stations): None for s in brought if re.findall(r"\d+", s) in numbers
+    }
+    return [own for own in families if all(s in known for s in own)]
 
 
 def _proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
@@ -160,9 +199,12 @@ def kind_of(model: AnyModel, place: str) -> str:
     raise unknown_name("slot", place, model.slots, where=f"model '{model.name}', which is closed inside")
 
 
-def _open_ends(model: AnyModel, place: str) -> tuple[str, ...]:
-    """What an effect at an end of a closed model may bring in: its inputs, for an output would close a loop around it."""
-    return tuple(n for n in model.inputs if n != place)
+def _open_to(model: AnyModel, place: str, brought: Sequence[str]) -> set[str]:
+    """What an effect at a place may bring in: nothing that would close a circle. At an end of a closed model signals of its
+    own side: an output at an input would close a loop around it, and what comes out does not see what goes in."""
+    if isinstance(model, Model):
+        return {*sources(model, place)} - {place}
+    return {s for s in brought if s != place and kind_of(model, s) == kind_of(model, place)}
 
 
 def _moves(model: AnyModel, place: str) -> bool:

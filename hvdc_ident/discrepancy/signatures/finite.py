@@ -50,11 +50,12 @@ class Kind:
 
 @dataclass(frozen=True)
 class Task:
-    """One column: its equations, slots, the signal it brings in, its values, its place among the columns."""
+    """One column: its equations, slots, the signals it brings in (none, one for all slots, or one each), its values, its
+    place among the columns."""
 
     kind: Kind
     at: tuple[str, ...]
-    source: str
+    sources: tuple[str, ...]
     values: tuple[float, ...]
     index: int
 
@@ -72,8 +73,9 @@ def tasks(candidates: Sequence[Candidate], columns: Sequence[Column], size: int)
         c = candidates[column.candidate]
         present = _present(c, column.probe)
         values = tuple(float(c.probes[column.probe].values[n]) for n in present)
-        task = Task(Kind(c.effect, present, bool(c.source)), c.at, c.source, values, k)
-        by_place.setdefault((*c.at, c.source), []).append(task)
+        own = c.sources if len(set(c.sources)) > 1 else c.sources[:1]
+        task = Task(Kind(c.effect, present, bool(own)), c.at, own, values, k)
+        by_place.setdefault((*c.at, *own), []).append(task)
     parcels: list[list[Task]] = [[]]
     for members in by_place.values():
         if parcels[-1] and len(parcels[-1]) + len(members) > most:
@@ -111,11 +113,11 @@ def signatures(
 
 
 class _Parcel:
-    """Some columns on their way to a closed loop. u: by column what its slots, then the brought signal, see (m, K)."""
+    """Some columns on their way to a closed loop. u: by column what its slots, then the brought signals, see (m, K)."""
 
     def __init__(self, model: Along | Ends, parcel: tuple[Task, ...]) -> None:
         self.model, self.parcel = model, parcel
-        self.places = [(*t.at, t.source) if t.source else t.at for t in parcel]
+        self.places = [(*t.at, *t.sources) for t in parcel]
         self.base = [np.array([model.signal(p) for p in at]) for at in self.places]
         self.u = list(self.base)
         self.y = np.zeros((len(model.outputs), model.count, len(parcel)))
@@ -147,7 +149,7 @@ class _Parcel:
             brought = None
             if kind.brings:
                 brought = np.concatenate(
-                    [np.repeat(self.u[c][-1:], w, 0) for c, w in zip(members, widths, strict=True)]
+                    [np.resize(self.u[c][w:], (w, self.u[c].shape[1])) for c, w in zip(members, widths, strict=True)]
                 ).T
             own = {
                 parameter(n): np.repeat([self.parcel[c].values[k] for c in members], widths)

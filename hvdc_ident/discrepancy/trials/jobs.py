@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.refits.refit import Job, Refit
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Pick
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, effects, joined
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
@@ -91,7 +91,7 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         parameters: dict[str, float | str] = {**values, **named}
         # What sat behind an effect that is left out sits where that one did.
         at_slots = tuple(home(model.slots, place) for place in p.use.at)
-        source = home(model.slots, p.use.source) if p.use.source else ""
+        source = joined(home(model.slots, s) for s in p.use.sources)
         use = EffectUse(p.use.effect, at_slots, FrozenMap(parameters), source=source, expression=p.use.expression)
         before = set(model.parameters)
         model = model.with_effects([use])
