@@ -22,7 +22,7 @@ from hidden.cases import PARTS, Design, designs, factorial, made  # noqa: E402
 from hidden.judging import summary  # noqa: E402
 from hidden.reporting import report  # noqa: E402
 
-SEED = 41
+SEED = 42
 """Of the reported cases. Thresholds were settled on others (--seed 1)."""
 
 
