@@ -199,7 +199,7 @@ class Search:
             except np.linalg.LinAlgError:
                 pass
             else:
-                if np.isfinite(slope).all() and np.linalg.cond(jac) < 1e13:
+                if np.isfinite(slope).all() and (not jac.size or np.linalg.cond(jac) < 1e13):
                     return np.asarray(slope)
         return np.asarray(np.linalg.lstsq(jac, -right, rcond=1e-12)[0])
 

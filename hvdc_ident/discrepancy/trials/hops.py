@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.discrepancy.refits.nominal import orthonormal
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, judged, of_held_out, run, signal
+from hvdc_ident.discrepancy.refits.refit import Found, Job, Refit, found_by, judged, of_held_out, run, signal
 from hvdc_ident.discrepancy.scores.dense import BETWEEN, by_level, sized
 from hvdc_ident.discrepancy.scores.scan import PATIENT
 from hvdc_ident.discrepancy.trials.jobs import as_given
@@ -109,17 +109,18 @@ def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Re
     here = further(here, _Sweep(_closely))
     here |= further({k: here[k] for k in counted}, _Sweep(_other_counts, between=False))
     best = [k for k in sorted(counted, key=lambda k: _left(here[k]))[:POLISHED] if here[k].chi2 < ROUGH * here[k].rows]
-    here |= dict(zip(best, mapped(search.executor, _polished, [here[k] for k in best]), strict=True))
+    polished = mapped(search.executor, _polished, [here[k] for k in best])
+    here |= {k: outcome.refit(jobs[k]) for k, outcome in zip(best, polished, strict=True)}
     found = stuck | _agreed(search, here)
     return [found[k] for k in range(len(jobs))]
 
 
-def _polished(here: Refit) -> Refit:
-    """The refit from where a simplex ends, where that is better: rows that go over an edge make of a slope a stair."""
+def _polished(here: Refit) -> Found:
+    """What the refit from where a simplex ends comes to, where that is better: rows that go over an edge make of a slope a stair."""
     simplex = NelderMead(max_evaluations=RUNS, size=SIMPLEX, cost=0.05, step=1e-8, restarts=2)
     end = simplex.run(replace(here.problem, simulator=ModelSimulator(here.model, PATIENT)), here.theta)
     there = run(Job(here.model, here.placed, here.problem, (end.theta,), here.noise))
-    return min(here, here if there.failure else there, key=_left)
+    return found_by(min(here, here if there.failure else there, key=_left))
 
 
 def _further(
