@@ -31,39 +31,48 @@ class LocalRank:
     points: how many could be simulated. independent: the most parameters that are told together once the others are
     held, the earlier listed where there is a choice. combinations: what is seen of the others. note: what the numbers
     cannot see. A parameter of which nothing at all is seen stands among the independent ones: the data's verdict on it
-    says more.
+    says more. moving: the parameters that move the outputs, at any of the points, by more than the sensitivities' error.
     """
 
     points: int
     independent: tuple[str, ...]
     combinations: tuple[Combination, ...] = ()
     note: str = ""
+    moving: tuple[str, ...] = ()
 
 
 def local_rank(problem: Problem, seed: int = 0) -> LocalRank:
-    """The rank of the whitened sensitivities of the problem's experiments, at five random points within the bounds.
+    """The rank of the whitened sensitivities of the problem's experiments, at the start and five random points in the bounds.
 
-    Points that cannot be simulated are passed over, and counted in the note.
+    Points that cannot be simulated are passed over; the random ones are counted in the note.
     """
     names = tuple(f.name for f in problem.free)
     error = sensitivity_error(problem.simulator)
     stacked, failures = [], []
-    for theta in _points(problem, seed):
+    for k, theta in enumerate([problem.start, *_points(problem, seed)]):
         try:
             _, jacobian = problem.residual(theta)
         except SimulationError as e:
-            failures.append(e.what)
+            failures += [e.what] if k else []
             continue
         stacked.append(jacobian * _slope(problem, theta))
     note = _note(failures, error)
+    moving = _moving(stacked, names, error)
     null = _lost(stacked, len(names), error) if stacked else np.zeros((0, len(names)))
     if not null.size:
-        return LocalRank(len(stacked), names, note=note)
+        return LocalRank(len(stacked), names, note=note, moving=moving)
     logs = [f.min > 0 for f in problem.free]
     combos = combinations_of(null, names, logs, [f.start for f in problem.free], "structural")
     held = held_of(null)
     told = tuple(n for i, n in enumerate(names) if i not in held)
-    return LocalRank(len(stacked), told, combos, note)
+    return LocalRank(len(stacked), told, combos, note, moving)
+
+
+def _moving(stacked: Sequence[Array], names: Sequence[str], error: float) -> tuple[str, ...]:
+    """The parameters whose column is at some point longer than the sensitivities' error, of the longest there."""
+    norms = [np.linalg.norm(j, axis=0) for j in stacked]
+    seen = [n[: len(names)] > error * n.max(initial=0.0) for n in norms]
+    return tuple(n for i, n in enumerate(names) if any(s[i] for s in seen))
 
 
 def _note(failures: Sequence[str], error: float) -> str:

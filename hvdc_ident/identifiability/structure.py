@@ -16,6 +16,7 @@ from hvdc_ident.identifiability.local_rank import METHOD, local_rank
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.rank.combination import Combination as Found
 from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
+from hvdc_ident.simulate.structure import Structure as Equations
 
 SECONDS = 10.0
 """How long the symbolic test may compute; the shipped link takes 3."""
@@ -28,7 +29,7 @@ class Structure:
     status: decided, or not decided. method: "symbolic" or "numerical, local". admissible: the most that can be told
     together once the others are held; the earlier listed where there is a choice. combinations: what is seen of others.
     note: why it is not decided, or what the method cannot see. unmoved: parameters that show only where an input is
-    moved that was not.
+    moved that was not, or in another regime. moving: parameters that move the outputs along the records, by numbers.
     """
 
     status: str
@@ -37,6 +38,7 @@ class Structure:
     combinations: tuple[Combination, ...] = ()
     note: str = ""
     unmoved: tuple[str, ...] = ()
+    moving: tuple[str, ...] = ()
 
     @property
     def local(self) -> bool:
@@ -54,9 +56,11 @@ def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure
 
     Numbers decide, locally, where there are no equations, or the equations have parts that the test does not reach
     (delays, sampling, recordings played in, instruments); where it ran out of time they stand in, undecided.
-    Where the equations lose a combination that the numbers, with all experiments together, tell apart, the numbers are
-    right: several operating points show more than one does. A parameter of which nothing at all is seen with the inputs
-    that were moved is structural only where no other input would show it; else it is left to the data's verdict.
+    The equations are asked in the regime of the start: every limiter on the branch it then has, every switch of time
+    where it then stands. What the records' own runs see beyond that, in other regimes or from several starts, counts: a
+    parameter whose derivative along them is more than its error is not lost, and a combination whose members no
+    direction without effect moves is told apart. A parameter of which nothing at all is seen with the inputs that were
+    moved is structural only where no other input would show it and no switch could; else it is left to the data's verdict.
     """
     numbers = numerical_structure(problem, seed)
     if model is None:
@@ -72,18 +76,18 @@ def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure
     if result.status != "decided":
         return _undecided(numbers, result.reason)
     alone = [c.members[0] for c in result.combinations if len(c.members) == 1]
-    hidden = _hidden(model, alone, names, outputs, seed)
-    together = tuple(_combination(c) for c in result.combinations if len(c.members) > 1)
-    if together and not numbers.combinations:
-        note = "one move from one start would not tell them all apart, but these experiments together do"
-        together, kept = (), set(names)
-    else:
-        note, kept = "", {*identifiable_subset(result), *alone}
-    unseen = tuple(Combination((n,), (), "structural", text=f"nothing is seen of {n}") for n in hidden)
+    hidden = _hidden(model, [n for n in alone if n not in numbers.moving], names, outputs, seed)
+    hidden -= _behind_switches(model, outputs)
+    together, told = _confirmed([c for c in result.combinations if len(c.members) > 1], numbers)
+    kept = {*identifiable_subset(result), *alone, *told}
+    note = ""
+    if told:
+        apart = ", ".join(n for n in names if n in told)
+        note = f"the equations at the start would not tell {apart} apart, but these experiments do"
+    unseen = tuple(Combination((n,), (), "structural", text=f"nothing is seen of {n}") for n in names if n in hidden)
     admissible = tuple(n for n in names if n in kept and n not in hidden)
-    return Structure(
-        "decided", result.method, admissible, (*together, *unseen), note, tuple(n for n in alone if n not in hidden)
-    )
+    unmoved = tuple(n for n in alone if n not in hidden and n not in numbers.moving)
+    return Structure("decided", result.method, admissible, (*together, *unseen), note, unmoved, numbers.moving)
 
 
 def moves(experiments: Sequence[Experiment]) -> dict[str, Literal["step", "free"]]:
@@ -104,6 +108,44 @@ def _hidden(model: Model, alone: Sequence[str], names: Sequence[str], outputs: S
         return set()
     wide: StructuralResult = structural_identifiability(model, names, outputs, seed=seed, time_limit=SECONDS)
     return {n for n in alone if any(c.members == (n,) for c in wide.combinations)}
+
+
+def _confirmed(found: Sequence[Found], numbers: Structure) -> tuple[tuple[Combination, ...], set[str]]:
+    """The combinations that the numbers lose too, and the parameters that the numbers tell apart.
+
+    Of a combination that the numbers lose in part only, that part stands, in the numbers' words.
+    """
+    lost = set(numbers.unidentifiable)
+    stand: dict[tuple[str, ...], Combination] = {}
+    told: set[str] = set()
+    for c in found:
+        members = set(c.members)
+        if members <= lost:
+            stand[c.members] = _combination(c)
+            continue
+        told |= (members - lost) | (members & set(numbers.admissible))
+        stand |= {part.members: part for part in numbers.combinations if members & set(part.members)}
+    return tuple(stand.values()), told
+
+
+def _behind_switches(model: Model, outputs: Sequence[str]) -> set[str]:
+    """The parameters that stand in a limiter or another switch on the way to the outputs: in its branches or its condition.
+
+    The equations are asked with every switch on one branch, so nothing is proved of what stands on the others.
+    """
+    compiled = Equations(model, (), outputs)
+    graph = compiled.graph
+    unknowns = (*compiled.derivatives, *compiled.residuals)
+    reached, roots = set[int](), [*compiled.observed]
+    while roots:
+        new = [n for n in graph.reachable(roots) if n not in reached]
+        reached.update(new)
+        leaves = [graph.nodes[n] for n in new if graph.nodes[n][0] == "leaf"]
+        roots = [unknowns[k] for _, group, k in leaves if group == "y" and unknowns[k] not in reached]
+    switches = [n for n in reached if graph.nodes[n][0] == "select"]
+    behind = [graph.nodes[n] for n in graph.reachable(switches) if graph.nodes[n][0] == "leaf"]
+    listed = list(model.parameters)
+    return {listed[k] for _, group, k in behind if group == "p"}
 
 
 def _combination(c: Found) -> Combination:
@@ -134,4 +176,4 @@ def numerical_structure(problem: Problem, seed: int = 0) -> Structure:
     names = tuple(f.name for f in problem.free)
     if not found.points:
         return Structure("not decided", METHOD, names, note="no random point could be simulated")
-    return Structure("decided", METHOD, found.independent, found.combinations, found.note)
+    return Structure("decided", METHOD, found.independent, found.combinations, found.note, moving=found.moving)

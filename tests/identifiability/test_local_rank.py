@@ -153,7 +153,7 @@ def test_differences_with_their_error_stated_see_what_exact_sensitivities_see() 
     free = (Free("a", 2, 0.5, 5), Free("b", 3, 0.5, 5), Free("c", 1, -5, 5))
     data = measured(exact, {"a": 2.5}, 0.01)
     found = local_rank(Problem(rough, (data,), free))
-    assert found.points == 5 and found.independent == ("a", "c") and "good to 0.0001" in found.note
+    assert found.points == 6 and found.independent == ("a", "c") and "good to 0.0001" in found.note
     assert found.combinations[0].seen == ("a*b",)
     silent = Differences(exact, sensitivity_error=0.0)
     assert local_rank(Problem(silent, (data,), free)).combinations == ()
