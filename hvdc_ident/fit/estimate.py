@@ -32,6 +32,8 @@ from hvdc_ident.trajectory import Array
 
 STARTS = 8
 """Runs of a multistart, where nothing else is said."""
+SAME = 0.1
+"""A run whose cost is higher by less has reached the optimum: no estimate is off by half its standard deviation."""
 SETTLED = 1e-3
 """A Gauss-Newton step that lowers the cost by less moves no estimate by a twentieth of its standard deviation."""
 
@@ -62,9 +64,9 @@ def fit(
     first = prepared(problem, whiten)
     begins = [first.start, *latin_hypercube(first.free, first.unknowns[len(first.free) :], count - 1, seed)]
     runs = _run_all(first, begins, method, executor, progress)
-    usable = [Optimum(r.theta, r.cost) for r in runs if r.status != "failed" and r.cost is not None]
-    if not usable:
+    if all(r.status == "failed" or r.cost is None for r in runs):
         return _failed(first, begins, runs)
+    usable = [Optimum(r.theta, r.cost) for r in runs if r.cost is not None]
     local = TrustRegion()
     problem, best, rivals = weighted(first, usable, local)
     if has_clocks(problem):
@@ -79,8 +81,8 @@ def fit(
     worth = min(1.0, sum(inner.effective.values()) / samples)
     optima = [best] if inner.singular else distinct(problem, [best, *rivals], worth)
     outcomes = _outcomes(problem, begins, runs, weigh=problem is not first)
-    settled = None if problem is first and best in usable else promised(problem, best.theta) <= SETTLED
-    status, message = _status(problem, best, optima, runs, outcomes, worth, settled)
+    again = problem is not first or best not in usable
+    status, message = _status(problem, best, optima, outcomes, worth, again=again)
     found = estimates_of(problem, best.theta, blocks, inner, all_unknowns)
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     result = FitResult(
@@ -188,27 +190,25 @@ def _status(
     problem: Problem,
     best: Optimum,
     optima: Sequence[Optimum],
-    runs: Sequence[OptimiserResult],
     outcomes: Sequence[StartOutcome],
     worth: float,
-    settled: bool | None,
+    *,
+    again: bool,
 ) -> tuple[Status, str]:
     """The status of the whole fit and why, worst first.
 
-    settled: whether the optimum stands in the final weights, where it was found again in them; else None, and a run has
-    to have arrived there.
+    again: whether the optimum was found once more in other weights than the runs had.
     """
-    slack = 1e-6 * best.cost + 1e-9
-    arrived = [o for o in outcomes if o.status == "converged" and o.cost is not None and o.cost <= best.cost + slack]
     lower = [o for o in outcomes if o.cost is not None and (best.cost - o.cost) * worth > DISTINCT]
-    if lower and lower[0].status == "failed":
-        return "not-converged", f"a run that failed had reached a lower cost: {lower[0].message}"
-    if not any(r.status == "converged" for r in runs) and not settled:
-        return "not-converged", f"no run reached an optimum: {_words_of_best(runs)}"
-    if settled is False:
+    if lower:
+        return "not-converged", f"a run had reached a lower cost: {lower[0].message}"
+    there = _arrived(problem, best, outcomes, worth)
+    if not again and all(o.status == "flat" for o in there):
+        return "not-converged", f"the start with the lowest cost did not move: {there[0].message}"
+    if again and promised(problem, best.theta) > SETTLED:
         return "not-converged", "found again in its final weights, the optimum does not stand: the cost still falls"
-    if settled is None and not arrived:
-        return "not-converged", f"the best run did not reach an optimum: {_words_of_best(runs)}"
+    if not again and not _stands(problem, best, there):
+        return "not-converged", f"the best run did not reach an optimum: {there[0].message}"
     near = [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
     if near:
         theta = ", ".join(f"{n} = {v:.6g}" for n, v in zip(problem.names, near[0].theta, strict=True))
@@ -216,14 +216,31 @@ def _status(
     at_bound = [f.name for f, v in zip(problem.unknowns, best.theta, strict=True) if not f.min < v < f.max]
     if at_bound:
         return "at-bound", f"on a bound: {', '.join(at_bound)}"
-    count = sum(o.status == "converged" for o in outcomes)
-    there = f"{len(arrived)} to this optimum" if settled is None else "and the best again in the final weights"
-    return "converged", f"{count} of {len(outcomes)} runs converged, {there}"
+    if again:
+        count = sum(o.status == "converged" for o in outcomes)
+        return "converged", f"{count} of {len(outcomes)} runs converged, and the best again in the final weights"
+    flat = sum(o.status == "flat" for o in outcomes)
+    unmoved = f"; {flat} could not move, for no compared output answers where they start" if flat else ""
+    return "converged", f"{len(there)} of {len(outcomes)} runs reached this optimum{unmoved}"
 
 
-def _words_of_best(runs: Sequence[OptimiserResult]) -> str:
-    """Why the run with the lowest cost ended."""
-    return min((r for r in runs if r.cost is not None), key=lambda r: r.cost or 0.0).message
+def _arrived(problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], worth: float) -> list[StartOutcome]:
+    """The runs that reached the best cost, the best first, to within what moves no estimate by half its spread."""
+    slack = max(1e-6 * best.cost, SAME / worth)
+    reached = [(o.cost, o) for o in outcomes if o.cost is not None and o.cost <= best.cost + slack]
+    return [o for _, o in sorted(reached, key=lambda pair: pair[0])]
+
+
+def _stands(problem: Problem, best: Optimum, there: Sequence[StartOutcome]) -> bool:
+    """Whether the best point is an optimum: a run says so that arrived, or nothing is left to gain, or two runs agree.
+
+    Runs that ended at one point from different starts have found what there is to be found, whatever stopped them.
+    """
+    if any(o.status == "converged" for o in there) or promised(problem, best.theta) <= SETTLED:
+        return True
+    space = problem.coordinates
+    ends = [space.scaled(np.array([o.end[n] for n in problem.names])) for o in there if o.status == "stalled"]
+    return sum(bool((np.abs(x - space.scaled(best.theta)) <= 1e-3 * space.ranges).all()) for x in ends) > 1
 
 
 def _held(problem: Problem) -> FrozenMap[str]:

@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.trajectory import Array
 
-Outcome = Literal["converged", "max-evaluations", "stopped", "failed"]
+Outcome = Literal["converged", "max-evaluations", "stopped", "stalled", "flat", "failed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,8 @@ class OptimiserResult:
 
     theta: (p,) the best admissible point seen, each unknown in its unit; the start where nothing else was admissible.
     status: converged, at an optimum by the method's own criterion; max-evaluations; stopped, by another rule of the
-    method; failed.
+    method; stalled, no step lowers the cost although its derivatives promise one; flat, the start lies where no output
+    answers to any unknown, so that the run could not move; failed.
     cost: half the sum of squares there; None where not even the start could be simulated. message: why the run ended.
     evaluations: simulations of the whole set of experiments, failed ones included.
     """

@@ -54,8 +54,7 @@ def distinct(problem: Problem, ends: Sequence[Optimum], worth: float = 1.0) -> l
 def _same(problem: Problem, a: Optimum, b: Optimum, worth: float) -> bool:
     space = problem.coordinates
     x, y = space.scaled(a.theta), space.scaled(b.theta)
-    ranges = np.array([np.log(u.drawn[1] / u.drawn[0]) if u.log else 1.0 for u in problem.unknowns])
-    if (np.abs(x - y) <= 1e-3 * ranges).all():
+    if (np.abs(x - y) <= 1e-3 * space.ranges).all():
         return True
     if (max(a.cost, b.cost) - min(a.cost, b.cost)) * worth >= DISTINCT:
         return False

@@ -99,6 +99,11 @@ class Coordinates:
         return np.array([u.span for u in self.unknowns])
 
     @cached_property
+    def ranges(self) -> Array:
+        """(p,): how far apart the bounds are in scaled coordinates; 1 where a bound is infinite."""
+        return np.array([np.log(u.drawn[1] / u.drawn[0]) if u.log else 1.0 for u in self.unknowns])
+
+    @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """(p,), (p,): the bounds in scaled coordinates."""
         low, high = self._limits

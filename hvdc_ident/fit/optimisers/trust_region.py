@@ -21,13 +21,21 @@ NAME = "trust-region"
 SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"
 
 
+PROBES = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
+"""Tiny steps, in units of `probe`, from which the scatter of the cost is told."""
+LUCK = 3.0
+"""A promised reduction within so many standard deviations of the cost's scatter cannot be told from it: the point stood on
+is the luckiest of some twenty (1.9 below the mean, the expected minimum), and the next has to be lower still."""
+
+
 @dataclass(frozen=True)
 class TrustRegion:
     """Options of the method; all tolerances are relative and without unit.
 
     max_evaluations: simulations of the whole set a run may take. gradient: largest cosine between the residual and a
     free column at which a point counts as stationary. reduction: smallest relative reduction of the cost worth a step.
-    step: smallest step in scaled coordinates. damping: first lambda.
+    step: smallest step in scaled coordinates. damping: first lambda. probe: length, in scaled coordinates, of the steps
+    that show how far the cost scatters by the simulation's own error.
     """
 
     max_evaluations: int = 200
@@ -35,9 +43,10 @@ class TrustRegion:
     reduction: float = 1e-13
     step: float = 1e-11
     damping: float = 1e-3
+    probe: float = 1e-9
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run from `start` ended: converged, max-evaluations, or failed with the reason."""
+        """Where the run from `start` ended: converged, max-evaluations, stalled, flat, or failed with the reason."""
         walk = _Walk(problem, self)
         status, message = walk.go(start)
         return OptimiserResult(walk.theta, walk.cost, status, message, walk.evaluations)
@@ -71,11 +80,13 @@ class _Walk:
         damping, growth = self.options.damping, 2.0
         while self.evaluations < self.options.max_evaluations:
             assert self.cost is not None
+            if not self.jacobian.any():
+                return "flat", "no compared output answers to any of the unknowns there"
             if self._stationary(low, high):
                 return "converged", "the gradient is zero"
             size = np.maximum(size, _norms(self.jacobian))
             p = _step(self.jacobian, self.r, damping, size, low - self.x, high - self.x)
-            predicted = self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
+            predicted = self._predicted(p)
             if predicted > 0 and np.abs(p).max() > self.options.step:
                 before = self.cost
                 if self._move(self.x + p, space, better_than=before):
@@ -119,15 +130,43 @@ class _Walk:
         return bool((np.abs(g) <= self.options.gradient * scale).all())
 
     def _standstill(self, size: Array, low: Array, high: Array) -> tuple[Outcome, str]:
-        """What a step too small to count means: an optimum, a failing region or a gradient that does not fit."""
+        """The outcome where steps are too small to count: an optimum, a failing region or a gradient that does not fit."""
         if self.failure:
             return "failed", f"every step down leads to where the simulation fails: {self.failure}"
         p = _step(self.jacobian, self.r, 1e-10, size, low - self.x, high - self.x)
         assert self.cost is not None
-        left = self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
+        left = self._predicted(p)
         if left <= 1e-4 * self.cost + 1e-12 * self.r.size:
             return "converged", "no smaller step lowers the cost"
-        return "failed", "stalled: the sensitivities promise a lower cost that no step reaches (a jump, or their error)"
+        error = self._scatter(p, low, high)
+        if left <= LUCK * error:
+            return "converged", f"no step lowers the cost by more than its own scatter there ({error:.2g})"
+        return "stalled", "the sensitivities promise a lower cost that no step reaches (a jump, or their error)"
+
+    def _predicted(self, p: Array) -> float:
+        """The reduction of the cost that the linearised residuals promise for the step p."""
+        assert self.cost is not None
+        return self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
+
+    def _scatter(self, p: Array, low: Array, high: Array) -> float:
+        """The standard deviation of the cost over tiny steps along p, less what the linear model says of them.
+
+        A smooth cost has none. Adaptive steps of an integrator make it jump from one parameter value to the next, however
+        close they are (Moré and Wild 2011, "Estimating computational noise", doi 10.1137/100786125).
+        """
+        space = self.problem.coordinates
+        unit = self.options.probe * p / np.abs(p).max()
+        changes = []
+        for k in PROBES:
+            x = np.clip(self.x + k * unit, low, high)
+            self.evaluations += 1
+            try:
+                r, _ = self.problem.residual(space.unscaled(x))
+            except SimulationError:
+                continue
+            assert self.cost is not None
+            changes.append(0.5 * float(r @ r) - self.cost + self._predicted(x - self.x))
+        return float(np.std(changes)) if len(changes) > 2 else 0.0
 
 
 def _norms(jacobian: Array) -> Array:
