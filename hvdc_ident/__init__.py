@@ -19,9 +19,19 @@ if TYPE_CHECKING:
     from hvdc_ident.formats import read_waveforms
     from hvdc_ident.identifiability import identifiability
     from hvdc_ident.linearize import LinearModel, OperatingPoint, find_operating_point, linearize
+    from hvdc_ident.linearize.compare import compare
+    from hvdc_ident.linearize.gap import gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.loop import loop, plant_and_controller
+    from hvdc_ident.linearize.margins import loop_margins, margins
+    from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
+    from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
+    from hvdc_ident.linearize.reduce import balanced
+    from hvdc_ident.linearize.symbolic import symbolic_transfer
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
+    from hvdc_ident.sensitivity.global_screening import morris, sobol
+    from hvdc_ident.sensitivity.linear import linear_sensitivities
     from hvdc_ident.sensitivity.local import sensitivities
     from hvdc_ident.sensitivity.sweep import sweep
     from hvdc_ident.simulate import simulate
@@ -39,20 +49,39 @@ __all__ = [
     "Model",
     "OperatingPoint",
     "Parameter",
+    "Port",
     "Trajectory",
     "__version__",
+    "balanced",
+    "compare",
     "diagnose",
     "export",
     "find_operating_point",
     "fit",
+    "gap",
+    "h2_norm",
+    "hinf_norm",
     "identifiability",
+    "linear_sensitivities",
     "linearize",
+    "linf_norm",
     "load_model",
     "load_study",
+    "loop",
+    "loop_margins",
+    "margins",
+    "morris",
+    "ncf_margin",
+    "nu_gap",
+    "plant_and_controller",
+    "port_admittance",
+    "port_impedance",
     "read_waveforms",
     "sensitivities",
     "simulate",
+    "sobol",
     "sweep",
+    "symbolic_transfer",
 ]
 
 _HOME = {
@@ -63,19 +92,38 @@ _HOME = {
     "Model": "model.definition",
     "OperatingPoint": "linearize",
     "Parameter": "parameters",
+    "Port": "linearize.port",
     "Trajectory": "trajectory",
+    "balanced": "linearize.reduce",
+    "compare": "linearize.compare",
     "diagnose": "discrepancy",
     "export": "study.export",
     "find_operating_point": "linearize",
     "fit": "fit",
+    "gap": "linearize.gap",
+    "h2_norm": "linearize.norms",
+    "hinf_norm": "linearize.norms",
     "identifiability": "identifiability",
+    "linear_sensitivities": "sensitivity.linear",
     "linearize": "linearize",
+    "linf_norm": "linearize.norms",
     "load_model": "models",
     "load_study": "study.study",
+    "loop": "linearize.loop",
+    "loop_margins": "linearize.margins",
+    "margins": "linearize.margins",
+    "morris": "sensitivity.global_screening",
+    "ncf_margin": "linearize.gap",
+    "nu_gap": "linearize.gap",
+    "plant_and_controller": "linearize.loop",
+    "port_admittance": "linearize.port",
+    "port_impedance": "linearize.port",
     "read_waveforms": "formats",
     "sensitivities": "sensitivity.local",
     "simulate": "simulate",
+    "sobol": "sensitivity.global_screening",
     "sweep": "sensitivity.sweep",
+    "symbolic_transfer": "linearize.symbolic",
 }
 
 

@@ -192,46 +192,6 @@ def bands(model: LinearModel, omega: Array | Sequence[float], covariance: Array,
     )
 
 
-def impedance(
-    model: LinearModel,
-    voltages: Sequence[str],
-    currents: Sequence[str],
-    omega: Array | Sequence[float],
-    *,
-    into: bool = True,
-) -> Response:
-    """The impedance matrix voltages/currents seen at a port: outputs over inputs that are injected currents.
-
-    voltages: outputs; currents: inputs, in matching order (d, q). into: False where the current input is drawn from the
-    port, as a load is: the sign is then turned so that a passive network has a positive real part.
-    """
-    part = model.channel(list(currents), list(voltages))
-    found = frequency_response(part, omega)
-    sign = 1.0 if into else -1.0
-    return Response(
-        found.omega, sign * found.values, found.output_names, found.input_names, found.units, source="impedance"
-    )
-
-
-def admittance(
-    model: LinearModel,
-    voltages: Sequence[str],
-    currents: Sequence[str],
-    omega: Array | Sequence[float],
-    *,
-    into: bool = True,
-) -> Response:
-    """The inverse of `impedance`; raises LinearizationError where the impedance is singular."""
-    z = impedance(model, voltages, currents, omega, into=into)
-    if z.values.shape[1] != z.values.shape[2]:
-        raise LinearizationError("an admittance needs as many voltages as currents", got=f"{z.values.shape[1:]}")
-    try:
-        values = np.linalg.inv(z.values)
-    except np.linalg.LinAlgError:
-        raise LinearizationError("the impedance is singular at one of the frequencies") from None
-    return Response(z.omega, values, z.input_names, z.output_names, source="admittance")
-
-
 def values_at(model: LinearModel, changes: Mapping[str, float], omega: Array) -> Array:
     """The response after small changes of parameters, to first order: what a band is made of."""
     slopes = sensitivity(model, omega, list(changes))

@@ -30,8 +30,8 @@ def linearize(
     model: AnyModel,
     point: OperatingPoint | None = None,
     *,
-    inputs: Sequence[str] | None = None,
-    outputs: Sequence[str] | None = None,
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
     pade_order: int = 5,
     sensitivities: Sequence[str] = (),
     side: Side = "refuse",
@@ -47,13 +47,15 @@ def linearize(
     Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
 
     >>> from hvdc_ident import linearize, load_model
-    >>> linear = linearize(load_model("vsc-hvdc-link"), inputs=["Vdcref1"], outputs=["Irorder1"])
+    >>> linear = linearize(load_model("vsc-hvdc-link"), inputs="Vdcref1", outputs="Irorder1")
     >>> linear.A.shape, linear.D.shape
     ((6, 6), (1, 1))
     >>> [round(mode.frequency_hz, 2) for mode in linear.modes() if mode.frequency_hz > 0.1]
     [4.87, 4.87]
     """
     at = find_operating_point(model) if point is None else point
+    inputs = [inputs] if isinstance(inputs, str) else inputs
+    outputs = [outputs] if isinstance(outputs, str) else outputs
     if not isinstance(model, Model):
         from hvdc_ident.linearize.external import linear_model
 

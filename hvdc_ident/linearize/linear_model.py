@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
     import control
 
     from hvdc_ident.linearize.frequency import Response
+    from hvdc_ident.linearize.margins import LoopMargins, Margins
     from hvdc_ident.linearize.modal import Mode
+    from hvdc_ident.linearize.reduce import Reduction
     from hvdc_ident.linearize.zeros import TransferFunction
 
 
@@ -156,6 +159,50 @@ class LinearModel:
             raise unknown_name(kind, name, names, where=f"linear model '{self.name}'")
         return names.index(name)
 
+    def scaled(self, sizes: Mapping[str, float]) -> LinearModel:
+        """Return the model with some inputs and outputs counted in other units: 1 is then the size given for it.
+
+        sizes: by input or output, in its unit. Raises UnknownNameError, LinearizationError for a size not above 0.
+        """
+        for name, size in sizes.items():
+            if name not in self.input_names and name not in self.output_names:
+                known = (*self.input_names, *self.output_names)
+                raise unknown_name("input or output", name, known, where=f"linear model '{self.name}'")
+            if not (np.isfinite(size) and size > 0):
+                raise LinearizationError("a size is not above 0", where=f"scale of '{name}'", got=f"{size:g}")
+        u = np.array([sizes.get(n, 1.0) for n in self.input_names])
+        y = np.array([sizes.get(n, 1.0) for n in self.output_names])[:, None]
+        core, n = self.delay_free, 0 if self.delay_free is None else self.delay_free.nx
+
+        def whole(matrix: Array) -> Array:
+            result = matrix.copy()
+            result[:, n : n + u.size] *= u
+            result[n : n + y.size] /= y
+            return result
+
+        gradients = {
+            k: Gradient(
+                g.A, g.B * u, g.C / y, g.D * u / y, None if g.delay_free is None else whole(g.delay_free), g.times
+            )
+            for k, g in self.gradients.items()
+        }
+
+        def units(names: tuple[str, ...], own: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(f"{sizes[k]:g} {v}".strip() if k in sizes else v for k, v in zip(names, own, strict=True))
+
+        return replace(
+            self,
+            B=self.B * u,
+            C=self.C / y,
+            D=self.D * u / y,
+            input_units=units(self.input_names, self.input_units),
+            output_units=units(self.output_names, self.output_units),
+            u0=tuple(v / k for v, k in zip(self.u0, u, strict=True)),
+            y0=tuple(v / k for v, k in zip(self.y0, y[:, 0], strict=True)),
+            gradients=FrozenMap(gradients),
+            delay_free=None if core is None else replace(core, matrix=whole(core.matrix)),
+        )
+
     def to_control(self) -> control.StateSpace:
         """A python-control StateSpace with the same names; delays are in their Pade form."""
         import control
@@ -212,6 +259,48 @@ class LinearModel:
         from hvdc_ident.linearize.frequency import frequency_response
 
         return frequency_response(self, omega)
+
+    def margins(self, break_at: str | Sequence[str] | None = None) -> Margins | LoopMargins:
+        """Return gain, phase, delay, modulus and disk margins; of several loops together with their common disk margin.
+
+        break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
+        is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
+        """
+        from hvdc_ident.linearize.loop import loop
+        from hvdc_ident.linearize.margins import loop_margins, margins
+        from hvdc_ident.model.definition import Model
+
+        if break_at is None:
+            return margins(self) if self.B.shape[1] == self.C.shape[0] == 1 else loop_margins(self)
+        if self.point is None or not isinstance(self.point.model, Model):
+            raise LinearizationError(
+                "a loop can be opened only in a model with equations",
+                where=f"linear model '{self.name}'",
+                hint="margins() without a signal takes this linear model for the open loop",
+            )
+        opened = loop(self.point.model, break_at, self.point)
+        return margins(opened) if isinstance(break_at, str) else loop_margins(opened)
+
+    def norms(self) -> dict[str, Any]:
+        """Return the H2, H-infinity and L-infinity norms, None with the reason where one does not exist."""
+        from hvdc_ident.linearize.norms import norms
+
+        return norms(self)
+
+    def reduce(self, order: int | None = None, tolerance: float | None = None, *, match_dc: bool = False) -> Reduction:
+        """Return a balanced model of fewer states: so many, or as few as keep the error within the tolerance.
+
+        See `hvdc_ident.linearize.reduce.balanced`.
+        """
+        from hvdc_ident.linearize.reduce import balanced
+
+        return balanced(self, order, tolerance, match_dc=match_dc)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model in the format of the path's ending (.mat, .json, .csv, .m, .mo, .tex, .zpk) and return the path."""
+        from hvdc_ident.linearize.export import write
+
+        return write(self, path)
 
     def plot(self, kind: str = "bode", ax: Any = None) -> Any:
         """The axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation"."""

@@ -1,4 +1,4 @@
-"""A loop opened at any named signal: its open-loop transfer, sensitivity and complementary sensitivity."""
+"""Loops opened at named signals: open-loop transfer, sensitivity, complementary sensitivity; plant and controller."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from hvdc_ident.parameters import Input
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A loop opened at a signal. open: L, from what is injected to minus what comes back; 1 + L = 0 closes it."""
+    """A loop opened at a signal, or several opened together (their names joined by ", ").
+
+    open: L, from what is injected to minus what comes back; det(1 + L) = 0 closes it.
+    """
 
     signal: str
     open: LinearModel
@@ -38,27 +41,29 @@ class Loop:
         Raises LinearizationError for an ill-posed loop.
         """
         a, b, c, d = without_sliding_means(self.open)
-        through = 1.0 + float(d[0, 0])
-        if abs(through) < 1e-12:
+        through = np.eye(d.shape[0]) + d
+        if np.linalg.cond(through) > 1e12 or np.abs(np.linalg.det(through)) < 1e-12:
             raise LinearizationError(
                 "the loop is ill-posed: its direct part is -1",
                 where=f"loop at '{self.signal}'",
                 hint="add the lag that is there",
             )
-        return np.asarray(np.linalg.eigvals(a - b @ c / through), dtype=complex)
+        return np.asarray(np.linalg.eigvals(a - b @ np.linalg.solve(through, c)), dtype=complex)
 
     def sensitivity(self, omega: Array | None = None) -> Response:
-        """S = 1 / (1 + L)."""
-        return self._of(omega, lambda value: 1.0 / (1.0 + value), "S")
+        """S = (1 + L)^-1."""
+        return self._of(omega, lambda value, one: np.linalg.inv(one + value), "S")
 
     def complementary(self, omega: Array | None = None) -> Response:
-        """T = L / (1 + L)."""
-        return self._of(omega, lambda value: value / (1.0 + value), "T")
+        """T = (1 + L)^-1 L."""
+        return self._of(omega, lambda value, one: np.linalg.solve(one + value, value), "T")
 
-    def _of(self, omega: Array | None, what: Callable[[Array], Array], name: str) -> Response:
+    def _of(self, omega: Array | None, of: Callable[[Array, Array], Array], name: str) -> Response:
         w = default_omega(self.open) if omega is None else np.atleast_1d(np.asarray(omega, dtype=float))
         values = transfer(self.open, 1j * w)
-        return Response(w, what(values), (name,), (self.signal,), source=f"{name} at '{self.signal}'")
+        signals = self.open.input_names
+        names = (name,) if len(signals) == 1 else tuple(f"{name} {n}" for n in signals)
+        return Response(w, of(values, np.eye(len(signals))), names, signals, source=f"{name} at '{self.signal}'")
 
 
 def open_model(model: Model, signal: str) -> tuple[Model, str]:
@@ -95,25 +100,75 @@ def open_model(model: Model, signal: str) -> tuple[Model, str]:
 
 def loop(
     model: Model,
-    signal: str,
+    signal: str | Sequence[str],
     point: OperatingPoint | None = None,
     *,
     sensitivities: Sequence[str] = (),
     pade_order: int = 5,
 ) -> Loop:
-    """The loop opened at a named signal, unknown or state, at the closed model's operating point."""
+    """Return the loop opened at a named signal, unknown or state, or several opened together, at the operating point.
+
+    point: of the closed model; default, its steady state.
+
+    >>> from hvdc_ident import load_model, loop, margins
+    >>> opened = loop(load_model("vsc-hvdc-link"), "Irorder1")
+    >>> round(margins(opened).phase_margin.value, 1)
+    65.3
+    """
+    signals = (signal,) if isinstance(signal, str) else tuple(signal)
+    if not signals or len(set(signals)) < len(signals):
+        raise LinearizationError(
+            "a loop is opened at different signals", where=f"model '{model.name}'", got=", ".join(signals) or "none"
+        )
     closed = find_operating_point(model) if point is None else point
-    opened, output = open_model(model, signal)
-    value = signal_value(model, closed, signal)
-    returned = fresh(model, f"{signal}_returned")
-    states = {**closed.states, **({returned: closed.states[signal]} if signal in closed.states else {})}
-    inputs = {**closed.inputs, signal: value}
+    opened, outputs, states = model, [], dict(closed.states)
+    for name in signals:
+        if name in model.states:
+            states[fresh(opened, f"{name}_returned")] = closed.states[name]
+        opened, output = open_model(opened, name)
+        outputs.append(output)
+    inputs = {**closed.inputs, **{n: signal_value(model, closed, n) for n in signals}}
     parameters = {n: v for n, v in closed.parameters.items() if n in opened.parameters}
     at = point_at(opened, {n: states[n] for n in opened.states}, inputs, parameters, time=closed.time)
     if sensitivities:  # the derivatives need the shift of a point that is at rest
         at = find_operating_point(opened, {**inputs, **parameters}, guess=states)
-    found = linearize(opened, at, inputs=[signal], outputs=[output], sensitivities=sensitivities, pade_order=pade_order)
-    return Loop(signal, negated(found))
+    found = linearize(
+        opened, at, inputs=list(signals), outputs=outputs, sensitivities=sensitivities, pade_order=pade_order
+    )
+    return Loop(", ".join(signals), negated(found))
+
+
+def plant_and_controller(
+    model: Model, inputs: Sequence[str], outputs: Sequence[str], point: OperatingPoint | None = None
+) -> tuple[LinearModel, LinearModel]:
+    """Return (plant, controller) of a closed model, cut at the signals that go into the plant and those measured on it.
+
+    inputs, outputs: names of signals, unknowns or states. The plant is what lies between inputs and outputs with both cut,
+    the controller what lies between outputs and inputs, with the sign of negative feedback. Raises LinearizationError
+    where there is a way from inputs to inputs, or outputs to outputs, that passes neither: the cut does not part them.
+    """
+    both = loop(model, (*inputs, *outputs), point).open
+    back = negated(both)
+    k = len(inputs)
+    names = both.output_names
+    returned_inputs, returned_outputs = names[:k], names[k:]
+    w = default_omega(both, 50)
+    values = np.abs(transfer(both, 1j * w))
+    size = np.maximum(values.max(axis=0), 1e-300)
+    for part in ((slice(0, k), slice(0, k)), (slice(k, None), slice(k, None))):
+        if (size[part] > 1e-9 * size.max()).any():
+            i, j = (int(v) for v in np.argwhere(size[part] > 1e-9 * size.max())[0])
+            signals = both.input_names[part[1]]
+            raise LinearizationError(
+                f"cutting at these signals does not part plant and controller: a way leads from '{signals[j]}' to "
+                f"'{signals[i]}' beside them",
+                where=f"model '{model.name}'",
+                hint="name every signal that the controller sends or measures; of a state, a signal that only the "
+                "controller reads",
+            )
+    plant = back.channel(list(inputs), list(returned_outputs))
+    controller = both.channel(list(outputs), list(returned_inputs))
+    return plant, controller
 
 
 def signal_value(model: Model, point: OperatingPoint, name: str) -> float:

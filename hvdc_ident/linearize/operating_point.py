@@ -100,6 +100,8 @@ def find_operating_point(
     bounds: Bounds | None = None,
     guess: Mapping[str, float] | None = None,
     *,
+    inputs: Mapping[str, float] | None = None,
+    outputs: Mapping[str, float] | None = None,
     at: At = "steady",
     moving: Collection[str] = (),
     time: float = 0.0,
@@ -107,6 +109,8 @@ def find_operating_point(
     """The operating point at which every derivative is 0 and what is fixed holds.
 
     fixed: values of inputs, parameters, states, unknowns, signals or outputs. free: inputs and parameters to be found.
+    inputs: values of inputs. outputs: values that outputs are to have (a trimmed point); where nothing is free the inputs
+    that move these outputs at rest are, if they are as many.
     bounds: (low, high) of anything but a fixed name. guess: where the search begins. moving: states whose derivative
     need not be 0. at="start": states with a given start stand there instead, and only the rest is solved.
     All in the model's units; an input that is not named keeps the model's value.
@@ -117,7 +121,19 @@ def find_operating_point(
     >>> rest = find_operating_point(load_model("vsc-hvdc-link"), {"Pref2": 0.5})
     >>> round(rest.outputs["P2"], 9), round(rest.outputs["Irorder1"], 3)
     (0.5, -0.5)
+    >>> trimmed = find_operating_point(load_model("vsc-hvdc-link"), outputs={"P2": 0.6})
+    >>> round(trimmed.inputs["Pref2"], 9)
+    0.6
     """
+    if inputs or outputs:
+        from hvdc_ident.linearize.trim import freed_inputs, known_inputs
+
+        fixed = {**(fixed or {}), **known_inputs(model, inputs or {})}
+        if outputs and not free:
+            base = find_operating_point(model, fixed, (), bounds, guess, at=at, moving=moving, time=time)
+            free = freed_inputs(model, base, outputs, fixed)
+            guess = {**base.states, **base.unknowns, **base.extras, **(guess or {})}
+        fixed = {**fixed, **(outputs or {})}
     if not isinstance(model, Model):
         from hvdc_ident.linearize.external import find_point
 

@@ -1,8 +1,9 @@
-"""Minimal realisation with the list of what was removed, and balanced reduction with a stated H-infinity bound."""
+"""Minimal realisation with the list of what was removed, and balanced reduction with a stated L-infinity bound."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -16,12 +17,34 @@ TOLERANCE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on max |G - Gr|."""
+    """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on max |G - Gr|.
+
+    kept: how many states carry modes that are not stable; these are never reduced. match_dc: whether the dc gain is the
+    whole's.
+    """
 
     model: LinearModel
     removed: tuple[complex, ...]
     hankel: tuple[float, ...]
     bound: float
+    kept: int = 0
+    match_dc: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """The reduced model as plain numbers."""
+        m = self.model
+        return {
+            "order": len(m.state_names),
+            "A": m.A.tolist(),
+            "B": m.B.tolist(),
+            "C": m.C.tolist(),
+            "D": m.D.tolist(),
+            "bound": self.bound,
+            "hankel": list(self.hankel),
+            "removed": [[v.real, v.imag] for v in self.removed],
+            "not_stable_states_kept": self.kept,
+            "match_dc": self.match_dc,
+        }
 
 
 def staircase(a: Array, b: Array, tolerance: float = TOLERANCE) -> tuple[Array, int]:
@@ -122,6 +145,27 @@ def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Arra
     return keep.T @ a @ keep, keep.T @ b, c @ keep, d
 
 
+def on_axis(poles: Array, a: Array) -> Array:
+    """Which eigenvalues of a matrix lie on the imaginary axis, as far as their rounding errors tell.
+
+    Eigenvalues computed in floating point are those of a matrix within n eps |A|, which moves a simple one by about so
+    much; 1e-9 of its size stands for worse conditioned ones.
+    """
+    size = float(np.linalg.norm(a, 2)) if a.size else 0.0
+    return np.asarray(np.abs(poles.real) <= 1e-9 * np.abs(poles) + 10 * len(poles) * np.finfo(float).eps * size)
+
+
+def visible(model: LinearModel) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D of what the inputs reach and the outputs see, whether or not the rest is stable: the transfer function."""
+    a, b, c, d = without_sliding_means(model)
+    a, b, c = _scale(a, b, c)
+    for transposed in (False, True):
+        basis, k = staircase(a.T if transposed else a, c.T if transposed else b)
+        keep = basis[:, :k]
+        a, b, c = keep.T @ a @ keep, keep.T @ b, c @ keep
+    return a, b, c, d
+
+
 def _renamed(model: LinearModel, a: Array, b: Array, c: Array, d: Array, how: str) -> LinearModel:
     names = tuple(f"{how}{k + 1}" for k in range(a.shape[0]))
     return replace(
@@ -154,37 +198,89 @@ def _root(p: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def balanced(model: LinearModel, order: int | None = None, bound: float | None = None) -> Reduction:
+def balanced(
+    model: LinearModel, order: int | None = None, bound: float | None = None, *, match_dc: bool = False
+) -> Reduction:
     """The model of fewer states by balanced truncation, with the bound 2 sum(removed Hankel values) on its error.
 
-    Give the order, or the largest H-infinity error allowed (in output per input units). Raises LinearizationError for
-    an unstable model or an order out of range.
+    order: states that stay, or bound: the largest L-infinity error allowed (in output per input units). match_dc: the
+    removed states are put at rest instead of left out (singular perturbation, Liu and Anderson 1989): the dc gain stays
+    what it is, the bound is the same and the error lies at high frequencies. Modes that are not stable are split off and
+    kept whole. Raises LinearizationError for an order out of range or where a hidden mode is not stable.
     """
     source = minimal(model)
     a, b, c, d = source.model.standard()
-    values_a = np.linalg.eigvals(a)
-    if (values_a.real >= 0).any():
-        raise LinearizationError(
-            "an unstable model has no balanced reduction",
-            where=f"linear model '{model.name}'",
-            got=f"eigenvalue {values_a[np.argmax(values_a.real)]:.6g}",
-            hint="close a stabilising loop first, or reduce the stable part alone",
-        )
-    values, left, right = hankel(a, b, c)
+    a, b, c, kept = _stable_last(a, b, c)
+    stable = a[kept:, kept:]
+    values, left, right = hankel(stable, b[kept:], c[:, kept:])
     tails = 2.0 * np.concatenate([np.cumsum(values[::-1])[::-1], [0.0]])
     if order is None:
         if bound is None:
             raise LinearizationError(
                 "neither an order nor a bound", where="balanced reduction", hint="give one of them"
             )
-        order = int(np.argmax(tails <= bound))
-    if not 0 <= order <= values.size:
-        raise LinearizationError("the order is out of range", expected=f"0 to {values.size}", got=f"{order}")
+        order = kept + int(np.argmax(tails <= bound))
+    if not kept <= order <= kept + values.size:
+        unstable = f" ({kept} of them are not stable and stay)" if kept else ""
+        raise LinearizationError(
+            "the order is out of range", where=f"balanced reduction of linear model '{model.name}'",
+            expected=f"{kept} to {kept + values.size}{unstable}", got=f"{order}",
+        )  # fmt: skip
     usable = int((values > 1e-14 * values[0]).sum()) if values.size else 0
-    order = min(order, usable)
-    scale = 1.0 / np.sqrt(values[:order])
-    w, t = left[:, :order] * scale, right[:, :order] * scale
-    reduced = _renamed(source.model, w.T @ a @ t, w.T @ b, c @ t, d, "balanced")
-    kept = np.linalg.eigvals(reduced.A) if order else np.zeros(0)
-    gone = [complex(v) for v in values_a if not kept.size or np.abs(kept - v).min() > 1e-9 * max(1.0, abs(v))]
-    return Reduction(reduced, (*source.removed, *gone), tuple(float(v) for v in values), float(tails[order]))
+    count = min(order - kept, usable)
+    size = usable if match_dc else count
+    scale = 1.0 / np.sqrt(values[:size])
+    w, t = left[:, :size] * scale, right[:, :size] * scale
+    inner = w.T @ stable @ t, w.T @ b[kept:], c[:, kept:] @ t, d
+    a_, b_, c_, d_ = _residualised(*inner, count) if match_dc else inner
+    reduced = _renamed(
+        source.model,
+        scipy.linalg.block_diag(a[:kept, :kept], a_),
+        np.concatenate([b[:kept], b_]),
+        np.concatenate([c[:, :kept], c_], axis=1),
+        d_,
+        "balanced",
+    )
+    all_poles = np.concatenate([np.linalg.eigvals(a[:kept, :kept]), np.linalg.eigvals(stable)])
+    left_over = np.linalg.eigvals(reduced.A) if reduced.A.size else np.zeros(0)
+    gone = [
+        complex(v) for v in all_poles if not left_over.size or np.abs(left_over - v).min() > 1e-9 * max(1.0, abs(v))
+    ]
+    hankel_values = tuple(float(v) for v in values)
+    return Reduction(reduced, (*source.removed, *gone), hankel_values, float(tails[count]), kept, match_dc)
+
+
+def _stable_last(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array, int]:
+    """A block diagonal with the modes that are not stable first, B and C to match, and the number of their states."""
+    if a.shape[0] == 0:
+        return a, b, c, 0
+    poles = np.linalg.eigvals(a)
+    stable = (poles.real < 0) & ~on_axis(poles, a)
+    if stable.all():
+        return a, b, c, 0
+    # The Schur form is ordered by a real part between the two groups, and the coupling removed by a Sylvester equation.
+    edge = 0.5 * (poles[~stable].real.min() + poles[stable].real.max(initial=poles[~stable].real.min() - 1.0))
+    t, basis, kept = scipy.linalg.schur(a, output="real", sort=lambda re, im=0.0: re > edge)
+    if kept == a.shape[0]:
+        return t, basis.T @ b, c @ basis, kept
+    x = scipy.linalg.solve_sylvester(t[:kept, :kept], -t[kept:, kept:], -t[:kept, kept:])
+    right = basis.copy()
+    right[:, kept:] += basis[:, :kept] @ x
+    left = basis.T.copy()
+    left[:kept] -= x @ basis.T[kept:]
+    return scipy.linalg.block_diag(t[:kept, :kept], t[kept:, kept:]), left @ b, c @ right, kept
+
+
+def _residualised(a: Array, b: Array, c: Array, d: Array, count: int) -> tuple[Array, Array, Array, Array]:
+    """The first states of a balanced model, the others at rest."""
+    if count == a.shape[0]:
+        return a, b, c, d
+    fast = a[count:, count:]
+    slow, drive = np.linalg.solve(fast, a[count:, :count]), np.linalg.solve(fast, b[count:])
+    first = a[:count, count:]
+    return (
+        a[:count, :count] - first @ slow,
+        b[:count] - first @ drive,
+        c[:, :count] - c[:, count:] @ slow,
+        d - c[:, count:] @ drive,
+    )

@@ -9,7 +9,9 @@ import pytest
 
 WITH_EXAMPLES = (
     "hvdc_ident.formats",
+    "hvdc_ident.linearize.compare",
     "hvdc_ident.linearize.jacobian",
+    "hvdc_ident.linearize.loop",
     "hvdc_ident.linearize.operating_point",
     "hvdc_ident.models",
     "hvdc_ident.sensitivity.sweep",

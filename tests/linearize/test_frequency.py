@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from hvdc_ident.errors import LinearizationError, UnknownNameError, WaveformError
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.frequency import (
-    admittance,
     bands,
     frequency_response,
-    impedance,
     sensitivity,
     sigma,
     values_at,
@@ -22,6 +20,7 @@ from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins
 from hvdc_ident.linearize.measured import by_simulation, from_record
 from hvdc_ident.linearize.pade import pade, response
+from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
 from hvdc_ident.linearize.symbolic import symbolic_transfer
 from hvdc_ident.linearize.zeros import zeros
 from hvdc_ident.models import load_model
@@ -176,12 +175,14 @@ def test_bands_against_monte_carlo(link):
 
 def test_dc_impedance_and_admittance(link):
     """At 0 rad/s the voltage control holds Vdc1; far above, the capacitors alone: 1/(s C)."""
-    found = linearize(link)
-    z = impedance(found, ["Vdc1"], ["Iload1"], [1e-4, 3e6], into=False)
+    port = Port(("Iload1",), ("Vdc1",), ("-Iload1",))
+    z = port_impedance(link, port, [1e-4, 3e6])
     assert abs(z.values[0, 0, 0]) < 1e-5
     assert z.values[1, 0, 0] == pytest.approx(1 / (3e6j * 0.2), rel=0.02)
-    y = admittance(found, ["Vdc1"], ["Iload1"], [3e6], into=False)
+    y = port_admittance(link, port, [3e6])
     assert y.values[0, 0, 0] == pytest.approx(1 / z.values[1, 0, 0])
+    with pytest.raises(LinearizationError, match="do not fit together"):
+        Port(("Iload1",), ("Vdc1", "Vdc2"), ("Iload1",))
 
 
 # --- loops and margins ---

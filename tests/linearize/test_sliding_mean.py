@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from hvdc_ident.linearize import linearize
-from hvdc_ident.linearize.compare import difference, hinf_norm, nu_gap
+from hvdc_ident.linearize.compare import difference
+from hvdc_ident.linearize.gap import nu_gap
 from hvdc_ident.linearize.locus import root_locus
 from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins
+from hvdc_ident.linearize.norms import hinf_norm
 from hvdc_ident.linearize.reduce import without_sliding_means
 from hvdc_ident.models import load_model
 

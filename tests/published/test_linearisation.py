@@ -11,9 +11,9 @@ import sympy as sp
 from hvdc_ident.expression import parse
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, point_at
-from hvdc_ident.linearize.compare import h2_norm, hinf_norm, nu_gap
-from hvdc_ident.linearize.gap import gap
+from hvdc_ident.linearize.gap import gap, nu_gap
 from hvdc_ident.linearize.margins import margins
+from hvdc_ident.linearize.norms import h2_norm, hinf_norm
 from hvdc_ident.model.definition import Model, Output, Signal, State
 from hvdc_ident.parameters import Input, Parameter
 
