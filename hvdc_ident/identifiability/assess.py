@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +15,8 @@ from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.identifiability import narrow
-from hvdc_ident.identifiability.evidence import pair_of
+from hvdc_ident.identifiability import narrow, verdicts
+from hvdc_ident.identifiability.evidence import pair_of, told_by_noise
 from hvdc_ident.identifiability.findings import Findings
 from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogeneity, misspecification
 from hvdc_ident.identifiability.pilot import Optimum, pilot
@@ -124,6 +124,8 @@ def _assembled(
         if n not in fitted
     }
     whole = _whole(so_far, last or first)
+    unjudged = _unjudged(so_far, whole, fitted, first)
+    held = {n: (v, so_far.found[n].reason if n in unjudged else why) for n, (v, why) in held.items()}
     resampled = _resampled(so_far, last, executor)
     scatter = resampled.ci95() if resampled else {}
     for n, verdict in so_far.found.items():
@@ -162,7 +164,23 @@ def _assembled(
         notes=tuple(so_far.notes),
         bootstrap=resampled,
         sensitivities=_sensitivities(so_far, whole),
+        not_judged=unjudged,
     )
+
+
+def _unjudged(so_far: Findings, whole: Optimum, fitted: Sequence[str], at: Optimum) -> tuple[str, ...]:
+    """The held parameters that noise alone would tell, where the misfit is more than noise; their verdicts are taken back.
+
+    at: the optimum of the pilot fit. A misfit that comes only with holding one at its start value is not the model's.
+    """
+    if at.excess == 1.0:
+        return ()
+    hidden = ("insensitive", "practically-unidentifiable", "at-bound")
+    others = [n for n in so_far.free if n not in fitted and so_far.found[n].verdict in hidden]
+    told = told_by_noise(whole, fitted, others) if others else {}
+    for n, half in told.items():
+        so_far.found[n] = verdicts.not_judged(so_far.found[n], float(np.sqrt(at.excess)), half)
+    return tuple(n for n in so_far.free if n in told)
 
 
 def _whole(so_far: Findings, at: Optimum) -> Optimum:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.verdicts import Verdict
+from hvdc_ident.sensitivity.fisher import independent, pivoted_order
 from hvdc_ident.trajectory import Array
 
 DRAWS = 999
@@ -57,6 +59,36 @@ def spreads(optimum: Optimum) -> dict[str, Spread]:
         limits = np.maximum(limits, wider)
     stds = np.sqrt(raw * factor)
     return {n: Spread(float(s), float(v)) for n, s, v in zip(optimum.names, stds, limits, strict=False)}
+
+
+def told_by_noise(whole: Optimum, kept: Sequence[str], others: Sequence[str]) -> dict[str, float]:
+    """By parameter of `others` the half-width, in its unit, of the 95 % interval that the noise alone would leave it.
+
+    whole: all candidates free. kept: those fitted anyway. Only those are in it that can be told beside them: the best
+    determined first, as long as no direction is lost and every interval is narrower than its bounds. The misfit has no
+    part in it, so this is what the records could tell of a model that explains them (Cramer and Rao's bound, at first order).
+    """
+    free = {f.name: f for f in whole.problem.free}
+    names = [n for n in whole.names if n in kept or n in others]
+    matrix = whole.information.select(names).matrix
+    slope = dict(zip(whole.problem.names, whole.slope.tolist(), strict=True))
+    order = [names[i] for i in pivoted_order(matrix)]
+    chosen, found = [n for n in order if n in kept], dict[str, float]()
+    for n in (n for n in order if n in others):
+        trial = [*chosen, n]
+        part = whole.information.select(trial).matrix
+        if len(independent(part, whole.error)) < len(trial):
+            continue
+        halves = np.sqrt(2.0 * TWO_SIDED * np.diag(np.linalg.inv(part)))
+        if all(h * slope[m] < _room(free[m], whole.value(m)) for m, h in zip(trial, halves.tolist(), strict=True)):
+            chosen = trial
+            found[n] = float(halves[-1] * slope[n])
+    return found
+
+
+def _room(free: Free, value: float) -> float:
+    """Half of the range between the bounds as the unknown is scaled, in its unit at `value`; infinite without bounds."""
+    return 0.5 * (value * math.log(free.max / free.min) if free.log else free.max - free.min)
 
 
 def rise_at_ends(optimum: Optimum, i: int, free: Free) -> float | None:

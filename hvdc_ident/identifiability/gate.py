@@ -25,16 +25,18 @@ class Gate:
     forced: tuple[str, ...] = ()
 
 
-def gate(report: Mapping[str, Any], force: Sequence[str] = ()) -> Gate:
+def gate(report: Mapping[str, Any], force: Sequence[str] = (), *, diagnosis: bool = False) -> Gate:
     """The gate that a report, as its `to_dict` or its JSON, sets up; `force` names parameters to fit all the same.
 
+    diagnosis: whether what is not judged for the misfit alone is free too: a parameter held at a wrong value is a gap of
+    its own, and would be named as an effect.
     Raises UnknownNameError for a forced name that is no candidate.
     """
     parameters = report["parameters"]
     for name in force:
         if name not in parameters:
             raise unknown_name("candidate", name, parameters, where="--force")
-    open_set = set(report["identifiable"])
+    open_set = {*report["identifiable"], *(report.get("not_judged", ()) if diagnosis else ())}
     forced = tuple(n for n in parameters if n in force and n not in open_set)
     fitted = tuple(n for n in parameters if n in open_set or n in forced)
     held = {n: (float(h["value"]), _why(n, report)) for n, h in report["held"].items() if n not in fitted}
@@ -81,7 +83,7 @@ def gated_fit(
         values = FrozenMap({n: v for n, (v, _) in through.held.items()})
         return FitResult(
             "failed",
-            "no candidate can be estimated from these data; every one is held, with its reason",
+            _nothing_to_fit(report),
             (),
             reasons,
             values,
@@ -98,6 +100,16 @@ def gated_fit(
         return result
     held = f"held on a bound: {', '.join(on_bound)}"
     return replace(result, status="at-bound", message=f"{result.message}; {held}")
+
+
+def _nothing_to_fit(report: Mapping[str, Any]) -> str:
+    text = "no candidate can be estimated from these data; every one is held, with its reason"
+    unjudged = report.get("not_judged", ())
+    return (
+        f"{text}; {', '.join(unjudged)} may be once the misfit is explained: run hvdc-ident diagnose"
+        if unjudged
+        else text
+    )
 
 
 def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate, *, whole: bool) -> Estimate:

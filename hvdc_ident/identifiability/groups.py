@@ -88,6 +88,7 @@ def _merged(a: IdentifiabilityReport, b: IdentifiabilityReport) -> Identifiabili
         pilot=_pilots(a.pilot, b.pilot),
         notes=(*a.notes, *b.notes),
         pair=a.pair or b.pair,
+        not_judged=(*a.not_judged, *b.not_judged),
     )
 
 

@@ -34,7 +34,8 @@ class IdentifiabilityReport:
     """What the experiments tell about the candidates.
 
     parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
-    reason of each other one. combinations: what is seen of those that cannot be told apart. collinear: subsets with
+    reason of each other one. not_judged: those of the held that noise alone would tell, which only the misfit hides: a
+    diagnosis leaves them free. combinations: what is seen of those that cannot be told apart. collinear: subsets with
     their index, worst first within each size. shares: of each parameter's information, by experiment.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
     search met. bootstrap: the estimates of the set fitted, from experiments drawn anew, where there are enough.
@@ -59,6 +60,7 @@ class IdentifiabilityReport:
     pair: PairProfile | None = None
     bootstrap: Bootstrap | None = None
     sensitivities: LocalSensitivities | None = None
+    not_judged: tuple[str, ...] = ()
 
     @property
     def conditional_on(self) -> dict[str, tuple[str, ...]]:
@@ -71,6 +73,7 @@ class IdentifiabilityReport:
         found = {
             "parameters": {n: _verdict(v) for n, v in self.parameters.items()},
             "identifiable": list(self.identifiable),
+            "not_judged": list(self.not_judged),
             "held": {n: {"value": v, "reason": why} for n, (v, why) in self.held.items()},
             "combinations": [
                 {

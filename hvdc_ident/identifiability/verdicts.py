@@ -12,7 +12,13 @@ from hvdc_ident.fit.profile import Profile
 from hvdc_ident.fit.unknown import Free
 
 VerdictName = Literal[
-    "structurally-unidentifiable", "insensitive", "practically-unidentifiable", "weak", "at-bound", "identifiable"
+    "structurally-unidentifiable",
+    "insensitive",
+    "practically-unidentifiable",
+    "not-judged",
+    "weak",
+    "at-bound",
+    "identifiable",
 ]
 WIDE = 0.5
 """A half-width of more than this share of the value (of the range where 0 is admissible) makes a parameter weak."""
@@ -102,6 +108,19 @@ def practical(profile: Profile, words: str, unit: str) -> Verdict:
         parts.append(f"from above ({profile.upper.reason})")
     text = f"These data do not bound it {' nor '.join(parts)}." + (f" Of these data {words}." if words else "")
     return Verdict(profile.name, "practically-unidentifiable", text, profile.value, unit, profile.ci95, profile=profile)
+
+
+def not_judged(judged: Verdict, times: float, half: float) -> Verdict:
+    """A verdict that only the misfit led to, taken back. times: the misfit over the noise. half: what noise alone leaves.
+
+    One at a bound stands there all the same, with the remark.
+    """
+    why = f"the model misses these records by {times:.2g} times the noise; diagnose first"
+    if judged.verdict == "at-bound":
+        return judged.noted(f"Not to be believed before the misfit is explained: {why}.")
+    text = f"Not judged: {why}. Against that misfit it is {judged.verdict}; "
+    text += f"against the noise alone it would be known to ±{_with_unit(half, judged.unit)}."
+    return replace(judged, verdict="not-judged", reason=text)
 
 
 def lost(name: str, words: str, value: float, unit: str) -> Verdict:

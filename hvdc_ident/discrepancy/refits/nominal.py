@@ -127,7 +127,7 @@ def nominal(
     noise = noise_of([e for e in experiments if e.outputs])
     problem = Problem(simulator, tuple(experiments), tuple(parameters), held=FrozenMap(held))
     if report is not None:
-        problem = gated(problem, gate(report))
+        problem = gated(problem, gate(report, diagnosis=True))
     # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
     told = tuple(
         off_jumps(e).with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))

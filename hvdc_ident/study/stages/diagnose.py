@@ -17,6 +17,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     from hvdc_ident.discrepancy import Options as Budget
     from hvdc_ident.discrepancy import diagnose
     from hvdc_ident.discrepancy.findings.sizes import size_curves
+    from hvdc_ident.identifiability import gate
     from hvdc_ident.model.definition import Model
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
@@ -30,7 +31,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     if "parameters" not in report:
         why = f"nothing can be diagnosed before the stage identify has run: {report.get('message', 'it failed')}"
         return Outcome({"status": "failed", "message": why}, failed=why)
-    if not report["identifiable"]:
+    if not gate(report, diagnosis=True).fitted:
         why = "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own"
         return Outcome({"status": "failed", "message": why}, failed=why)
     with executor_of(study, options, "diagnose") as executor:
