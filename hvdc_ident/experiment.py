@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +97,11 @@ class Experiment:
     time: (n,) instants at which outputs are wanted, s; one that stands twice asks for the values before and after a jump.
     inputs: signals by input name; an input not named keeps the model's start value. A name in `drive` is a slot that follows its signal.
     values: inputs held constant at other than the model's start value.
-    measured: the recorded outputs at `time`, under the names of the model's outputs; None for a plain simulation.
-    noise: standard deviation of each measured output, in its unit; noise_dof: how many independent samples it was
-    estimated from, where it was (else it is exact). event: instant of the first disturbance, s.
+    measured: the recorded outputs at `time`, under the names of the model's outputs, NaN where not recorded; None for a
+    plain simulation.
+    noise: standard deviation of each measured output, in its unit; noise_profile: (n,) by output, the standard deviation
+    of each row over that one, where rows differ; noise_dof: how many independent samples it was estimated from, where it
+    was (else it is exact). event: instant of the first disturbance, s.
     window: (from, to) in s of what is compared. role: "fit" or "holdout".
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
     offsets: constants added to inputs all along, in their units. starts: states that begin at a value and not at rest.
@@ -122,6 +124,7 @@ class Experiment:
     offsets: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_dof: FrozenMap[float] = field(default_factory=FrozenMap)
     starts: FrozenMap[float] = field(default_factory=FrozenMap)
+    noise_profile: FrozenMap[Array] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
@@ -133,7 +136,7 @@ class Experiment:
             )
         time.setflags(write=False)
         object.__setattr__(self, "time", time)
-        for name in ("inputs", "values", "noise", "offsets", "noise_dof", "starts"):
+        for name in ("inputs", "values", "noise", "offsets", "noise_dof", "starts", "noise_profile"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
         if self.measured is not None and not np.array_equal(self.measured.time, time):
@@ -156,6 +159,46 @@ class Experiment:
     def with_(self, **changes: Any) -> Experiment:
         """A copy with some fields changed."""
         return replace(self, **changes)
+
+    @property
+    def recording(self) -> dict[str, Any]:
+        """What became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, not_recorded}.
+
+        rows: compared or not. dropped: of the file, left out. jumps: instants with two rows. time_unit: as the file or
+        the study says it, None where neither does (then s). not_recorded: by output the number of rows without a value.
+        """
+        origin = self.measured.origin if self.measured is not None else Origin()
+        gaps = {o: self.measured.gaps(o) for o in self.outputs} if self.measured is not None else {}
+        return {
+            "rows": int(self.time.size),
+            "dropped": origin.dropped,
+            "jumps": int(np.count_nonzero(np.diff(self.time) == 0)),
+            "time_unit": origin.time_unit or None,
+            "time_column": origin.time_column or None,
+            "converted": list(origin.converted),
+            "not_recorded": {o: n for o, n in gaps.items() if n},
+        }
+
+
+def recording_lines(recording: Mapping[str, Any]) -> list[str]:
+    """Sentences on what `Experiment.recording` tells beside the number of rows; none where there is nothing to tell."""
+    rows, lines = recording["rows"], []
+    if recording["time_column"]:
+        lines.append(f"the time is column '{recording['time_column']}'")
+    unit = recording["time_unit"]
+    if unit and unit not in ("s", "date"):
+        lines.append(f"time in {unit}, converted to s")
+    elif unit == "date":
+        lines.append("dates, counted in s from the first row")
+    lines += recording["converted"]
+    if (n := recording["jumps"]) > 0:
+        lines.append(f"{n} instant{'s' if n > 1 else ''} with two rows: a jump, both kept")
+    if (n := recording["dropped"]) > 0:
+        lines.append(
+            f"{n} row{'s' if n > 1 else ''} of the file dropped: a third of one instant, or outside another record"
+        )
+    lines += [f"{o}: {n} of {rows} rows not recorded" for o, n in recording["not_recorded"].items()]
+    return lines
 
 
 def experiment(

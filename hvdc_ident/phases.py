@@ -129,7 +129,7 @@ class _Quantities:
         if name == "f":
             return "Hz"
         if name in ("p", "q"):
-            return _product(volts, amperes, "W" if name == "p" else "var")
+            return product_unit(volts, amperes, "W" if name == "p" else "var")
         return amperes if name.startswith("i") else volts
 
     def get(self, name: str) -> Array:
@@ -191,7 +191,7 @@ def _strict(time: Array) -> Array:
     return time + 1e-9 * step * np.arange(time.size)
 
 
-def _product(volts: str, amperes: str, unit: str) -> str:
+def product_unit(volts: str, amperes: str, unit: str) -> str:
     prefixes = {"": 0, "k": 3, "M": 6, "m": -3}
     power = {v: k for k, v in prefixes.items()}
     if not (volts.endswith("V") and amperes.endswith("A")):

@@ -15,18 +15,37 @@ from hvdc_ident.notebook import axes_of, table_html
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Origin:
+    """How the rows of a trajectory came out of a file.
+
+    rows: in the file; 0 where there is none. dropped: those left out, third and later rows of an instant and what only
+    some records of several rates cover. time_unit: the time's as the file says it, "" where it does not; times are in s
+    in any case. time_column: the name of the column that the time came from, where it was not the first. converted: the
+    signals whose unit was changed to the model's, in words.
+    """
+
+    rows: int = 0
+    dropped: int = 0
+    time_unit: str = ""
+    time_column: str = ""
+    converted: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Signals sampled at the same instants.
 
     time: (n,) in s, non-decreasing; a time that stands twice is a jump, the first row before it and the second after.
-    values: (n, k), one column a signal. names: k names. units: k units ("" where unknown).
+    values: (n, k), one column a signal, NaN where it was not recorded. names: k names. units: k units ("" where unknown).
+    origin: what became of the file's rows, where it comes from a file.
     """
 
     time: Array
     values: Array
     names: tuple[str, ...]
     units: tuple[str, ...] = ()
+    origin: Origin = Origin()
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
@@ -66,11 +85,16 @@ class Trajectory:
             self.values[:, columns],
             tuple(self.names[c] for c in columns),
             tuple(self.units[c] for c in columns),
+            self.origin,
         )
 
     def rows(self, mask: NDArray[np.bool_]) -> Trajectory:
         """The rows where the mask holds."""
-        return Trajectory(self.time[mask], self.values[mask], self.names, self.units)
+        return Trajectory(self.time[mask], self.values[mask], self.names, self.units, self.origin)
+
+    def gaps(self, name: str) -> int:
+        """The number of rows at which the signal was not recorded."""
+        return int(np.count_nonzero(np.isnan(self[name])))
 
     def plot(self, names: Iterable[str] | None = None, ax: Any = None) -> Any:
         """Axes with the signals over time, all or those named."""
@@ -86,7 +110,7 @@ class Trajectory:
         span = f"{self.time[0]:g} to {self.time[-1]:g} s" if len(self) else "no rows"
         rows = (
             [
-                (n, u, float(v.min()), float(v.max()))
+                (n, u, float(np.fmin.reduce(v)), float(np.fmax.reduce(v)))
                 for n, u, v in zip(self.names, self.units, self.values.T, strict=True)
             ]
             if len(self)

@@ -36,6 +36,7 @@ _SMOOTH = 0.35  # row-to-row curvature over change, medians: white noise 0.87, a
 _FEW_ROWS = 8  # too few for a standard deviation before the event
 _MAD_TO_STD = 1.482602218505602  # of a normal distribution
 _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
+_GAP = 1.5  # times the median stride between recorded rows, the same share as `fit.whitening.GAP`
 _DEPARTURE = 6.0  # standard deviations
 _OUTLIER = 5.0  # standard deviations
 
@@ -73,33 +74,40 @@ def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
 def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> float:
     """The standard deviation of the noise in a record, in its unit; 0.0 where the record is deterministic.
 
-    time: (n,) in s. values: (n,). event: instant of the first disturbance in s; None where there is none.
-    Before the event: the scatter around a line, by the median. Where fewer than 8 rows lie before it, or none is given:
+    time: (n,) in s. values: (n,), NaN where not recorded. event: instant of the first disturbance in s; None where there
+    is none. Before the event: the scatter around a line, by the median. Where fewer than 8 rows lie before it, or none is given:
     the scatter of the rows about the line through their neighbours, which white noise makes. A record is deterministic
     where it is smooth from row to row: its curvature is small beside its change, which no first-order noise is.
     """
-    t, v = _distinct(np.asarray(time, dtype=float), np.asarray(values, dtype=float))
-    before = t < event if event is not None else np.zeros(t.size, dtype=bool)
+    t, v = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
+    single = np.append(np.diff(t) > 0, True)  # of two rows at one time the second
+    there = single & ~np.isnan(v)
+    before = there & (t < event) if event is not None else np.zeros(t.size, dtype=bool)
     settled = int(before.sum()) >= _FEW_ROWS
-    if settled:
-        t, v = t[before], v[before]
+    rows = before if settled else there
+    t, v, number = t[rows], v[rows], np.cumsum(single)[rows]
     if t.size < _FEW_ROWS or (v == v[0]).all():
         return 0.0
+    stride = np.diff(number)
+    apart = stride > _GAP * np.median(stride)  # rows on two sides of a gap are no neighbours
     bend, change = _bend(t, v)
-    if _scatter(bend) < _SMOOTH * _scatter(np.diff(v)):
+    near = ~(apart[1:] | apart[:-1])
+    if _scatter(bend[near]) < _SMOOTH * _scatter(np.diff(v)[~apart]):
         return 0.0
     if not settled:
-        return _scatter(bend / change)
+        return _scatter((bend / change)[near])
     return _scatter(_detrended(t, v))
 
 
 def noise_floor(values: ArrayLike) -> float:
     """The smallest noise to assume of a record, in its unit: 1e-6 of the range or the resolution of the file.
 
-    values: (n,). The resolution is the smallest change between rows, over the square root of 12; it counts only where
-    the values are clearly quantised: every change a multiple of it, as a converter or few written digits make them.
+    values: (n,), NaN where not recorded. The resolution is the smallest change between rows, over the square root of 12;
+    it counts only where the values are clearly quantised: every change a multiple of it, as a converter or few written
+    digits make them.
     """
     v = np.asarray(values, dtype=float)
+    v = v[~np.isnan(v)]
     if v.size == 0:
         return 0.0
     return max(FLOOR_SHARE * float(np.ptp(v)), _resolution(v) / np.sqrt(12.0))

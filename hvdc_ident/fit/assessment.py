@@ -18,7 +18,7 @@ from hvdc_ident.fit.noise import GIVEN
 from hvdc_ident.fit.nuisance import observe, unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import compared_rows
+from hvdc_ident.fit.residual import compared_rows, per_deviation, stretches
 from hvdc_ident.fit.residual_tests import ljung_box
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.frozen import FrozenMap
@@ -29,7 +29,8 @@ from hvdc_ident.trajectory import Array
 class Curve:
     """One output of one experiment at the estimates, at all n rows.
 
-    model, measured: (n,) in the output's unit. rows: those compared. sigma: standard deviation of the noise.
+    model, measured: (n,) in the output's unit. rows: those compared. sigma: standard deviation of the noise; profile:
+    (n,) that of each row over sigma, where rows differ.
     std: (n,) standard deviation of the model's curve from that of the estimates; band: half the width of the 95 % band
     within which a recorded sample is expected. Both None where no estimate has a standard deviation.
     """
@@ -40,6 +41,12 @@ class Curve:
     sigma: float
     std: Array | None
     band: Array | None
+    profile: Array | None = None
+
+    @property
+    def residual(self) -> Array:
+        """The misfit in standard deviations."""
+        return per_deviation(self.misfit, self.sigma, None if self.profile is None else self.profile[self.rows])
 
     @property
     def misfit(self) -> Array:
@@ -138,15 +145,15 @@ def curves(
             continue
         table[e.name] = {}
         for o in e.outputs:
-            sigma, std, band = problem.sigma[e.name][o], None, None
+            sigma, profile, std, band = problem.sigma[e.name][o], e.noise_profile.get(o), None, None
             if known is not None and known.names:
                 pick = [k for k, n in enumerate(columns) if n in known.names]
                 place = [known.names.index(columns[k]) for k in pick]
                 g = seen.gradient[o][:, pick]
                 variance = np.einsum("ni,ij,nj->n", g, known.matrix[np.ix_(place, place)], g)
                 std = np.sqrt(np.clip(variance, 0.0, None))
-                band = quantile * np.sqrt(std**2 + sigma**2)
-            table[e.name][o] = Curve(seen.values[o], e.measured[o], compared_rows(e, o), sigma, std, band)
+                band = quantile * np.sqrt(std**2 + (sigma if profile is None else sigma * profile) ** 2)
+            table[e.name][o] = Curve(seen.values[o], e.measured[o], compared_rows(e, o), sigma, std, band, profile)
     return table
 
 
@@ -189,7 +196,7 @@ def _quality(c: Curve) -> dict[str, Any]:
     return {
         "n": int(e.size),
         "rmse": rmse,
-        "rmse_per_sigma": rmse / c.sigma,
+        "rmse_per_sigma": float(np.sqrt(np.mean(c.residual**2))),
         "r2": 1.0 - left / moved if moved > 0 else None,
         "fit_percent": 100.0 * (1.0 - np.sqrt(left / moved)) if moved > 0 else None,
         "in_band": float(np.mean(np.abs(e) <= c.band[c.rows])) if c.band is not None else None,
@@ -219,7 +226,7 @@ def validation(
                 **quality,
                 "rmse_start": result.rmse_start.get(output, {}).get(name),
                 "of_fit": quality["rmse"] / typical if typical else None,
-                "ljung_box": ljung_box(c.misfit / c.sigma),
+                "ljung_box": ljung_box(c.residual, parts=stretches(c.rows)),
             }
         status = "done" if line else "failed"
         table[name] = {"status": status, "nuisance": dict(nuisances.get(name) or {}), "outputs": outputs}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band, transformed
 from hvdc_ident.fit.unsettled import freed
-from hvdc_ident.fit.whitening import AR, segments, whitened
+from hvdc_ident.fit.whitening import AR, GAP, segments, whitened
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -25,7 +26,8 @@ class Block:
     """The residuals of one output in one experiment, over its m compared rows; a spectrum has n values instead of m.
 
     misfit: (m,) measured - simulated, in the output's unit. sigma: standard deviation, in the same unit.
-    residual: (n,) misfit/sigma, treated; positive where the measurement lies above the model. No unit.
+    profile: (m,) the standard deviation of each row over sigma, where rows differ; else None.
+    residual: (n,) misfit/(sigma profile), treated; positive where the measurement lies above the model. No unit.
     jacobian: (n, p) d residual/d unknown, so minus the treated sensitivity over sigma.
     rows: (m,) the experiment's rows that are compared.
     taken: how many independent directions the elimination of unknown starts has taken out of the experiment's blocks,
@@ -44,6 +46,18 @@ class Block:
     taken: int = 0
     slope: Array | None = None
     spare: float = 0.0
+    profile: Array | None = None
+
+    def scaled(self, values: Array) -> Array:
+        """Values of the compared rows, (m,) or (m, k) in the output's unit, in standard deviations."""
+        return per_deviation(values, self.sigma, self.profile)
+
+    @property
+    def stretches(self) -> tuple[slice, ...]:
+        """The stretches of residuals between which rows are missing; a spectrum is one."""
+        if self.residual.size != self.rows.size:
+            return (slice(0, self.residual.size),)
+        return stretches(self.rows)
 
     @property
     def rmse(self) -> float:
@@ -57,7 +71,7 @@ class Block:
             jacobian[:, columns] = self.jacobian
         return Block(
             self.experiment, self.output, self.rows, self.misfit, self.sigma, self.residual, jacobian, self.taken,
-            self.slope, self.spare,
+            self.slope, self.spare, self.profile,
         )  # fmt: skip
 
     @property
@@ -74,6 +88,22 @@ class Block:
     def score(self) -> Array:
         """(n,) what each row says of its level, of mean 0 under noise also where the level lies askew between two steps."""
         return self.residual if self.slope is None else self.residual * self.slope * self.sigma
+
+
+def per_deviation(values: Array, sigma: float, profile: Array | None) -> Array:
+    """Values, (m,) or (m, k), over the standard deviation of each row."""
+    if profile is None:
+        return values / sigma
+    return np.asarray(values / (sigma * profile).reshape(-1, *([1] * (values.ndim - 1))))
+
+
+def stretches(rows: NDArray[np.intp]) -> tuple[slice, ...]:
+    """The stretches of compared rows without a gap; a step over 1.5 median ones is one, as between instants."""
+    steps = np.diff(rows)
+    if not steps.size or steps.max() == 1:
+        return (slice(0, rows.size),)
+    ends = [0, *(np.flatnonzero(steps > GAP * np.median(steps)) + 1).tolist(), rows.size]
+    return tuple(slice(a, b) for a, b in pairwise(ends))
 
 
 def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> NDArray[np.intp]:
@@ -102,7 +132,7 @@ def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> ND
 class Record:
     """What of an output's record is compared with every run: (m,) rows, and values in its unit at instants in s.
 
-    whole: whether it is every row.
+    whole: whether it is every row. profile: (m,) as in `Block`.
     """
 
     output: str
@@ -110,6 +140,7 @@ class Record:
     values: Array
     time: Array
     whole: bool
+    profile: Array | None = None
 
 
 def records(experiment: Experiment, guard: float = 0.0) -> tuple[Record, ...]:
@@ -121,7 +152,10 @@ def _record(experiment: Experiment, output: str, guard: float) -> Record:
     rows = compared_rows(experiment, output, guard)
     assert experiment.measured is not None
     values, time = experiment.measured[output][rows], experiment.time[rows]
-    return Record(output, rows, values, time, rows.size == experiment.time.size)
+    profile = experiment.noise_profile.get(output)
+    return Record(
+        output, rows, values, time, rows.size == experiment.time.size, None if profile is None else profile[rows]
+    )
 
 
 @dataclass(frozen=True)
@@ -182,17 +216,19 @@ def residual_blocks(
         y, dy = seen.values[output], seen.gradient[output]
         misfit = record.values - (y if record.whole else y[record.rows])
         slopes = -(dy if record.whole else dy[record.rows])
-        rounding = treatment.rounded(output)
+        rounding = treatment.rounded(output) if record.profile is None else None
         if rounding is not None:
             residual, slope = rounding.residual(misfit)
             jacobian, spare = slopes * slope[:, None], rounding.spare
         else:
             both = np.empty((misfit.size, 1 + slopes.shape[1]))
-            both[:, 0], both[:, 1:] = misfit / weight, slopes / weight
+            both[:, 0] = per_deviation(misfit, weight, record.profile)
+            both[:, 1:] = per_deviation(slopes, weight, record.profile)
             treated = treatment.applied(both, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
         block = Block(
-            experiment.name, output, record.rows, misfit, weight, residual, jacobian, slope=slope, spare=spare
+            experiment.name, output, record.rows, misfit, weight, residual, jacobian, slope=slope, spare=spare,
+            profile=record.profile,
         )  # fmt: skip
         blocks.append(block)
         raw.append(slopes[:, k : k + len(loose)])

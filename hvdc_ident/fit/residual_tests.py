@@ -38,21 +38,25 @@ def _tests(block: Block, experiment: Experiment) -> dict[str, Any]:
         "n": int(r.size),
         "mean": float(r.mean()),
         "std": float(r.std()),
-        "ljung_box": ljung_box(r),
+        "ljung_box": ljung_box(r, parts=block.stretches),
         "runs": runs(r),
         "inputs": inputs,
     }
 
 
-def ljung_box(r: Array, lags: int | None = None) -> dict[str, Any]:
-    """Ljung and Box's (1978) statistic over the first lags (default: 10, or a fifth of the rows), with its p."""
+def ljung_box(r: Array, lags: int | None = None, parts: Sequence[slice] = ()) -> dict[str, Any]:
+    """Ljung and Box's (1978) statistic over the first lags (default: 10, or a fifth of the rows), with its p.
+
+    parts: stretches of rows between which some are missing; none for one stretch.
+    """
     n = r.size
     lags = min(10, n // 5) if lags is None else lags
     centred = r - r.mean()
     power = float(centred @ centred)
     if lags < 1 or power == 0.0:
         return {"statistic": None, "lags": lags, "p": None}
-    acf = np.array([float(centred[k:] @ centred[:-k]) / power for k in range(1, lags + 1)])
+    records = [centred[part] for part in parts] or [centred]
+    acf = np.array([sum(float(c[k:] @ c[:-k]) for c in records) / power for k in range(1, lags + 1)])
     statistic = float(n * (n + 2) * np.sum(acf**2 / (n - np.arange(1, lags + 1))))
     return {"statistic": statistic, "lags": lags, "p": float(chdtrc(lags, statistic))}
 

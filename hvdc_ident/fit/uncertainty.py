@@ -98,7 +98,10 @@ def uncertainty(
     norms = np.where(unseen, 1.0, norms)
     inverse, null = _inverse(jacobian / norms, ~unseen)
     rho, effective = _samples(blocks, p)
-    meat = sum((score_covariance(b.jacobian / norms, rho[b.output]) for b in blocks), np.zeros((p, p)))
+    meat = sum(
+        (score_covariance(b.jacobian[part] / norms, rho[b.output]) for b in blocks for part in b.stretches),
+        np.zeros((p, p)),
+    )
     if prior is not None and prior.size:
         meat = meat + (prior / norms).T @ (prior / norms)
     sandwich = inverse @ meat @ inverse
@@ -153,7 +156,7 @@ def _samples(blocks: Sequence[Block], p: int) -> tuple[dict[str, float], dict[st
     total = sum(b.residual.size for b in blocks)
     rho, effective = {}, {}
     for output in dict.fromkeys(b.output for b in blocks):
-        records = [b.score for b in blocks if b.output == output]
+        records = [b.score[part] for b in blocks if b.output == output for part in b.stretches]
         n = sum(r.size for r in records)
         rho[output] = autocorrelation(records, p * n / total)
         effective[output] = n * (1.0 - rho[output]) / (1.0 + rho[output])

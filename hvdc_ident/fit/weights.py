@@ -68,7 +68,8 @@ def whitened_by_residuals(
         blocks = replace(problem, rho=FrozenMap()).blocks(best.theta, derivatives=False, in_time=True)
         models = {}
         for output in problem.outputs:
-            records = [b.misfit - b.misfit.mean() for b in blocks if b.output == output]
+            own = [(b, b.scaled(b.misfit)) for b in blocks if b.output == output]
+            records = [(r - r.mean())[part] for b, r in own for part in b.stretches]
             models[output] = autoregression(records)
         problem, best, rivals = _again(replace(problem, rho=FrozenMap(models)), best, rivals, method, moved=True)
         problem, best, rivals = weighted(problem, [best, *rivals], method)

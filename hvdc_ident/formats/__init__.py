@@ -13,6 +13,7 @@ import pkgutil
 import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from io import StringIO
 from pathlib import Path
@@ -29,8 +30,10 @@ __all__ = [
     "Format",
     "convert",
     "event_rows",
+    "files_of",
     "formats",
     "list_signals",
+    "once",
     "pick",
     "read_waveforms",
     "write_csv",
@@ -67,7 +70,8 @@ class Format(Protocol):
     def sample(self, path: Path) -> None:
         """Nothing; a small valid file is at the path afterwards."""
 
-    # A module that can also write its format has `write(trajectory, path) -> None`, for `convert`.
+    # A module that can also write its format has `write(trajectory, path) -> None`, for `convert`; one whose recordings
+    # stand in several files has `files(path) -> list[Path]`, all of them that are there.
 
 
 @cache
@@ -86,7 +90,7 @@ def formats() -> dict[str, Format]:
 
 
 def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None = None) -> Trajectory:
-    """The waveforms of a file of any known format: time in s, signals in the file's units.
+    """The waveforms of a file of any known format: time in s, signals in the file's units, NaN where not recorded.
 
     signals: names wanted, in that order; None for all of them.
     Raises WaveformError where the file cannot be used, UnknownNameError for a signal it does not have.
@@ -106,6 +110,14 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     found = _format_of(file).read(file, wanted)
     _check(found, file)
     return found
+
+
+def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Every file that the recording at a path stands in, that one first. Raises WaveformError where it cannot be used."""
+    file = _usable_file(path)
+    module = _format_of(file)
+    others = module.files(file) if hasattr(module, "files") else []
+    return (file, *(other for other in others if other != file))
 
 
 def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[str, str]]:
@@ -154,9 +166,9 @@ def convert(
 def write_csv(trajectory: Trajectory, path: str | os.PathLike[str], *, units: bool = False) -> None:
     """Nothing; the trajectory is at the path afterwards, whole or not at all, every number to the last bit.
 
-    First column `time` in s, then the signals. units: write `name [unit]` where the unit is known.
-    A name a spreadsheet would take for a formula gets an apostrophe before it, which the reader takes off.
-    Raises WaveformError for values that are not finite, a signal called `time`, and a place that cannot be written.
+    First column `time` in s, then the signals, an empty cell where a value was not recorded. units: write `name [unit]`
+    where the unit is known. A name a spreadsheet would take for a formula gets an apostrophe before it, which the reader
+    takes off. Raises WaveformError for infinite values, a signal called `time`, and a place that cannot be written.
     """
     target = Path(path)
     _check(trajectory, target, rows=0)
@@ -210,6 +222,15 @@ def event_rows(time: Array) -> NDArray[np.bool_]:
     return np.asarray(first | last)
 
 
+def once(found: Trajectory) -> Trajectory:
+    """The waveforms with the first and the last row of every instant alone; `origin` counts what is left out."""
+    keep = event_rows(found.time)
+    before = found.origin
+    origin = replace(before, rows=before.rows or len(found), dropped=before.dropped + int(np.count_nonzero(~keep)))
+    kept = found if keep.all() else found.rows(keep)
+    return replace(kept, origin=origin)
+
+
 def _csv_text(trajectory: Trajectory, units: bool) -> Iterator[str]:
     labels = ["time [s]" if units else "time"]
     for name, unit in zip(trajectory.names, trajectory.units, strict=True):
@@ -221,7 +242,8 @@ def _csv_text(trajectory: Trajectory, units: bool) -> Iterator[str]:
     for start in range(0, len(trajectory), _WRITTEN_AT_ONCE):
         part = slice(start, start + _WRITTEN_AT_ONCE)
         table = np.column_stack([trajectory.time[part], trajectory.values[part]])
-        yield "".join(",".join(map(repr, row)) + "\n" for row in table.tolist())
+        lines = "".join(",".join(map(repr, row)) + "\n" for row in table.tolist())
+        yield lines.replace("nan", "") if np.isnan(table).any() else lines
 
 
 def _usable_file(path: str | os.PathLike[str]) -> Path:
@@ -294,12 +316,13 @@ def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
         )
     if not event_rows(found.time).all():
         raise WaveformError("one time stands more than twice", where=where, expected="two rows at a jump")
-    bad = np.argwhere(~np.isfinite(found.values))
+    bad = np.argwhere(np.isinf(found.values))
     if bad.size:
         row, column = bad[0]
         raise WaveformError(
-            f"signal '{found.names[column]}' is not a finite number at {found.time[row]:g} s",
+            f"signal '{found.names[column]}' is infinite at {found.time[row]:g} s",
             where=where,
             got=str(found.values[row, column]),
-            hint="select the signals you need, or cut the time in which it is missing",
+            expected="a finite number, or an empty cell or NaN where nothing was recorded",
+            hint="select the signals you need, or cut the time in which it is infinite",
         )

@@ -11,13 +11,14 @@ import io
 import json
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats._columns import damaged
-from hvdc_ident.trajectory import Trajectory
+from hvdc_ident.trajectory import Origin, Trajectory
 
 START = 20.0  # s for a process to begin and a small file to be read
 RATE = 5e6  # bytes a second, at least
@@ -44,7 +45,8 @@ def read_apart(module: str, path: Path) -> Trajectory:
     if "what" in heading:
         raise WaveformError(**{**heading, "where": str(path)})
     time, values = np.load(stream, allow_pickle=False), np.load(stream, allow_pickle=False)
-    return Trajectory(time, values, tuple(heading["names"]), tuple(heading["units"]))
+    origin = Origin(**heading["origin"])
+    return Trajectory(time, values, tuple(heading["names"]), tuple(heading["units"]), origin)
 
 
 def _main(module: str, path: str) -> None:
@@ -56,7 +58,8 @@ def _main(module: str, path: str) -> None:
         out.write(json.dumps(said).encode() + b"\n")
         return
     told = io.BytesIO()  # numpy writes to a buffered file by its position, and a pipe has none
-    told.write(json.dumps({"names": found.names, "units": found.units}).encode() + b"\n")
+    heading = {"names": found.names, "units": found.units, "origin": asdict(found.origin)}
+    told.write(json.dumps(heading).encode() + b"\n")
     np.save(told, found.time, allow_pickle=False)
     np.save(told, found.values, allow_pickle=False)
     out.write(told.getbuffer())

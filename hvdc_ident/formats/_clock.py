@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import re
+from functools import lru_cache
 
 _CLOCK = re.compile(
     r"(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4})[T ]\s*)?"
     r"(?P<h>\d{1,2}):(?P<m>\d{2}):(?P<s>\d{2})(?:[.,](?P<fraction>\d{1,12}))?"
-    r"\s*(?P<zone>Z|UTC|[+-]\d{2}:?\d{2})?",
-    re.ASCII,
+    r"\s*(?P<half>AM|PM)?\s*(?P<zone>Z|UTC|[+-]\d{2}:?\d{2})?",
+    re.ASCII | re.IGNORECASE,
 )
+_DATE = re.compile(r"\d{4}([-/.])\d{1,2}\1\d{1,2}|\d{1,2}([-/.])\d{1,2}\2\d{4}", re.ASCII)
 _DAY = 86400.0  # s
 
 
@@ -19,14 +22,21 @@ def is_clock(text: str) -> bool:
     return _CLOCK.fullmatch(text) is not None
 
 
+def is_date(text: str) -> bool:
+    """Whether the text is a date alone, in figures."""
+    return _DATE.fullmatch(text) is not None
+
+
 class Clock:
     """Seconds from the first time asked; a time of day that falls back has passed midnight.
 
-    Days and seconds are kept apart, so that a fraction of a second loses no digits to the date.
+    A date that does not begin with the year may be day first or month first: of two dates of a record the order is the
+    one that puts the later row the fewest days after the first. Days and seconds are kept apart, so that a fraction of a
+    second loses no digits to the date.
     """
 
     def __init__(self) -> None:
-        self._first: tuple[int, float] | None = None
+        self._first: tuple[str, float] | None = None
         self._last = 0.0
         self._midnights = 0
 
@@ -39,10 +49,17 @@ class Clock:
             raise ValueError("no time of day")
         here = 3600.0 * int(match["h"]) + 60 * int(match["m"]) + int(match["s"]) - _zone(match["zone"])
         here += float(f"0.{match['fraction']}") if match["fraction"] else 0.0
-        day = _day(match["date"]) if match["date"] else self._day_of(here)
+        if match["half"]:  # 12:30 AM is half past midnight
+            here += 43200.0 * ((match["half"].upper() == "PM") - (int(match["h"]) == 12))
+        date = match["date"] or ""
+        day = self._day_of(here) if not date else 0
         if self._first is None:
-            self._first = (day, here)
-        return (day - self._first[0]) * _DAY + (here - self._first[1])
+            if date:
+                _days_between(date, date)  # refuses what is none
+            self._first = (date, here)
+        elif date:
+            day = _days_between(self._first[0], date)
+        return day * _DAY + (here - self._first[1])
 
     def _day_of(self, here: float) -> int:
         if here < self._last - _DAY / 2:
@@ -51,16 +68,31 @@ class Clock:
         return self._midnights
 
 
-def _day(text: str) -> int:
-    """The number of a date, year first or day first."""
+@lru_cache(maxsize=1024)
+def _days_between(first: str, later: str) -> int:
+    """The days from one date to another. Raises ValueError where either is none."""
+    if not first:
+        raise ValueError("a date after times of day without one")
+    found: list[int] = []
+    for month_first in (False, True):
+        with contextlib.suppress(ValueError):
+            found.append(_day(later, month_first) - _day(first, month_first))
+    if not found:
+        _day(first, False), _day(later, False)
+        raise ValueError("dates of two orders")
+    return min(found, key=lambda days: (days < 0, abs(days)))
+
+
+def _day(text: str, month_first: bool) -> int:
+    """The number of a date, year first, else day or month first."""
     a, b, c = (int(x) for x in re.split(r"[-/.]", text))
-    year, month, day = (a, b, c) if a > 31 else (c, b, a)
+    year, month, day = (a, b, c) if a > 31 else (c, a, b) if month_first else (c, b, a)
     return datetime.date(year, month, day).toordinal()
 
 
 def _zone(text: str | None) -> float:
     """The distance of a time zone from UTC in s."""
-    if not text or text in ("Z", "UTC"):
+    if not text or text.upper() in ("Z", "UTC"):
         return 0.0
     digits = text[1:].replace(":", "")
     return (-1.0 if text[0] == "-" else 1.0) * (3600 * int(digits[:2]) + 60 * int(digits[2:]))

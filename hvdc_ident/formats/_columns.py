@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +42,12 @@ def time_name(names: Sequence[str]) -> str | None:
 def joined(parts: Sequence[Trajectory], path: Path) -> Trajectory:
     """Records of several rates over one time axis: that of the part with most rows, within the time all of them cover.
 
-    Slower signals are joined by lines in between. Raises WaveformError where the parts share no time.
+    Slower signals are joined by lines in between; `origin` counts the rows left out. Raises WaveformError where the parts share no time.
     """
     finest = max(parts, key=len)
     if all(part.time is finest.time or np.array_equal(part.time, finest.time) for part in parts):
         values = np.column_stack([part.values for part in parts])
-        return Trajectory(finest.time, values, _names(parts), _units(parts))
+        return Trajectory(finest.time, values, _names(parts), _units(parts), finest.origin)
     start, end = max(float(p.time[0]) for p in parts), min(float(p.time[-1]) for p in parts)
     time = finest.time[(finest.time >= start) & (finest.time <= end)]
     if time.size < 2:
@@ -59,7 +60,8 @@ def joined(parts: Sequence[Trajectory], path: Path) -> Trajectory:
             hint="select signals of one record",
         )
     values = np.column_stack([_at(part, j, time) for part in parts for j in range(len(part.names))])
-    return Trajectory(time, values, _names(parts), _units(parts))
+    origin = replace(finest.origin, dropped=finest.origin.dropped + len(finest) - time.size)
+    return Trajectory(time, values, _names(parts), _units(parts), origin)
 
 
 def check_size(rows: int, columns: int, path: Path) -> None:

@@ -93,6 +93,11 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     return Trajectory(time, values, tuple(record.names[i] for i in wanted), tuple(record.units[i] for i in wanted))
 
 
+def files(path: Path) -> list[Path]:
+    """The .dat of a .cfg; nothing beside a .cff."""
+    return [] if path.suffix.lower() == ".cff" else [_beside(path)]
+
+
 def sample(path: Path) -> None:
     """Nothing; a small ASCII record with an analog channel of two kinds and a digital one is there afterwards."""
     header = (

@@ -1,6 +1,8 @@
-"""CSV and its relatives: one header line, then numbers, separated by comma, semicolon, tab or blanks.
+"""CSV and its relatives: a line of names, perhaps one of units, then numbers; comma, semicolon, tab or blanks between.
 
-A first column of dates or times of day, as phasor measurement units export them, counts in s from its first row.
+Lines above the names that have another number of cells are a title and left. The time stands in the first column, or
+in the one that is called so, in any unit of time; dates or times of day, as phasor measurement units export them, count
+in s from the first row. An empty cell, or one of the words for it, was not recorded.
 Two readers share one layout: a fast one that only says yes or no, and a careful one that either finds the line and
 column that is wrong or, where only columns nobody asked for are, reads around them.
 """
@@ -14,27 +16,36 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import FORMULA_START, event_rows, pick
-from hvdc_ident.formats._clock import Clock, is_clock
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.formats import event_rows, once, pick
+from hvdc_ident.formats._clock import Clock, is_clock, is_date
+from hvdc_ident.formats._labels import merged, names_and_units, time_column
+from hvdc_ident.trajectory import Array, Origin, Trajectory
+from hvdc_ident.units import seconds_of
 
 NAME = "csv"
-SUMMARY = "text columns under one header line, the first column time in s or a date; comma, semicolon, tab or blanks"
+SUMMARY = (
+    "text columns under their names, and perhaps units, time in s, ms or as dates; comma, semicolon, tab or blanks"
+)
 SUFFIXES = (".csv", ".tsv", ".txt", ".ssv", ".asc")
 
 _MAX_COLUMNS = 100_000
 _MAX_LINE = 32 * 1024**2  # characters
 _SEPARATORS = (";", "\t", ",")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_UNIT = re.compile(r"(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]|(?P<name2>.*\S)\s+\((?P<unit2>[^()]*)\)", re.DOTALL)
-_SUBSCRIPT = re.compile(r"[\d,:\s]+")
-_SECONDS = {"", "s", "sec", "second", "seconds", "-"}
+_MISSING = {
+    "", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "#nv", "#n/d", "null", "none", "<na>", "1.#qnan", "-1.#qnan",
+    "1.#ind", "-1.#ind", "--", "---",
+}  # fmt: skip
+"""What stands, in lower case, in cells of what was not recorded: as pandas reads it, and Excel's words."""
+_EMPTY = ' \t,;"\r\n'
+_DIRECTIVE = re.compile(r'"?sep=."?', re.IGNORECASE)
+_TOP = 40  # lines within which the numbers begin
 _MANY_ROWS_SHARE = 0.2  # of the instants that may have more than two rows (event iterations)
 
 
@@ -42,7 +53,8 @@ _MANY_ROWS_SHARE = 0.2  # of the instants that may have more than two rows (even
 class _Layout:
     """What the top of a file says about the rest. labels: the header cells as they stand, the time's included.
 
-    absolute: the first column holds dates or times of day.
+    units: the time's included, as the header says them. time: the column of times; scale: s in its unit. date: the
+    column of dates beside it, -1 where there is none. absolute: whether its times are dates or times of day.
     """
 
     path: Path
@@ -53,10 +65,18 @@ class _Layout:
     labels: tuple[str, ...]
     names: tuple[str, ...]
     units: tuple[str, ...]
+    time: int = 0
+    scale: float = 1.0
+    date: int = -1
     absolute: bool = False
 
     def column(self, i: int) -> str:
         return f"column {i + 1} ('{_short(self.labels[i])}')"
+
+    @property
+    def signals(self) -> list[int]:
+        """The columns that are not times or dates."""
+        return [i for i in range(len(self.labels)) if i not in (self.time, self.date)]
 
 
 def recognises(path: Path) -> bool:
@@ -64,13 +84,14 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() not in SUFFIXES:
         return False
     with open(path, "rb") as file:
-        return b"\0" not in file.read(65536)
+        top = file.read(65536)
+    return top.startswith(_WIDE) or b"\0" not in top
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
     """Name and unit of every column but the time's; WaveformError where the top of the file is wrong."""
     layout = _layout(path)
-    return list(zip(layout.names[1:], layout.units[1:], strict=True))
+    return [(layout.names[i], layout.units[i]) for i in layout.signals]
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
@@ -81,19 +102,20 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     """
     layout = _layout(path)
     _check_text(layout)
-    wanted = pick(path, signals, layout.names[1:], layout.labels[1:])
-    columns = [0] + [i + 1 for i in wanted]
+    known = layout.signals
+    wanted = pick(path, signals, [layout.names[i] for i in known], [layout.labels[i] for i in known])
+    columns = [layout.time] + [known[i] for i in wanted]
     table = None if layout.absolute else _fast(layout, columns)
     if table is None:
         table = _careful(layout, columns)
     if len(table) < 2:
         raise WaveformError("too few rows", where=str(path), expected="at least 2 rows of numbers", got=f"{len(table)}")
-    time = table[:, 0]
-    keep = _checked_rows(layout, time)
-    if not keep.all():
-        table = table[keep]
-    names = tuple(signals) if signals is not None else layout.names[1:]
-    return Trajectory(table[:, 0], table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]))
+    _check_times(layout, table[:, 0])
+    names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
+    unit = "date" if layout.absolute else layout.units[layout.time]
+    origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "")
+    time = table[:, 0] if layout.scale == 1.0 else table[:, 0] * layout.scale
+    return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
 
 
 def sample(path: Path) -> None:
@@ -103,47 +125,91 @@ def sample(path: Path) -> None:
 
 def _layout(path: Path) -> _Layout:
     encoding = _encoding(path)
-    lines = _lines(path, encoding)
-    number, header = next(lines, (0, ""))
-    if not header:
-        raise WaveformError("nothing but blank lines and comments", where=str(path), expected="a header and numbers")
-    _, row = next(lines, (0, ""))
+    top = list(islice(_lines(path, encoding), _TOP))
+    if not top:
+        raise WaveformError("nothing but blank lines and comments", where=str(path), expected="names and numbers")
+    first = next((k for k, (_, line) in enumerate(top) if _is_row(line)), min(1, len(top)))
+    row = top[first][1] if first < len(top) else ""
+    if first == 0:
+        raise _no_header(path, top[0][0])
+    number, header = top[first - 1]
     separator = _separator(header, row)
-    labels = _header_cells(header, separator, path, number)
+    rows = [_header_cells(header, separator, path, number)]
+    for above, line in reversed(top[: first - 1]):
+        cells = _header_cells(line, separator, path, above)
+        if separator is None or len(cells) != len(rows[0]) or len(cells) < 2 or len(rows) == 3 or not any(cells[1:]):
+            break
+        rows.insert(0, cells)
+    labels = merged(rows) if len(rows) > 1 else rows[0]
     trailing = len(labels) > 1 and labels[-1] == ""
     if trailing:
         labels = labels[:-1]
     elif separator and row:
         cells = row.split(separator)
         trailing = len(cells) == len(labels) + 1 and not cells[-1].strip()
+    time = time_column(labels)
+    if time and not labels[0]:
+        labels[0] = "row"  # the index that some packages write first and without a name
     _check_labels(labels, path, number)
-    names, units = _names_and_units(labels)
-    absolute = separator is not None and is_clock(row.split(separator)[0].strip(' "'))
-    if not absolute and units[0].lower() not in _SECONDS:
+    names, units = names_and_units(labels)
+    cells = [c.strip(' "') for c in row.split(separator)]
+    absolute, date = False, -1
+    if len(cells) >= len(labels) > 1:
+        absolute = is_clock(cells[time])
+        if (
+            is_date(cells[time]) and len(cells) > time + 1 and is_clock(cells[time + 1])
+        ):  # a date beside its time of day
+            absolute, date, time = True, time, time + 1
+        elif absolute and time and is_date(cells[time - 1]):
+            date = time - 1
+    scale = 1.0 if absolute else seconds_of(units[time])
+    if scale is None:
         raise WaveformError(
-            "the first column is not in seconds",
-            where=f"{path}, line {number}, column 1",
-            expected="time in s",
-            got=f"'{_short(labels[0])}'",
-            hint="write the time in seconds",
+            "the time is in a unit that is none of time",
+            where=f"{path}, line {number}, column {time + 1}",
+            expected="s, ms, us, min, h, or dates",
+            got=f"'{_short(labels[time])}'",
+            hint="put the column of times first, or name it 'time [s]'",
         )
-    return _Layout(path, encoding, number, separator, trailing, tuple(labels), names, units, absolute)
+    return _Layout(
+        path, encoding, number, separator, trailing, tuple(labels), names, units, time, scale, date, absolute
+    )
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line is one of numbers, not of names: one of its first cells is a number, a date or a time of day."""
+    for separator in (*_SEPARATORS, None):
+        cells = [c.strip(' "') for c in line.split(separator, 2)]  # of a line that may be very long
+        if len(cells) > 1 or (separator is None and not any(s in line for s in _SEPARATORS)):
+            tops = cells[:2] if cells[0] == "" or is_date(cells[0]) else cells[:1]
+            decimal = "," if separator == "," else "."
+            if any(_NUMBER.fullmatch(c.replace(",", decimal, 1)) or is_clock(c) or is_date(c) for c in tops):
+                return True
+    return False
+
+
+_WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 def _encoding(path: Path) -> str:
+    """UTF-8, UTF-16 where the file says so, else the code page of Western Windows."""
     with open(path, "rb") as file:
         top = file.read(65536)
-    if top.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise WaveformError("the text is UTF-16", where=str(path), expected="UTF-8", hint="save it as UTF-8")
+    if top.startswith(_WIDE):
+        return "utf-16"
     try:
         codecs.getincrementaldecoder("utf-8")().decode(top)
     except UnicodeDecodeError:
-        return "latin-1"
+        return "cp1252"
     return "utf-8-sig"
 
 
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
-    """Line number and text of the lines that are neither blank nor comments."""
+    """Line number and text of the lines that are neither blank, nor comments, nor Excel's `sep=;`.
+
+    Lines of nothing but separators are left out at the end only, where spreadsheets put them.
+    """
+    empty: list[tuple[int, str]] = []
     with open(path, encoding=encoding, errors="replace") as file:
         number = 0
         while line := file.readline(_MAX_LINE):
@@ -153,8 +219,14 @@ def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
             if "\0" in line:
                 raise _binary(path, number)
             text = line.strip(" \r\n")
-            if text.strip() and not text.startswith("#"):
-                yield number, text
+            if not text.strip() or text.startswith("#") or _DIRECTIVE.fullmatch(text):
+                continue
+            if not text.strip(_EMPTY):
+                empty.append((number, text))
+                continue
+            yield from empty
+            empty.clear()
+            yield number, text
 
 
 def _binary(path: Path, line: int) -> WaveformError:
@@ -166,6 +238,8 @@ def _binary(path: Path, line: int) -> WaveformError:
 def _check_text(layout: _Layout) -> None:
     """Refuse a file with a NUL byte anywhere; says in which line."""
     line = 1
+    if layout.encoding == "utf-16":
+        return  # where every second byte is one; the lines are looked at instead
     with open(layout.path, "rb") as file:
         while chunk := file.read(1 << 20):
             place = chunk.find(b"\0")
@@ -198,16 +272,18 @@ def _header_cells(header: str, separator: str | None, path: Path, line: int) -> 
     return [cell.strip() for cell in cells]
 
 
+def _no_header(path: Path, line: int) -> WaveformError:
+    return WaveformError(
+        "no header",
+        where=f"{path}, line {line}",
+        expected="a line with the names of the columns",
+        got="numbers",
+        hint="put one before the numbers, without # at its start",
+    )
+
+
 def _check_labels(labels: Sequence[str], path: Path, line: int) -> None:
     where = f"{path}, line {line}"
-    if all(_NUMBER.fullmatch(cell.replace(",", ".")) for cell in labels):
-        raise WaveformError(
-            "no header",
-            where=where,
-            expected="a line with the names of the columns",
-            got="numbers",
-            hint="put one before the numbers, without # at its start",
-        )
     if len(labels) < 2:
         raise WaveformError(
             "only one column",
@@ -228,26 +304,6 @@ def _check_labels(labels: Sequence[str], path: Path, line: int) -> None:
         )
 
 
-def _names_and_units(labels: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of the header cells; a cell keeps its unit in the name where two would be the same without."""
-    parts = [_name_and_unit(label) for label in labels]
-    counts = Counter(name for name, _ in parts)
-    names = [name if counts[name] == 1 else label for (name, _), label in zip(parts, labels, strict=True)]
-    return tuple(names), tuple(unit for _, unit in parts)
-
-
-def _name_and_unit(label: str) -> tuple[str, str]:
-    match = _UNIT.fullmatch(label)
-    name, unit = label, ""
-    if match and match["name"] is not None and not _SUBSCRIPT.fullmatch(match["unit"]):
-        name, unit = match["name"], match["unit"].strip()
-    elif match and match["name2"] is not None:
-        name, unit = match["name2"], match["unit2"].strip()
-    if name.startswith("'") and FORMULA_START.match(name[1:]):
-        name = name[1:]
-    return name, unit
-
-
 def _fast(layout: _Layout, columns: list[int]) -> Array | None:
     """(n, columns) the numbers, or None where anything about the file is not as it should be."""
     try:
@@ -257,12 +313,13 @@ def _fast(layout: _Layout, columns: list[int]) -> Array | None:
     if table.shape[1] != len(layout.labels):
         return None
     table = table[:, columns] if columns != list(range(table.shape[1])) else table
-    return table if np.isfinite(table).all() else None
+    return table if np.isfinite(table[:, 0]).all() and not np.isinf(table).any() else None
 
 
 def _rows(layout: _Layout) -> Iterator[str]:
     """The lines of numbers, made plain for the fast reader; ValueError where that cannot be done without doubt."""
     separator = layout.separator
+    void = False
     comma = point = False
     empty = True
     with open(layout.path, encoding=layout.encoding, errors="replace") as file:
@@ -271,6 +328,11 @@ def _rows(layout: _Layout) -> Iterator[str]:
         for line in file:
             if line.isspace() or line.startswith("#") or line.lstrip().startswith("#"):
                 continue
+            if not line.strip(_EMPTY):
+                void = True
+                continue
+            if void:
+                raise ValueError("a row of nothing but separators")
             if '"' in line:
                 line = line.replace('"', "")
             if layout.trailing:
@@ -281,6 +343,10 @@ def _rows(layout: _Layout) -> Iterator[str]:
                 if comma and point:
                     raise ValueError("both decimal signs")
                 line = line.replace(",", ".") if comma else line
+            if separator and separator * 2 in line:
+                line = line.replace(separator * 2, f"{separator}nan{separator}").replace(
+                    separator * 2, f"{separator}nan{separator}"
+                )
             empty = False
             yield line
     if empty:
@@ -302,8 +368,9 @@ def _careful(layout: _Layout, columns: list[int]) -> Array:
         row = []
         for i in columns:
             cell = cells[i]
-            if i == 0 and layout.absolute:
-                row.append(_clock_time(clock, cell, layout, number))
+            if i == layout.time and layout.absolute:
+                dated = f"{cells[layout.date]} {cell}" if layout.date >= 0 else cell
+                row.append(_clock_time(clock, dated, layout, number))
                 continue
             if layout.separator != ",":
                 comma_line, point_line = comma_line or number * ("," in cell), point_line or number * ("." in cell)
@@ -326,7 +393,7 @@ def _clock_time(clock: Clock, cell: str, layout: _Layout, line: int) -> float:
     except ValueError as error:
         raise WaveformError(
             f"{error} where the time stands",
-            where=f"{layout.path}, line {line}, {layout.column(0)}",
+            where=f"{layout.path}, line {line}, {layout.column(layout.time)}",
             expected="as in 2026-11-21 10:15:00.020 (or 21/11/2026, day first)",
             got=f"'{_short(cell)}'",
             hint="write the time in seconds",
@@ -354,7 +421,7 @@ def _ragged(layout: _Layout, line: int, got: int) -> WaveformError:
 
 def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
     value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
-    if math.isfinite(value):
+    if math.isfinite(value) or (column != layout.time and cell.lower() in _MISSING):
         return value
     lowered = cell.lower().lstrip("+-")
     what = "an empty cell" if not cell else "a value that is not finite" if lowered[:3] in ("nan", "inf") else "text"
@@ -363,39 +430,38 @@ def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
     raise WaveformError(
         f"{what} where a number belongs",
         where=f"{layout.path}, line {line}, {layout.column(column)}",
-        expected="a finite number",
+        expected="a finite number" + ("" if column == layout.time else ", or an empty cell where nothing was recorded"),
         got=f"'{_short(cell)}'",
         hint="take out the row, or the column if it is not needed",
     )
 
 
-def _checked_rows(layout: _Layout, time: Array) -> NDArray[np.bool_]:
-    """(n,) the rows that stay; WaveformError where the time goes back or stands still."""
+def _check_times(layout: _Layout, time: Array) -> None:
+    """WaveformError where the time goes back or stands still. time: (n,) in the file's unit."""
     back = np.flatnonzero(np.diff(time) < 0)
+    unit = "s" if layout.absolute else layout.units[layout.time] or "s"
     if back.size:
         row = int(back[0]) + 1
         raise WaveformError(
             "the time goes back",
-            where=f"{layout.path}, line {_line_of(layout, row)}, {layout.column(0)}",
-            expected=f"at least {time[row - 1]:.12g} s, the time of the row before",
-            got=f"{time[row]:.12g} s",
+            where=f"{layout.path}, line {_line_of(layout, row)}, {layout.column(layout.time)}",
+            expected=f"at least {time[row - 1]:.12g} {unit}, the time of the row before",
+            got=f"{time[row]:.12g} {unit}",
             hint="sort the rows by time",
         )
-    keep = event_rows(time)
-    if keep.all():
-        return keep
+    if event_rows(time).all():
+        return
     instants, rows = np.unique(time, return_counts=True)
     if np.count_nonzero(rows > 2) > _MANY_ROWS_SHARE * instants.size:
         t = instants[np.argmax(rows > 2)]
         row = int(np.flatnonzero(time == t)[2])
         raise WaveformError(
-            f"the time {t:.12g} s stands more than twice",
-            where=f"{layout.path}, line {_line_of(layout, row)}, {layout.column(0)}",
+            f"the time {t:.12g} {unit} stands more than twice",
+            where=f"{layout.path}, line {_line_of(layout, row)}, {layout.column(layout.time)}",
             expected="two rows at a jump, one anywhere else",
             got=f"{int(rows[instants == t][0])} rows",
             hint="export the time with more digits",
         )
-    return keep
 
 
 def _line_of(layout: _Layout, row: int) -> int:

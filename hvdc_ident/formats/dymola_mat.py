@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import MAX_BYTES, event_rows, pick
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "dymola-mat"
 SUMMARY = "result files of Dymola and OpenModelica (MATLAB v4)"
@@ -100,7 +100,8 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         columns = _resampled(result, int(number), np.abs(signed) - 1, time, path)
         values[:, here] = columns[keep if len(columns) == time.size else slice(None)] * np.sign(signed)
     names = tuple(result.names[i] for i in wanted)
-    return Trajectory(time[keep], values, names, tuple(result.units[i] for i in wanted))
+    origin = Origin(rows=time.size, dropped=int(np.count_nonzero(~keep)), time_unit="s")
+    return Trajectory(time[keep], values, names, tuple(result.units[i] for i in wanted), origin)
 
 
 def sample(path: Path) -> None:

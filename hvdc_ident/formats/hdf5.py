@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
 from hvdc_ident.trajectory import Trajectory
@@ -142,4 +142,4 @@ def _netcdf3(path: Path) -> list[Trajectory]:
 def _checked(part: Trajectory, path: Path) -> Trajectory:
     if len(part) < 2 or not np.isfinite(part.time).all() or (np.diff(part.time) < 0).any():
         raise damaged(path, "a time vector is too short, not finite, or goes back")
-    return part.rows(event_rows(part.time))
+    return once(part)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
 from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
@@ -217,7 +217,7 @@ def _once(part: Trajectory, path: Path) -> Trajectory:
         raise damaged(path, "a time vector is too short or not finite", expected="at least 2 times")
     if (np.diff(part.time) < 0).any():
         raise damaged(path, "the time goes back", expected="increasing times")
-    return part.rows(event_rows(part.time))
+    return once(part)
 
 
 def _object(path: Path, name: str) -> WaveformError:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._columns import check_size, damaged, package, time_name
 from hvdc_ident.trajectory import Trajectory
 
@@ -43,7 +43,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     if not np.isfinite(time).all() or (np.diff(time) < 0).any():
         raise damaged(path, f"column '{clock}' is not finite or goes back", expected="increasing times")
     found = Trajectory(time, values, tuple(names[i] for i in wanted), tuple(units[i] for i in wanted))
-    return found.rows(event_rows(time))
+    return once(found)
 
 
 def write(trajectory: Trajectory, path: Path) -> None:

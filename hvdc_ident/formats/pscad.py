@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._columns import check_size, damaged, own_names
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "pscad"
 SUMMARY = "PSCAD output: the .inf, with its numbered .out files beside it"
@@ -75,8 +75,15 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     values = np.column_stack([tables[(c.number - 1) // _PER_FILE][:, (c.number - 1) % _PER_FILE + 1] for c in wanted])
     if (np.diff(first[:, 0]) < 0).any():
         raise damaged(path, "the time goes back in the .out files")
-    keep = event_rows(first[:, 0])
-    return Trajectory(first[keep, 0], values[keep], tuple(c.name for c in wanted), tuple(c.unit for c in wanted))
+    units = tuple(c.unit for c in wanted)
+    return once(Trajectory(first[:, 0], values, tuple(c.name for c in wanted), units, Origin(time_unit="s")))
+
+
+def files(path: Path) -> list[Path]:
+    """The .out files of the channels that are there."""
+    numbers = sorted({(c.number - 1) // _PER_FILE + 1 for c in _channels(path)})
+    found = (_there(path, number) for number in numbers)
+    return [file for file in found if file is not None]
 
 
 def sample(path: Path) -> None:
@@ -111,16 +118,25 @@ def _channels(path: Path) -> list[_Channel]:
 
 
 def _out_file(path: Path, number: int) -> Path:
+    """The .out file of a number. Raises WaveformError where it is missing."""
+    found = _there(path, number)
+    if found is None:
+        raise WaveformError(
+            f"a file of channels {(number - 1) * _PER_FILE + 1} to {number * _PER_FILE} is missing",
+            where=str(path),
+            expected=f"{path.stem}_{number:02d}.out beside it",
+            hint="copy all .out files of the run",
+        )
+    return found
+
+
+def _there(path: Path, number: int) -> Path | None:
+    """The .out file of a number, where there is one."""
     names = (f"{path.stem}_{number:02d}.out", f"{path.stem}_{number:02d}.OUT", f"{path.stem}.out")
     for name in names[: 3 if number == 1 else 2]:
         if (other := path.with_name(name)).is_file():
             return other
-    raise WaveformError(
-        f"a file of channels {(number - 1) * _PER_FILE + 1} to {number * _PER_FILE} is missing",
-        where=str(path),
-        expected=f"{names[0]} beside it",
-        hint="copy all .out files of the run",
-    )
+    return None
 
 
 def _table(path: Path, columns: int) -> Array:

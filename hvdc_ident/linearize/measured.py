@@ -63,12 +63,12 @@ def from_record(
 
 
 def from_experiment(experiment: Experiment, input: str, output: str, segments: int = 8) -> Response:
-    """The response between an experiment's input and a measured output, over its window."""
+    """The response between an experiment's input and a measured output, over the recorded rows of its window."""
     if input not in experiment.inputs:
         raise unknown_name("input", input, experiment.inputs, where=f"experiment '{experiment.name}'")
     if experiment.measured is None or output not in experiment.measured.names:
         raise unknown_name("measured output", output, experiment.outputs, where=f"experiment '{experiment.name}'")
-    rows = experiment.compared
+    rows = experiment.compared & np.isfinite(experiment.measured[output])
     t = experiment.time[rows]
     u, y = experiment.inputs[input](t), experiment.measured[output][rows]
     return from_record(t, u, y, input=input, output=output, segments=segments)

@@ -60,7 +60,10 @@ def svg(fig: Figure, label: str) -> str:
 
 
 def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
-    """At most about so many points that draw the same line: the smallest and the largest of each stretch, in order."""
+    """At most about so many points that draw the same line: the smallest and the largest of each stretch, in order.
+
+    A NaN in a stretch stays one, so that the line has a gap there.
+    """
     rows = visible_rows(values, points)
     return time[rows], values[rows]
 
@@ -72,5 +75,10 @@ def visible_rows(values: Array, points: int = POINTS) -> NDArray[np.intp]:
     width = -(-2 * values.size // points)
     whole = np.append(values, np.full(-values.size % width, values[-1])).reshape(-1, width)
     begins = np.arange(0, values.size, width)
-    rows = np.concatenate([[0, values.size - 1], begins + whole.argmin(axis=1), begins + whole.argmax(axis=1)])
+    missing = np.isnan(whole)
+    low, high = np.where(missing, np.inf, whole).argmin(axis=1), np.where(missing, -np.inf, whole).argmax(axis=1)
+    parts = [[0, values.size - 1], begins + low, begins + high]
+    if missing.any():
+        parts.append(begins + missing.argmax(axis=1))
+    rows = np.concatenate(parts)
     return np.unique(np.minimum(rows, values.size - 1))

@@ -99,7 +99,8 @@ def _swing(results: Results, output: str, experiment: str) -> float | None:
     for stage in ("simulation", "fit"):
         table = results.table(f"{stage}.{experiment}.csv")
         if table is not None and f"{output}.measured" in table:
-            return float(np.ptp(table[f"{output}.measured"]))
+            record = table[f"{output}.measured"]
+            return float(np.nanmax(record) - np.nanmin(record))
     return None
 
 

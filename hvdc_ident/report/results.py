@@ -61,7 +61,7 @@ class Results:
         with path.open(encoding="utf-8", newline="") as file:
             header = [csv_name(name) for name in next(csv.reader(file), [])]
             try:
-                rows = np.loadtxt(file, delimiter=",", ndmin=2)
+                rows = np.loadtxt((_filled(line) for line in file), delimiter=",", ndmin=2)
             except ValueError:
                 return None
         return (
@@ -69,3 +69,10 @@ class Results:
             if rows.shape[1] == len(header) and rows.size
             else None
         )
+
+
+def _filled(line: str) -> str:
+    """A line of a table with NaN in its empty cells: what was not recorded."""
+    if ",," not in line and not line.rstrip().endswith(","):
+        return line
+    return ",".join(cell.strip() or "nan" for cell in line.split(","))

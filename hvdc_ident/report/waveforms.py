@@ -123,6 +123,6 @@ def curves(
 def _limits(tables: list[Trajectory], output: str) -> tuple[float, float]:
     """The range of the recording and of what is simulated, with some air; never of no height."""
     columns: list[Array] = [t[c] for t in tables for c in (output, f"{output}.measured")]
-    low, high = float(np.min([c.min() for c in columns])), float(np.max([c.max() for c in columns]))
+    low, high = float(np.nanmin([np.nanmin(c) for c in columns])), float(np.nanmax([np.nanmax(c) for c in columns]))
     air = 0.06 * (high - low) or 0.05 * max(abs(high), 1e-3)
     return low - air, high + air

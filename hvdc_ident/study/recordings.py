@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,13 +12,13 @@ import numpy as np
 from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.files import digest
-from hvdc_ident.formats import read_waveforms
+from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.derived import raw_columns, with_phases
-from hvdc_ident.study.units import factor, same_unit
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.trajectory import Array, Origin, Trajectory
+from hvdc_ident.units import conversion, same_unit, seconds_of
 from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor
 
 TIME_SHIFT = "time-shift"
@@ -39,7 +39,7 @@ class NoiseNote:
 
 @dataclass
 class Recordings:
-    """The data files of a study, each read once. digests: sha256 by the name in the study."""
+    """The data files of a study, each read once. digests: sha256 of every file behind them, by its path from the study."""
 
     folder: Path
     digests: dict[str, str] = field(default_factory=dict)
@@ -53,7 +53,9 @@ class Recordings:
                 self._read[name] = read_waveforms(path, dict.fromkeys(c for cs in wanted.values() for c in cs))
             except InputError as e:
                 raise self._placed(e, path, wanted) from None
-            self.digests[name] = digest(path.read_bytes())
+            for file in files_of(path):
+                beside = name if file == path else (Path(name).parent / file.name).as_posix()
+                self.digests[beside] = digest(file.read_bytes())
 
     def __getitem__(self, name: str) -> Trajectory:
         """The columns read from a file."""
@@ -155,15 +157,21 @@ def _experiment(
     columns = dict(_channels(table))
     data = with_phases(table.phases, data, place)
     time = _time(table, data, place)
-    scaled = {s: _scaled(table, model, s, c, data, place) for s, c in columns.items()}
-    inputs = {s: _input(table, s, time, scaled[s], place) for s in (*table.inputs, *table.drive)}
+    mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
+    scaled = {s: _scaled(data[c], mappings[s]) for s, c in columns.items()}
+    inputs = {s: _input(table, s, columns[s], time, scaled[s], place) for s in (*table.inputs, *table.drive)}
     outputs = tuple(table.outputs)
     event = _event(table, inputs, time, place)
     window = _window(table, time, place)
+    for o in outputs:
+        _check_recorded(o, columns[o], scaled[o], f"{place}, {table.data}")
     notes = {o: _noise(table.noise.get(o), time, scaled[o], event) for o in outputs}
-    measured = Trajectory(
-        time, np.column_stack([scaled[o] for o in outputs]), outputs, tuple(model.outputs[o].unit for o in outputs)
+    units = tuple(model.outputs[o].unit for o in outputs)
+    converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
+    origin = replace(
+        data.origin, time_unit=_time_unit(table, data.origin), converted=tuple(line for line in converted if line)
     )
+    measured = Trajectory(time, np.column_stack([scaled[o] for o in outputs]), outputs, units, origin)
     experiment = Experiment(
         name=table.name,
         time=time,
@@ -171,7 +179,9 @@ def _experiment(
         values=FrozenMap(table.values),
         measured=measured,
         noise=FrozenMap({o: n.std for o, n in notes.items() if n.source != "floor"}),
-        noise_dof=FrozenMap({o: _noise_dof(time, event) for o, n in notes.items() if n.source == "estimated"}),
+        noise_dof=FrozenMap(
+            {o: _noise_dof(time[np.isfinite(scaled[o])], event) for o, n in notes.items() if n.source == "estimated"}
+        ),
         event=event,
         window=window,
         role=table.role,
@@ -187,25 +197,41 @@ def _time(table: schema.Experiment, data: Trajectory, place: str) -> Array:
     line = table.columns.get("time")
     if line is None:
         return data.time
-    if line.name is not None:
+    if line.name is not None or line.base is not None or line.offset is not None:
         raise StudyError(
-            "the time is the file's first column", where=f"{place}.columns.time", expected="unit or scale alone"
+            "the file says where its time stands", where=f"{place}.columns.time", expected="unit or scale alone"
         )
-    scale = line.scale if line.scale is not None else factor(line.unit or "s", "s")
+    stated = data.origin.time_unit
+    if stated and (line.scale is not None or seconds_of(stated) != seconds_of(line.unit or "s")):
+        raise StudyError(
+            "the unit of the time contradicts the file's",
+            where=f"{place}.columns.time",
+            expected=f"nothing: {table.data} says '{stated}', and its times are converted from that",
+            got=f"{line.unit or line.scale}",
+        )
+    if stated:
+        return data.time
+    scale = line.scale if line.scale is not None else seconds_of(line.unit or "s")
     if scale is None or scale <= 0:
         raise StudyError(
             "no unit of time",
             where=f"{place}.columns.time",
-            expected="s, ms, us, or a scale above 0",
+            expected="s, ms, us, min, h, or a scale above 0",
             got=f"{line.unit or line.scale}",
         )
     return data.time * scale
 
 
-def _scaled(table: schema.Experiment, model: AnyModel, signal: str, column: str, data: Trajectory, place: str) -> Array:
-    """The column in the model's unit. Raises where the units contradict each other and no scale is given."""
+def _mapping(
+    table: schema.Experiment, model: AnyModel, signal: str, column: str, data: Trajectory, place: str
+) -> tuple[float, float]:
+    """Scale and offset: the value in the model's unit = scale x recorded + offset.
+
+    Units of one kind are converted. Raises where the units contradict each other and neither scale nor base is given.
+    """
     line = table.columns.get(signal) or schema.Column()
     recorded = line.unit if line.unit is not None else data.unit(column)
+    offset = line.offset or 0.0
     if line.unit is not None and data.unit(column) and not same_unit(line.unit, data.unit(column)):
         raise StudyError(
             f"the unit of column '{column}' contradicts the file's",
@@ -218,21 +244,44 @@ def _scaled(table: schema.Experiment, model: AnyModel, signal: str, column: str,
             raise StudyError(
                 "a scale of 0 leaves nothing", where=f"{place}.columns.{signal}", expected="a number that is not 0"
             )
-        return data[column] * line.scale
+        return line.scale, offset
     if line.base is not None:
-        return data[column] / line.base
+        return 1.0 / line.base, offset
     unit = _unit(model, signal)
     if not recorded or not unit or same_unit(recorded, unit):
-        return data[column]
-    by = factor(recorded, unit)
-    scale = f"{by:g}" if by else "... (value in the model = scale x recorded)"
-    raise StudyError(
-        f"column '{column}' is in another unit than the model's '{signal}'",
-        where=f"{place}.columns.{signal}" if line.unit is not None else f"{place}, {table.data}",
-        expected=f"'{unit}'",
-        got=f"'{recorded}'",
-        hint=f'columns = {{{signal} = {{unit = "{recorded}", scale = {scale}}}}}',
-    )
+        return 1.0, offset
+    by = conversion(recorded, unit)
+    if by is None:
+        raise StudyError(
+            f"column '{column}' is in another unit than the model's '{signal}'",
+            where=f"{place}.columns.{signal}" if line.unit is not None else f"{place}, {table.data}",
+            expected=f"'{unit}'",
+            got=f"'{recorded}'",
+            hint=f'columns = {{{signal} = {{unit = "{recorded}", scale = ...}}}}, value in the model = scale x recorded',
+        )
+    return by[0], by[1] + offset
+
+
+def _conversion_words(
+    table: schema.Experiment,
+    model: AnyModel,
+    signal: str,
+    column: str,
+    data: Trajectory,
+    mapping: tuple[float, float],
+) -> str:
+    """What was done to a column beyond what the study states: the conversion of its unit; "" where nothing was."""
+    line = table.columns.get(signal) or schema.Column()
+    if line.scale is not None or line.base is not None or mapping == (1.0, line.offset or 0.0):
+        return ""
+    return f"{signal}: from {line.unit or data.unit(column)} to {_unit(model, signal)}"
+
+
+def _scaled(values: Array, mapping: tuple[float, float]) -> Array:
+    """The values in the model's unit, untouched where nothing is to be done."""
+    scale, offset = mapping
+    found = values if scale == 1.0 else values * scale
+    return found if offset == 0.0 else found + offset
 
 
 def _unit(model: AnyModel, signal: str) -> str:
@@ -242,13 +291,39 @@ def _unit(model: AnyModel, signal: str) -> str:
     return ""
 
 
-def _input(table: schema.Experiment, signal: str, time: Array, values: Array, place: str) -> InputSignal:
+def _input(table: schema.Experiment, signal: str, column: str, time: Array, values: Array, place: str) -> InputSignal:
     kind = table.interpolation
     chosen = kind.get(signal) if isinstance(kind, dict) else kind
+    missing = np.flatnonzero(np.isnan(values))
+    if missing.size:
+        raise StudyError(
+            f"column '{column}' is not recorded in {missing.size} of {values.size} rows, the first at {time[missing[0]]:g} s",
+            where=f"{place}, {table.data}",
+            expected=f"a number in every row: the model needs its '{signal}' all along",
+            hint="fill the gaps, or cut the record; only outputs may have them",
+        )
     try:
         return input_signal(time, values, chosen)
     except InputError as e:
         raise e.at(f"{place}, signal '{signal}'") from None
+
+
+def _check_recorded(output: str, column: str, values: Array, place: str) -> None:
+    if np.isnan(values).all():
+        raise StudyError(
+            f"column '{column}' of output '{output}' is not recorded in any row",
+            where=place,
+            expected="numbers",
+            hint="take it out of outputs",
+        )
+
+
+def _time_unit(table: schema.Experiment, origin: Origin) -> str:
+    """The unit of the time as the file or the study says it, "" where neither does."""
+    line = table.columns.get("time")
+    if origin.time_unit or line is None:
+        return origin.time_unit
+    return line.unit or (f"{line.scale:g} s" if line.scale is not None else "")
 
 
 def _event(table: schema.Experiment, inputs: Mapping[str, InputSignal], time: Array, place: str) -> float | None:

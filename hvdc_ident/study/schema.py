@@ -106,12 +106,16 @@ class Candidate(Table):
 
 
 class Column(Table):
-    """One line of an experiment's `columns`: the recorded column of a signal and how it gets the model's unit."""
+    """One line of an experiment's `columns`: the recorded column of a signal and how it gets the model's unit.
+
+    model = scale x recorded + offset, or (recorded / base) + offset; the offset is in the model's unit.
+    """
 
     name: Name | None = None
     unit: Annotated[str, StringConstraints(max_length=50)] | None = None
     scale: FiniteFloat | None = None
     base: Positive | None = None
+    offset: FiniteFloat | None = None
 
     @model_validator(mode="after")
     def _one_factor(self) -> Column:

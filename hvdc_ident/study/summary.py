@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.experiment import Experiment, recording_lines
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.stage import stages
 from hvdc_ident.study.study import Study
@@ -44,6 +44,7 @@ def summary_text(found: dict[str, Any]) -> str:
         lines.append(
             f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
         )
+        lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
     lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
     return "\n".join(lines)
 
@@ -58,5 +59,6 @@ def _experiment(e: Experiment, study: Study) -> dict[str, Any]:
         "window": e.window,
         "inputs": [n for n in e.inputs if n not in e.drive],
         "outputs": list(e.outputs),
+        "recording": e.recording,
         "noise": {o: {"std": n.std, "source": n.source} for o, n in notes.items()},
     }

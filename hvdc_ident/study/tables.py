@@ -12,6 +12,7 @@ import numpy as np
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import csv_cell
+from hvdc_ident.fit.residual import compared_rows
 from hvdc_ident.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -22,9 +23,12 @@ SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 
 
 def rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
-    """The root mean square of measured - simulated over the rows that are compared, in the output's unit."""
+    """The root mean square of measured - simulated over the rows that are compared, in the output's unit.
+
+    Raises StudyError where there is none.
+    """
+    rows = compared_rows(experiment, output)
     assert experiment.measured is not None
-    rows = experiment.compared
     difference = experiment.measured[output][rows] - simulated[output][rows]
     return float(np.sqrt(np.mean(difference**2)))
 
@@ -80,7 +84,7 @@ def ssv(values: Mapping[str, float], name: str) -> str:
 
 
 def csv_text(header: list[str], rows: list[list[Any]]) -> str:
-    """CSV text, every number with all its digits, nothing for None, no text that a spreadsheet takes for a formula."""
+    """CSV text, every number with all its digits, nothing for None and NaN, no text that a spreadsheet takes for a formula."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([csv_cell(h) for h in header])
@@ -91,4 +95,6 @@ def csv_text(header: list[str], rows: list[list[Any]]) -> str:
 def _cell(value: Any) -> Any:
     if isinstance(value, str):
         return csv_cell(value)
-    return "" if value is None else repr(value) if isinstance(value, float) else value
+    if value is None or value != value:  # None, or NaN: not recorded
+        return ""
+    return repr(value) if isinstance(value, float) else value

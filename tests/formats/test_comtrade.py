@@ -106,7 +106,6 @@ def test_channels_of_one_name_keep_their_phase(tmp_path: Path) -> None:
         (header("ASCII", rates="2\n1000,4\n100,2"), ascii_rows(), "sampling rates"),
         (header("ASCII").replace("0.5,1,0", "nan,1,0"), ascii_rows(), "not finite"),
         (header("ASCII"), ascii_rows().replace("-21", "x"), "cannot be read"),
-        (header("ASCII"), ascii_rows().replace("-21", "99999"), "not a finite number"),
         ("STATION,REC\n" + "3,2A,1D\n", ascii_rows(), "number of channels"),
         (header("ASCII", rates="0\n0,4", multiplier="0"), ascii_rows(), "multiplier"),
     ],

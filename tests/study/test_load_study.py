@@ -10,7 +10,7 @@ import pytest
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.study import recordings
 from hvdc_ident.study.study import Study, load_study
-from hvdc_ident.study.units import factor, same_unit
+from hvdc_ident.units import conversion, same_unit
 
 TIME = np.arange(101) * 0.01
 
@@ -161,5 +161,5 @@ def test_every_table_of_the_contract_is_read(tmp_path: Path, table: str) -> None
 
 def test_units() -> None:
     assert same_unit("", "pu") and same_unit("p.u.", "1") and not same_unit("kV", "V")
-    assert factor("kV", "V") == 1e3 and factor("ms", "s") == 1e-3 and factor("MW", "kW") == pytest.approx(1e3)
-    assert factor("kA", "pu") is None and factor("m", "s") is None
+    assert conversion("kV", "V") == (1e3, 0.0) and conversion("ms", "s") == (1e-3, 0.0)
+    assert conversion("kA", "pu") is None and conversion("m", "s") is None

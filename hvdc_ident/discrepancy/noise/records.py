@@ -196,7 +196,8 @@ def _given(output: str, experiments: Sequence[Experiment]) -> float | None:
     found = [e.noise.get(output) for e in experiments]
     if any(n is None or n <= 0 for n in found):
         return None
-    ranges = [float(np.ptp(e.measured[output])) for e in experiments if e.measured is not None]
+    whole = [e.measured[output] for e in experiments if e.measured is not None]
+    ranges = [float(np.nanmax(v) - np.nanmin(v)) for v in whole if np.isfinite(v).any()]
     value = float(np.sqrt(np.mean([n**2 for n in found if n is not None])))
     return value if value > 1.001 * SOFT * max([*ranges, 0.0]) else None
 
@@ -298,10 +299,10 @@ def draws(
             placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
             e = np.round((placed + size * e) / n.step) * n.step - placed
             rounding = problem.treatment.rounded(b.output)
-            if rounding is not None:
+            if rounding is not None and b.profile is None:
                 found.append(rounding.residual(e)[0])
                 continue
-            e = e / b.sigma
+            e = b.scaled(e)
         found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
     return found
 

@@ -240,7 +240,8 @@ def _correlation(blocks: Sequence[Block]) -> float:
     """The lag-1 autocorrelation of all residuals, 0 where it is negative or what chance gives."""
     power = sum(float(b.score @ b.score) for b in blocks)
     rows = sum(b.residual.size for b in blocks)
-    found = sum(float(b.score[1:] @ b.score[:-1]) for b in blocks) / power if power else 0.0
+    records = [b.score[part] for b in blocks for part in b.stretches]
+    found = sum(float(r[1:] @ r[:-1]) for r in records) / power if power else 0.0
     return found if found > 2.0 / np.sqrt(rows) else 0.0
 
 

@@ -207,7 +207,7 @@ class Whitening:
     def _rows(self, b: Block, y: Array, time: Array) -> Array:
         if b.slope is not None:
             return np.asarray(y * b.slope[:, None])
-        return self.treatment.applied(y / b.sigma, time, b.output, self.name)
+        return self.treatment.applied(b.scaled(y), time, b.output, self.name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from hvdc_ident.experiment import recording_lines
 from hvdc_ident.report.drawing import svg
 from hvdc_ident.report.html import text
 from hvdc_ident.report.interactive import zoomable
@@ -30,7 +31,9 @@ def _render(results: Results) -> str:
         left -= len(drawn)
         if drawn:
             role = " (held out: not used by the fit)" if about.get("role") == "holdout" else ""
-            parts.append(f"<h3>{text(name)}{role}</h3>\n" + "\n".join(drawn))
+            told = "; ".join(recording_lines(about["recording"])) if about.get("recording") else ""
+            note = f"<p class='small'>The recording: {text(told)}.</p>\n" if told else ""
+            parts.append(f"<h3>{text(name)}{role}</h3>\n{note}" + "\n".join(drawn))
     if left <= 0:
         parts.append(f"<p>Only the first {MOST} waveforms are drawn; the CSV files beside this page hold all.</p>")
     return "\n".join(parts)

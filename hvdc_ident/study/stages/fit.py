@@ -59,7 +59,10 @@ def _context(study: Study, options: Options, report: Mapping[str, Any], result: 
             for n, f in study.candidates.items()
         },
         "units": {o: study.model.outputs[o].unit for o in result.rmse},
-        "experiments": {e.name: {"role": e.role, "event": e.event, "window": e.window} for e in study.experiments},
+        "experiments": {
+            e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording}
+            for e in study.experiments
+        },
         "noise": {
             e: {o: {"std": n.std, "source": n.source} for o, n in notes.items()} for e, notes in study.noise.items()
         },

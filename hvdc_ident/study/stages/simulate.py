@@ -41,7 +41,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         "rmse": table,
         "units": {o: study.model.outputs[o].unit for o in table},
         "experiments": {
-            e.name: {"role": e.role, "event": e.event, "window": e.window, **status[e.name]} for e in study.experiments
+            e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording, **status[e.name]}
+            for e in study.experiments
         },
     }
     return Outcome(data, files, failed=status[failed[0]]["reason"] if failed else "")

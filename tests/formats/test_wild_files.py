@@ -1,0 +1,126 @@
+"""Files as tools and people write them: titles, two header lines, other languages, dates, gaps, rows left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hvdc_ident.errors import WaveformError
+from hvdc_ident.formats import convert, csv_text, files_of, formats, list_signals, read_waveforms, write_csv
+from hvdc_ident.trajectory import trajectory
+
+ROWS = ((0.0, 1.5, -2.0), (0.5, 1e-3, 4.0))
+"""What every file of STYLES holds: time in s, U in kV, P in MW."""
+
+STYLES = {
+    "German Excel": ("Zeit [s];U [kV];P [MW]\n0;1,5;-2\n0,5;0,001;4\n", "cp1252"),
+    "sep line and units below": ("sep=;\nZeit;U;P\n[ms];[kV];[MW]\n0;1,5;-2\n500;0,001;4\n;;\n", "cp1252"),
+    "title above": ("Messung Müller;;\nGerät 7\n\nt/ms;U/kV;P/MW\n0;1,5;-2\n500;0,001;4\n", "cp1252"),
+    "French": ("Temps (ms);U (kV);P (MW)\n0;1,5;-2\n500;1,0E-3;4\n", "utf-8"),
+    "brackets without a blank": ('"Time(s)","U(kV)","P(MW)"\n0,1.5,-2\n0.5,1e-3,4\n', "utf-8"),
+    "PowerFactory": ('"All calculations","U","P"\n"Time in s","in kV","in MW"\n0,1.5,-2\n0.5,1e-3,4\n', "utf-8"),
+    "stroke": ("t / s\tU / kV\tP / MW\n0\t1.5\t-2\n0.5\t1e-3\t4\n", "utf-8"),
+    "Excel's Unicode text": ("Time [s]\tU [kV]\tP [MW]\r\n0\t1,5\t-2\r\n0,5\t0,001\t4\r\n", "utf-16"),
+    "index first": (",time [s],U [kV],P [MW]\n0,0,1.5,-2\n1,0.5,1e-3,4\n", "utf-8"),
+    "sample number first": ("Sample;Zeit [ms];U [kV];P [MW]\n17;0;1,5;-2\n18;500;0,001;4\n", "utf-8"),
+    "dates, the month first": (
+        "Timestamp,U (kV),P (MW)\n11/30/2026 11:59:59.750 PM,1.5,-2\n12/01/2026 12:00:00.250 AM,1e-3,4\n", "utf-8",
+    ),
+    "dates in a column of their own": (
+        "Datum;Uhrzeit;U [kV];P [MW]\n30.11.2026;23:59:59,75;1,5;-2\n01.12.2026;00:00:00,25;0,001;4\n", "utf-8",
+    ),
+    "blanks at the end": ("time[s], U[kV], P[MW],\n0, 1.5, -2,\n0.5, 1e-3, 4,\n\n", "utf-8"),
+}  # fmt: skip
+
+
+def put(folder: Path, text: str, encoding: str = "utf-8", name: str = "x.csv") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize(("text", "encoding"), STYLES.values(), ids=STYLES)
+def test_one_record_in_many_styles(tmp_path: Path, text: str, encoding: str) -> None:
+    path = put(tmp_path, text, encoding)
+    found = read_waveforms(path, ["U", "P"])
+    np.testing.assert_allclose(np.column_stack([found.time - found.time[0], found.values]), ROWS, rtol=1e-12)
+    assert found.units == ("kV", "MW") and list_signals(path)[-2:] == [("U", "kV"), ("P", "MW")]
+
+
+def test_names_with_strokes_and_brackets_that_are_no_units(tmp_path: Path) -> None:
+    path = put(
+        tmp_path, "t,P/Q,U (L1),dP/dt,V(bus1),Uf / p.u.,ROCOF / Hz/s,n / 1/min\n" + "0,1,2,3,4,5,6,7\n1,1,2,3,4,5,6,7\n"
+    )
+    assert list_signals(path) == [
+        ("P/Q", ""), ("U (L1)", ""), ("dP/dt", ""), ("V(bus1)", ""), ("Uf", "p.u."), ("ROCOF", "Hz/s"), ("n", "1/min"),
+    ]  # fmt: skip
+    assert read_waveforms(path, ["Uf / p.u."]).unit("Uf / p.u.") == "p.u."
+
+
+GAPS = "time;a;b\n0;1;2\n1;;2,5\n2;NaN;\n3;#NV;3\n4;5;n/a\n"
+
+
+def test_cells_of_what_was_not_recorded(tmp_path: Path) -> None:
+    path = put(tmp_path, GAPS)
+    found = read_waveforms(path)
+    np.testing.assert_array_equal(found["a"], [1.0, np.nan, np.nan, np.nan, 5.0])
+    np.testing.assert_array_equal(found["b"], [2.0, 2.5, np.nan, 3.0, np.nan])
+    assert (found.gaps("a"), found.gaps("b")) == (3, 2)
+
+
+def test_both_readers_see_the_same_gaps(tmp_path: Path) -> None:
+    path = put(tmp_path, "time,a,b,c\n0,1,,\n1,,,3\n2,nan,2,4\n")
+    layout = csv_text._layout(path)
+    quick = csv_text._fast(
+        csv_text._layout(put(tmp_path, "time,a,b,c\n0,1,,9\n1,,,3\n2,nan,2,4\n", name="y.csv")), [0, 1, 2]
+    )
+    assert quick is not None
+    np.testing.assert_array_equal(quick, [[0, 1, np.nan], [1, np.nan, np.nan], [2, np.nan, 2]])
+    np.testing.assert_array_equal(
+        csv_text._careful(layout, [0, 2, 3]), [[0, np.nan, np.nan], [1, np.nan, 3], [2, 2, 4]]
+    )
+
+
+def test_gaps_stay_gaps_in_what_is_written(tmp_path: Path) -> None:
+    record = trajectory([0.0, 1.0, 2.0], {"a": [1.0, np.nan, 3.0], "nano": [np.nan, 2.0, np.nan]})
+    write_csv(record, tmp_path / "x.csv")
+    assert (tmp_path / "x.csv").read_text() == "time,a,nano\n0.0,1.0,\n1.0,,2.0\n2.0,3.0,\n"
+    np.testing.assert_array_equal(read_waveforms(tmp_path / "x.csv").values, record.values)
+    convert(tmp_path / "x.csv", tmp_path / "x.parquet")
+    np.testing.assert_array_equal(read_waveforms(tmp_path / "x.parquet").values, record.values)
+
+
+def test_a_comtrade_mark_for_a_missing_sample_is_a_gap(tmp_path: Path) -> None:
+    formats()["comtrade"].sample(tmp_path / "r.cfg")
+    data = tmp_path / "r.dat"
+    data.write_text(data.read_text().replace("2,1000,101,-21,0", "2,1000,99999,-21,0"))
+    assert np.isnan(read_waveforms(tmp_path / "r.cfg")["Vdc"]).tolist() == [False, True, False, False]
+
+
+def test_rows_left_out_are_counted(tmp_path: Path) -> None:
+    rows = [(t / 10, 0.0) for t in range(20)] + [(2.0, float(k)) for k in range(5)] + [(2.1, 9.0)]
+    found = read_waveforms(put(tmp_path, "time,a\n" + "".join(f"{t!r},{v!r}\n" for t, v in rows)))
+    assert (found.origin.rows, found.origin.dropped, len(found)) == (26, 3, 23)
+    assert found.select(["a"]).origin.dropped == 3
+
+
+def test_the_unit_of_the_time_is_known(tmp_path: Path) -> None:
+    for label, unit in (("t", ""), ("t [s]", "s"), ("t/ms", "ms")):
+        assert read_waveforms(put(tmp_path, f"{label},a\n0,1\n1,1\n")).origin.time_unit == unit
+    assert read_waveforms(put(tmp_path, "n,time [ms],a\n0,0,1\n1,5,1\n")).origin.time_column == "time [ms]"
+
+
+def test_every_file_behind_a_recording_is_listed(tmp_path: Path) -> None:
+    for name, first, others in (
+        ("comtrade", "r.cfg", ["r.dat"]), ("pscad", "run.inf", ["run_01.out", "run_02.out"]), ("csv", "x.csv", []),
+    ):  # fmt: skip
+        formats()[name].sample(tmp_path / first)
+        assert [f.name for f in files_of(tmp_path / first)] == [first, *others]
+
+
+def test_dates_of_one_record_that_no_order_explains_are_refused(tmp_path: Path) -> None:
+    path = put(tmp_path, "Timestamp,a\n13/02/2026 00:00:00,1\n02/14/2026 00:00:01,1\n")
+    with pytest.raises(WaveformError, match="line 3"):
+        read_waveforms(path)

@@ -1,0 +1,195 @@
+"""Recordings as they are: gaps, units, offsets, several files, dropped rows; through a study of a motor made here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hvdc_ident import load_study
+from hvdc_ident.errors import StudyError
+from hvdc_ident.fit import FitResult, Problem, fit
+from hvdc_ident.report.page import write_report
+from hvdc_ident.report.results import Results
+from hvdc_ident.study.pipeline import run_stage
+from hvdc_ident.study.simulator import ModelSimulator
+from hvdc_ident.study.stage import Options
+from hvdc_ident.study.study import Study
+from hvdc_ident.study.summary import summary, summary_text
+from hvdc_ident.waveform import noise_estimate
+
+CARD = """schema = 1
+name = "motor"
+[parameters]
+J = {value = 0.01, unit = "kg.m2", min = 0.001, max = 0.1}
+[inputs]
+v = {value = 1.0, unit = "V"}
+[states]
+w = {derivative = "(0.5*i - 0.1*w) / J", unit = "rad/s"}
+[signals]
+i = {value = "v - 0.5*w", unit = "A"}
+[outputs]
+w = {value = "w", unit = "rad/s"}
+i = {value = "i", unit = "A"}
+"""
+TIME = np.arange(241) * 0.005
+EVENT = 0.3
+TRUE = 0.013
+
+
+def exact(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """v, w and i of the motor of inertia TRUE: J w' = 0.5 v - 0.35 w from rest, so an exponential."""
+    v = np.where(time < EVENT, 1.0, 1.5)
+    w = (0.5 / 0.35) * (1.0 + 0.5 * np.where(time < EVENT, 0.0, 1.0 - np.exp(-0.35 / TRUE * (time - EVENT))))
+    return v, w, v - 0.5 * w
+
+
+def write(
+    folder: Path, rows: np.ndarray, *, header: str = "time,v,w,i", experiment: str = "", outputs: str = '["w", "i"]'
+) -> Path:
+    """A study of the motor with one recording; NaN is written as an empty cell."""
+    (folder / "motor.toml").write_text(CARD)
+    text = "\n".join(",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in rows)
+    (folder / "d.csv").write_text(f"{header}\n{text}\n", "utf-8")
+    (folder / "s.toml").write_text(
+        'schema = 1\n[model]\nsource = "motor.toml"\n[parameters]\nJ = {start = 0.01, min = 0.002, max = 0.05}\n'
+        f'[[experiment]]\nname = "d"\ndata = "d.csv"\ninputs = ["v"]\noutputs = {outputs}\ninterpolation = "hold"\n'
+        f"{experiment}\n[fit]\nstarts = 1\n"
+    )
+    return folder / "s.toml"
+
+
+def record(noise: float = 1e-3, seed: int = 1) -> np.ndarray:
+    v, w, i = exact(TIME)
+    e = noise * np.random.default_rng(seed).standard_normal((2, TIME.size))
+    return np.column_stack([TIME, v, w + e[0], i + e[1]])
+
+
+def holed() -> np.ndarray:
+    rows = record()
+    rows[70:80, 2] = np.nan
+    rows[[3, 50, 200], 3] = np.nan
+    return rows
+
+
+def fitted(study: Study) -> FitResult:
+    problem = Problem(ModelSimulator(study.model), study.experiments, tuple(study.candidates.values()))
+    return fit(problem, starts=1)
+
+
+def told(study: Study) -> str:
+    return summary_text(summary(study))
+
+
+def test_gaps_of_outputs_are_not_compared_and_said(tmp_path: Path) -> None:
+    study = load_study(write(tmp_path, holed()))
+    assert "w: 10 of 241 rows not recorded" in told(study) and "i: 3 of 241 rows not recorded" in told(study)
+    assert study.noise["d"]["i"].std == pytest.approx(1e-3, rel=0.5)
+    found = fitted(study)
+    assert found.estimates["J"].ci95 is not None
+    low, high = found.estimates["J"].ci95
+    assert low < TRUE < high and high - low < 0.05 * TRUE
+    assert found.goodness["outputs"]["w"]["d"]["n"] == 231
+
+
+def test_gaps_reach_every_file_and_the_page(tmp_path: Path) -> None:
+    study = load_study(write(tmp_path, holed()))
+    folder = tmp_path / "out"
+    run_stage(study, "fit", folder, Options(folder=folder))
+    done = run_stage(study, "simulate", folder, Options(folder=folder))
+    assert done.data["experiments"]["d"]["recording"]["not_recorded"] == {"w": 10, "i": 3}
+    _, w, _ = exact(TIME)
+    table = Results(folder).table("fit.d.csv")
+    assert table is not None
+    assert np.isnan(table["w.measured"]).sum() == 10 and np.isfinite(table["w"]).all()
+    assert np.abs(table["w"] - w).max() < 1e-3
+    rms = np.sqrt(np.nanmean((table["w.measured"] - table["w"]) ** 2))
+    assert Results(folder).get("fit")["rmse"]["w"]["d"] == pytest.approx(rms, rel=1e-6)
+    assert "w: 10 of 241 rows not recorded" in write_report(folder).read_text("utf-8")
+    assert ",nan" not in (folder / "fit.d.csv").read_text()
+
+
+def test_gaps_of_inputs_are_an_error_that_says_where(tmp_path: Path) -> None:
+    rows = record()
+    rows[[4, 9], 1] = np.nan
+    with pytest.raises(StudyError, match=r"column 'v' is not recorded in 2 of 241 rows, the first at 0.02 s"):
+        load_study(write(tmp_path, rows))
+    rows = record()
+    rows[:, 3] = np.nan
+    with pytest.raises(StudyError, match="not recorded in any row"):
+        load_study(write(tmp_path, rows))
+
+
+def test_a_gap_splits_the_rows_that_noise_is_estimated_from() -> None:
+    random = np.random.default_rng(2)
+    time = np.arange(400) * 1e-3
+    values = 1e-3 * random.standard_normal(400)
+    values[100:300] += 5.0  # a level of its own, recorded only in parts
+    values[95:105] = values[295:305] = np.nan
+    assert noise_estimate(time, values, None) == pytest.approx(1e-3, rel=0.2)
+    sparse = np.where(np.arange(400) % 4 == 0, values, np.nan)
+    assert noise_estimate(time, sparse, None) == pytest.approx(1e-3, rel=0.4)
+
+
+def test_units_are_converted_and_said(tmp_path: Path) -> None:
+    rows = record()
+    rows[:, 0] *= 1e3
+    rows[:, 2] *= 30.0 / np.pi
+    rows[:, 3] *= 1e3
+    study = load_study(write(tmp_path, rows, header="t/ms,v / V,w (1/min),i [mA]"))
+    (e,) = study.experiments
+    assert e.measured is not None
+    np.testing.assert_allclose(e.time, TIME, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(e.measured.values, record()[:, 2:], rtol=1e-12)
+    for line in ("time in ms, converted to s", "w: from 1/min to rad/s", "i: from mA to A"):
+        assert line in told(study)
+    assert "v:" not in told(study)
+
+
+def test_offset_and_scale_of_a_column(tmp_path: Path) -> None:
+    rows = record()
+    rows[:, 2] = (rows[:, 2] - 5.0) / 2.0
+    extra = "columns = {w = {scale = 2.0, offset = 5.0}, i = {offset = -0.25}}"
+    (e,) = load_study(write(tmp_path, rows, experiment=extra)).experiments
+    assert e.measured is not None
+    np.testing.assert_allclose(e.measured["w"], record()[:, 2], rtol=1e-12)
+    np.testing.assert_allclose(e.measured["i"], record()[:, 3] - 0.25, rtol=1e-12)
+
+
+def test_the_file_s_unit_of_time_is_not_applied_twice(tmp_path: Path) -> None:
+    rows = record()
+    rows[:, 0] *= 1e3
+    same = load_study(write(tmp_path, rows, header="t [ms],v,w,i", experiment='columns = {time = {unit = "ms"}}'))
+    assert same.experiments[0].time[-1] == pytest.approx(1.2)
+    with pytest.raises(StudyError, match="contradicts the file's"):
+        load_study(write(tmp_path, rows, header="t [ms],v,w,i", experiment='columns = {time = {unit = "s"}}'))
+
+
+def test_rows_dropped_and_jumps_are_told(tmp_path: Path) -> None:
+    rows = record()
+    at = int(EVENT / 0.005) + 1
+    rows = np.vstack([rows[:at], np.repeat(rows[at - 1 : at], 3, axis=0), rows[at:]])
+    study = load_study(write(tmp_path, rows))
+    assert study.experiments[0].recording["dropped"] == 2
+    assert "2 rows of the file dropped" in told(study) and "1 instant with two rows: a jump" in told(study)
+
+
+def test_a_change_of_the_data_file_behind_a_header_is_a_change_of_the_study(tmp_path: Path) -> None:
+    path = write(tmp_path, record())
+    head = "ST,REC,1999\n3,3A,0D\n" + "".join(
+        f"{n + 1},{c},,,,1e-4,0,0,-99999,99999,1,1,P\n" for n, c in enumerate("vwi")
+    )
+    (tmp_path / "d.cfg").write_text(
+        f"{head}50\n1\n200,241\n01/01/2020,00:00:00.000000\n01/01/2020,00:00:00.300000\nASCII\n1\n"
+    )
+    raw = np.round(1e4 * record()[:, 1:]).astype(int)
+    lines = [f"{n + 1},{5000 * n},{a},{b},{c}\n" for n, (a, b, c) in enumerate(raw.tolist())]
+    (tmp_path / "d.dat").write_text("".join(lines))
+    path.write_text(path.read_text().replace("d.csv", "d.cfg"))
+    before = load_study(path).sources
+    assert {"d.cfg", "d.dat"} <= set(before)
+    lines[-1] = f"241,1200000,{raw[-1, 0]},{raw[-1, 1] + 1},{raw[-1, 2]}\n"
+    (tmp_path / "d.dat").write_text("".join(lines))
+    after = load_study(path).sources
+    assert {n for n in after if after[n] != before[n]} == {"d.dat"}
