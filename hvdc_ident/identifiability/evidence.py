@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
-from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile, Side
+from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile
 from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
@@ -22,6 +22,8 @@ from hvdc_ident.sensitivity.fisher import independent, pivoted_order
 from hvdc_ident.trajectory import Array
 
 DRAWS = 999
+SCATTER = 0.1
+"""The 95 % quantile of so many draws scatters by 0.08 of itself (sqrt(p (1 - p)/n) over the density): less is no difference."""
 
 
 @dataclass(frozen=True)
@@ -126,46 +128,58 @@ def partner(optimum: Optimum, i: int) -> str:
 
 
 def joint_limits(
-    optimum: Optimum, found: Mapping[str, Profile], limits: Mapping[str, float], *, seed: int = 0
+    optimum: Optimum,
+    found: Mapping[str, Profile],
+    limits: Mapping[str, float],
+    again: Callable[[Mapping[str, float]], Mapping[str, Profile]],
+    *,
+    seed: int = 0,
 ) -> FrozenMap[Profile]:
     """The profiles, with the limits of parameters on bounds found anew where several are on bounds together.
 
-    Then 1.353 is not the right rise, for the others on bounds do not scatter freely: a parametric bootstrap of the
-    linearised problem, from the limit and the bounds, gives the rise that 95 % of the samples stay below. The limit is
-    then read from the profile's own points.
+    Then 1.353 is not the right rise, for the others on bounds do not scatter freely: a parametric bootstrap of the problem
+    linearised at the limit gives the rise that 95 % of the samples stay below. again: walks the profiles of some unknowns
+    to other thresholds.
     """
     on_bound = [n for n, p in found.items() if p.one_sided]
     if len(on_bound) < 2:
         return FrozenMap(found)
-    result = dict(found)
+    other: dict[str, float] = {}
     for n in on_bound:
-        low = found[n].lower.limit is None
-        side = found[n].upper if low else found[n].lower
-        if side.status == "closed" and side.limit is not None:
-            share = bootstrap_rise(optimum, n, side.limit, seed) / ONE_SIDED
-            result[n] = _with_rise(found[n], low, share * limits[n] * ONE_SIDED / TWO_SIDED)
-    return FrozenMap(result)
+        crossing = next(
+            (s.limit for s in (found[n].lower, found[n].upper) if s.status == "closed" and not s.reason), None
+        )
+        if crossing is None:
+            continue
+        there = found[n].thetas[int(np.argmin(np.abs(found[n].values - crossing)))]
+        rise = bootstrap_rise(optimum, n, crossing, seed, there)
+        if rise > 0 and abs(rise - ONE_SIDED) > SCATTER * ONE_SIDED:
+            other[n] = limits[n] * rise / ONE_SIDED
+    return FrozenMap({**found, **again(other)} if other else found)
 
 
-def bootstrap_rise(optimum: Optimum, name: str, value: float, seed: int = 0) -> float:
-    """The 95 % quantile of the rise at the true value of `name`, where estimates stop at their bounds.
+def bootstrap_rise(optimum: Optimum, name: str, value: float, seed: int = 0, near: Array | None = None) -> float:
+    """The 95 % quantile of the rise at the true value of `name`, where estimates stop at their bounds; 0 where it says nothing.
 
-    Noise is drawn for the linearised problem whose truth is `value` and, for the others, the optimum.
+    Noise is drawn for the problem linearised, in scaled coordinates, at the point of the profile where `name` has the
+    value: at the optimum a parameter on its bound may have no derivative left. near: (p,) where the search for it begins.
+    Raises SimulationError.
     """
-    i = optimum.problem.names.index(name)
-    slope, matrix = optimum.slope, optimum.columns.T @ optimum.columns
-    truth = optimum.theta.copy()
-    truth[i] = value
-    low, high = (
-        (np.array([getattr(u, side) for u in optimum.problem.unknowns]) - truth) / slope for side in ("min", "max")
-    )
+    problem, space = optimum.problem, optimum.problem.coordinates
+    i = problem.names.index(name)
+    begin = (optimum.theta if near is None else near).copy()
+    begin[i] = value
+    truth = descend(LeastSquares.of(problem), begin, np.arange(begin.size) == i, enough=1e-3).theta
+    columns = problem.residual(truth)[1] * space.slope(truth)
+    matrix = columns.T @ columns
+    low, high = (side - space.scaled(truth) for side in space.bounds)
     above = value > optimum.theta[i]
     low_fixed, high_fixed = low.copy(), high.copy()
     low_fixed[i] = high_fixed[i] = 0.0
     values, vectors = np.linalg.eigh(matrix)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     rises = []
-    for z in np.random.default_rng(seed).standard_normal((DRAWS, slope.size)):
+    for z in np.random.default_rng(seed).standard_normal((DRAWS, truth.size)):
         g = root @ z
         best = bounded_step(g, matrix, 0.0, low, high)
         at = bounded_step(g, matrix, 0.0, low_fixed, high_fixed)
@@ -176,17 +190,6 @@ def bootstrap_rise(optimum: Optimum, name: str, value: float, seed: int = 0) -> 
 
 def _cost(g: Array, h: Array, p: Array) -> float:
     return float(g @ p + 0.5 * p @ h @ p)
-
-
-def _with_rise(profile: Profile, low: bool, rise: float) -> Profile:
-    """The profile with the limit at another rise, between its points; kept where it does not reach so far."""
-    beyond = profile.values >= profile.value if low else profile.values <= profile.value
-    order = np.argsort(profile.rises[beyond])
-    roots, values = np.sqrt(np.clip(profile.rises[beyond][order], 0, None)), profile.values[beyond][order]
-    if np.sqrt(rise) > roots[-1]:
-        return profile
-    limit = Side("closed", float(np.interp(np.sqrt(rise), roots, values)), "bootstrap, several on bounds")
-    return replace(profile, upper=limit, threshold=rise) if low else replace(profile, lower=limit, threshold=rise)
 
 
 def pair_of(optimum: Optimum, found: Mapping[str, Verdict], names: tuple[str, str], points: int = 13) -> PairProfile:

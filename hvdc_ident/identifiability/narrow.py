@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from hvdc_ident.fit.executor import Executor
 from hvdc_ident.fit.objective import LeastSquares
-from hvdc_ident.fit.profile import Profile, profiles
+from hvdc_ident.fit.profile import Profile, Profiles, profiles
 from hvdc_ident.identifiability import verdicts
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
 from hvdc_ident.identifiability.evidence import (
@@ -31,6 +32,7 @@ from hvdc_ident.sensitivity.fisher import (
     pivoted_order,
     rise_over_range,
 )
+from hvdc_ident.trajectory import Array
 
 
 def structural(so_far: Findings, structure: Structure) -> None:
@@ -99,19 +101,24 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
         limits = thresholds(optimum)
         so_far.thresholds |= limits
         physical = physical_bounds(optimum.problem)
-        around = profiles(
+        walked = partial(
+            profiles,
             LeastSquares.of(optimum.problem),
-            optimum.theta,
-            optimum.names,
-            threshold=limits,
             physical=physical,
             walk=so_far.walk,
             executor=executor,
             progress=so_far.progress,
         )
+        around = walked(optimum.theta, optimum.names, threshold=limits)
         so_far.notes += [f"A better optimum was found: {r}." for r in around.restarts]
         optimum = Optimum(optimum.problem, around.theta)
-        by_name = joint_limits(optimum, around.by_name, limits, seed=so_far.seed)
+
+        def again(
+            other: Mapping[str, float], walked: partial[Profiles] = walked, at: Array = around.theta
+        ) -> Mapping[str, Profile]:
+            return walked(at, list(other), threshold=other).by_name
+
+        by_name = joint_limits(optimum, around.by_name, limits, again, seed=so_far.seed)
         opened = [n for n, p in by_name.items() if not bounded(p)]
         if not opened:
             _closed(so_far, optimum, by_name, physical)

@@ -6,6 +6,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq, lsq_linear
 from scipy.stats import binom
 
 from hvdc_ident.errors import StudyError
@@ -140,3 +141,30 @@ def test_the_bootstrap_of_one_on_its_bound_is_the_known_quantile() -> None:
     free = (Free("a", 0.0, -9, 9), Free("b", 0.1, 0.0, 9.0))
     optimum, _ = pilot(Problem(plant, (measured(plant, {"a": 1, "b": 0.0}, 0.05),), free), starts=1)
     assert bootstrap_rise(optimum, "b", 5.0) == pytest.approx(1.353, rel=0.15)
+
+
+def plateau(t, p):
+    """y = a (1 - exp(-k t)) + c t."""
+    e = np.exp(-p["k"] * t)
+    return p["a"] * (1 - e) + p["c"] * t, {"a": 1 - e, "k": p["a"] * t * e, "c": t}
+
+
+def test_a_limit_far_from_its_bound_is_not_read_at_the_bound_where_several_are_on_bounds() -> None:
+    """A rate that has no upper limit, over eight decades, beside a slope below its bound: scipy profiles the same cost."""
+    physical = {"k": Parameter(10.0, min=1e-3, max=1e5), "c": Parameter(0.1, min=0.0)}
+    t = np.linspace(0.05, 1.0, 60)
+    y = 2.0 - 0.02 * t + 0.02 * np.random.default_rng(5).normal(size=t.size)
+    y[:3] += 0.02  # no slower than a step
+    data = recorded("e", t, {"y": 0.02}, y=y)
+    free = [Free("a", 1, 0.1, 10), Free("k", 10, 1e-3, 1e5), Free("c", 0.1, 0.0, 5.0)]
+    report = identifiability(closed(plateau, a=1.0, **physical), [data], free, starts=4)
+    assert {n for n, v in report.parameters.items() if v.verdict == "at-bound"} == {"k", "c"}
+
+    def cost(k):
+        columns = np.column_stack([1 - np.exp(-k * t), t]) / 0.02
+        return lsq_linear(columns, y / 0.02, ([0.1, 0.0], [10.0, 5.0])).cost
+
+    least = cost(1e5)
+    low, high = (brentq(lambda k, rise=rise: cost(k) - least - rise, 5, 5000) for rise in (2.7, 0.7))
+    limit = report.parameters["k"].ci95[0]
+    assert low < limit < high < 1000
