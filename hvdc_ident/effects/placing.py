@@ -15,7 +15,8 @@ from hvdc_ident.expression.functions import symbol
 from hvdc_ident.expression.parser import parse
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.model.transform import fresh, rewritten, slot
+from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model.transform import fresh, home, rewritten, slot
 from hvdc_ident.parameters import Parameter
 
 COEFFICIENT = EffectParameter(0.0, neutral=0.0, min=-math.inf, optional=True, description="coefficient of the term")
@@ -69,6 +70,11 @@ class EffectUse:
         source = list(self.sources) if "," in self.source else self.source
         extra = {"from": source, "expression": self.expression, "prefix": self.prefix}
         return result | {key: told for key, told in extra.items() if told}
+
+    def within(self, model: AnyModel) -> EffectUse:
+        """Return the use at this model's slots: what sat behind an effect that the model lacks sits where that one did."""
+        source = joined(home(model.slots, s) for s in self.sources)
+        return replace(self, at=tuple(home(model.slots, place) for place in self.at), source=source)
 
     @property
     def sources(self) -> tuple[str, ...]:

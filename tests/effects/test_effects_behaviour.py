@@ -14,6 +14,7 @@ from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.model import Model
+from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 
 T = np.linspace(0.0, 1.0, 2001)
@@ -323,3 +324,14 @@ def test_how_late_a_slow_signal_comes(name: str) -> None:
     y = simulate(alone(EffectUse(name, ("u",), FrozenMap(values))), ramp)["y"]
     settled = (time > 0.6) & (time <= 0.8)  # ten sampling periods
     assert np.mean((time - y)[settled]) == pytest.approx(late(values), abs=3e-4)
+
+
+def test_what_sat_behind_an_effect_sits_where_that_one_did_without_it():
+    link = load_model("vsc-hvdc-link")
+    first = EffectUse("inner-loop", ("Irorder1",), FrozenMap({"wn": 500.0, "zeta": 0.7}))
+    behind = EffectUse("coupling", ("Irorder1_before_inner_loop",), FrozenMap({"k": 0.1}), source="P1")
+    both = link.with_effects([first, behind])
+    assert behind.within(both) == behind
+    alone = behind.within(link)
+    assert alone.at == ("Irorder1",) and alone.source == "P1"
+    assert "Irorder1_before_coupling" in link.with_effects([alone]).signals

@@ -6,12 +6,11 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import numpy as np
-
 from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
-from hvdc_ident.effects import effects
+from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.words import quantity
@@ -101,14 +100,15 @@ def _size(value: float, neutral: float, share: float) -> float | None:
 
 def _with(model: Model, found: Diagnosis, value: float | None) -> Model:
     """The model with the effects as found, the first one at another size, or without it."""
-    uses = [_use(effect, {}) for effect in found.effects[1:]]
     first = found.effects[0]
-    if value is not None:
-        uses.insert(0, _use(first, {next(iter(first.parameters)): float(np.float64(value))}))
-    return model.with_effects(uses)
+    for effect in found.effects:
+        if effect is not first:
+            model = model.with_effects([_use(effect, {}).within(model)])
+        elif value is not None:
+            model = model.with_effects([_use(first, {next(iter(first.parameters)): value})])
+    return model
 
 
-def _use(effect: Found, other: Mapping[str, float]) -> dict[str, Any]:
-    sizes = {n: s.value for n, s in effect.parameters.items()} | dict(other)
-    use: dict[str, Any] = {"effect": effect.effect, "at": list(effect.at), "parameters": sizes}
-    return use | ({"from": effect.source} if effect.source else {})
+def _use(effect: Found, other: Mapping[str, float]) -> EffectUse:
+    sizes: dict[str, float | str] = {n: s.value for n, s in effect.parameters.items()}
+    return EffectUse(effect.effect, effect.at, FrozenMap(sizes | dict(other)), source=effect.source)

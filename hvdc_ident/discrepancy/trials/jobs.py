@@ -12,11 +12,10 @@ from hvdc_ident.discrepancy.refits.refit import Job, Refit
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Pick
-from hvdc_ident.effects import EffectUse, effects, joined
+from hvdc_ident.effects import effects
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
-from hvdc_ident.model.transform import home
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
@@ -89,16 +88,13 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
         named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
         parameters: dict[str, float | str] = {**values, **named}
-        # What sat behind an effect that is left out sits where that one did.
-        at_slots = tuple(home(model.slots, place) for place in p.use.at)
-        source = joined(home(model.slots, s) for s in p.use.sources)
-        use = EffectUse(p.use.effect, at_slots, FrozenMap(parameters), source=source, expression=p.use.expression)
+        use = replace(p.use, parameters=FrozenMap(parameters), prefix="").within(model)
         before = set(model.parameters)
         model = model.with_effects([use])
         new = [n for n in model.parameters if n not in before]
         names = dict(zip(p.names, new, strict=True))
         free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
-        moved = replace(p.candidate, at=at_slots, source=source)
+        moved = replace(p.candidate, at=use.at, source=use.source)
         again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
     unsettled = any(effects()[p.use.effect].restless for p in placed)
     problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
