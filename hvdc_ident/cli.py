@@ -223,6 +223,8 @@ def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet:
         # A fit that ended on a bound or found two optima is done, but not by that word alone.
         status = d.data.get("status")
         rest = f", {status}" if status in ("at-bound", "two-optima") and not d.failed else ""
+        if (d.data.get("adequacy") or {}).get("verdict") == "does-not-fit" and not d.failed:
+            rest += f", but the model does not fit; next: {d.data['adequacy']['next']}"
         _say(f"{d.stage.name}: {state}{rest}", json=json, quiet=quiet)
     _say(f"report: {folder / 'report.html'}", json=json, quiet=quiet)
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]

@@ -15,7 +15,15 @@ from hvdc_ident.errors import WaveformError
 from hvdc_ident.experiment import InputSignal
 from hvdc_ident.trajectory import Array
 
-__all__ = ["Interpolation", "event_time", "input_signal", "noise_estimate", "noise_floor", "pre_event_ar"]
+__all__ = [
+    "Interpolation",
+    "event_time",
+    "input_signal",
+    "noise_estimate",
+    "noise_floor",
+    "pre_event_ar",
+    "row_scatter",
+]
 
 Interpolation = Literal["hold", "linear"]
 
@@ -34,6 +42,7 @@ FLOOR_SHARE = 1e-6
 
 _SMOOTH = 0.35  # row-to-row curvature over change, medians: white noise 0.87, any first-order noise over 0.7
 _FEW_ROWS = 8  # too few for a standard deviation before the event
+_ROWS_OF_SCATTER = 32  # see row_scatter
 _MAD_TO_STD = 1.482602218505602  # of a normal distribution
 _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
 _GAP = 1.5  # times the median stride between recorded rows, the same share as `fit.whitening.GAP`
@@ -97,6 +106,40 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> f
     if not settled:
         return _scatter((bend / change)[near])
     return _scatter(_detrended(t, v))
+
+
+def row_scatter(time: ArrayLike, values: ArrayLike) -> float | None:
+    """The standard deviation of the white noise that a record shows from row to row, in its unit; None where it does not.
+
+    time: (n,) in s, uneven allowed; values: (n,), NaN where nothing was recorded. The divided differences of second,
+    third and fourth order of white noise give the same standard deviation once each is scaled, and so do those of
+    every other row; those of a signal do not, for every order sees less of a smooth course and more of one that the
+    rows hardly follow, and coloured noise grows with the distance of rows (Moré and Wild 2011, doi
+    10.1137/100786125). So they have to agree, within three standard errors of their ratios (0.9/sqrt(n) and, for
+    every other row, 1.9/sqrt(n) in the logarithm, by simulation). Below 32 rows such an agreement would say nothing:
+    any two orders agree within a factor of 1.6.
+    """
+    t, v = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
+    t, v = _distinct(t[np.isfinite(v)], v[np.isfinite(v)])
+    if t.size < _ROWS_OF_SCATTER or np.ptp(v) == 0.0:
+        return None
+    orders = [_scatter(_difference(t, v, k)) for k in (2, 3, 4)]
+    sparse = float(np.mean([_scatter(_difference(t[i::2], v[i::2], 3)) for i in (0, 1)]))
+    if min(*orders, sparse) <= noise_floor(v):
+        return None
+    error = 3.0 / np.sqrt(t.size)
+    agree = np.log(max(orders) / min(orders)) <= 0.9 * error and abs(np.log(sparse / orders[0])) <= 1.9 * error
+    return orders[0] if agree else None
+
+
+def _difference(t: Array, v: Array, order: int) -> Array:
+    """(n - order,) divided differences, scaled so that white noise of 1 makes a standard deviation of 1."""
+    windows = np.lib.stride_tricks.sliding_window_view(t, order + 1)
+    gaps = windows[:, :, None] - windows[:, None, :]
+    gaps[:, range(order + 1), range(order + 1)] = np.median(np.diff(t))  # leaves the product's scale as it is
+    weights = 1.0 / gaps.prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    return np.asarray((weights * np.lib.stride_tricks.sliding_window_view(v, order + 1)).sum(axis=1))
 
 
 def noise_floor(values: ArrayLike) -> float:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.experiment import InputSignal
-from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor, pre_event_ar
+from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor, pre_event_ar, row_scatter
 
 T = np.arange(501) * 1e-3
 
@@ -214,3 +214,17 @@ def test_autocorrelation_of_nothing() -> None:
     assert pre_event_ar(np.full(100, 0.3)) == 0.0
     assert pre_event_ar([1.0, 2.0]) == 0.0
     assert pre_event_ar(np.linspace(0, 1, 100)) == 0.0
+
+
+def test_the_scatter_from_row_to_row_is_told_where_rows_follow_the_signal_and_only_there() -> None:
+    rng = np.random.default_rng(4)
+    for t in (np.linspace(0, 1, 400), np.sort(rng.random(400))):
+        found = [row_scatter(t, np.sin(6 * t) + 0.01 * rng.standard_normal(t.size)) for _ in range(40)]
+        told = [f for f in found if f is not None]
+        assert len(told) >= 39 and np.mean(told) == pytest.approx(0.01, rel=0.05)
+    slow = np.linspace(0, 1, 60)
+    assert row_scatter(slow, np.sin(6 * slow)) is None  # no noise at all
+    assert row_scatter(slow, np.sin(90 * slow)) is None  # rows hardly follow it
+    assert row_scatter(slow[:20], rng.standard_normal(20)) is None  # too few to tell
+    walk = np.cumsum(rng.standard_normal(2000))
+    assert row_scatter(np.linspace(0, 1, 2000), walk) is None  # no white noise

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, stdtrit
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.noise import GIVEN
+from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.nuisance import observe, unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.problem import Problem
@@ -114,7 +114,7 @@ def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[st
 def _weights(result: FitResult) -> dict[str, float]:
     """The standard deviations that came from the misfit, by output."""
     return {
-        o: next(s[o] for s in result.sigma.values() if o in s) for o, w in result.noise_source.items() if w != GIVEN
+        o: next(s[o] for s in result.sigma.values() if o in s) for o, w in result.noise_source.items() if from_misfit(w)
     }
 
 
@@ -170,7 +170,7 @@ def goodness(problem: Problem, result: FitResult, found: Mapping[str, Mapping[st
             table.setdefault(output, {})[experiment] = _quality(c)
     samples = sum(q["n"] for line in table.values() for q in line.values())
     effective = sum(result.effective_samples.values())
-    given = bool(result.noise_source) and all(s == GIVEN for s in result.noise_source.values())
+    given = bool(result.noise_source) and not any(map(from_misfit, result.noise_source.values()))
     behind = problem.noise_dof
     overall: dict[str, Any] = {"chi2": None, "dof": None, "p": None, "reason": "", "noise_dof": None}
     if not given:

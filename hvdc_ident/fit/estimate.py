@@ -8,11 +8,12 @@ from functools import partial
 
 import numpy as np
 
+from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.clock import has_clocks, searched
 from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.fit.intervals import estimates_of
-from hvdc_ident.fit.noise import GIVEN, floor_of, source_of
+from hvdc_ident.fit.noise import floor_of, source_of, source_text
 from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import promised
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
@@ -83,7 +84,13 @@ def fit(
     outcomes = _outcomes(problem, begins, runs, weigh=problem is not first)
     again = problem is not first or best not in usable
     status, message = _status(problem, best, optima, outcomes, worth, again=again)
+    noise = {o: _noise_text(problem, o) for o in problem.outputs}
+    judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
+    inner, all_unknowns = inner.widened(judged.widening), all_unknowns.widened(judged.widening)
     found = estimates_of(problem, best.theta, blocks, inner, all_unknowns)
+    found = _beside_the_other_optimum(
+        problem, found, [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
+    )
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     result = FitResult(
         status=status,
@@ -97,7 +104,8 @@ def fit(
         chi2_per_dof=squares / (samples - best.theta.size) if samples > best.theta.size else None,
         rmse=problem.rmse(best.theta),
         rmse_start=problem.rmse(problem.start),
-        noise_source=FrozenMap({o: _noise_text(problem, o, source[o]) for o in problem.outputs}),
+        adequacy=judged,
+        noise_source=FrozenMap(noise),
         sigma=problem.sigma,
         rho=inner.rho,
         effective_samples=inner.effective,
@@ -224,11 +232,38 @@ def _status(
     return "converged", f"{len(there)} of {len(outcomes)} runs reached this optimum{unmoved}"
 
 
+def _beside_the_other_optimum(
+    problem: Problem, found: dict[str, Estimate], rivals: Sequence[Optimum]
+) -> dict[str, Estimate]:
+    """The estimates, each with the value it has at another optimum as good where that lies outside its interval."""
+    told = dict(found)
+    for name, e in found.items():
+        values = [float(o.theta[problem.names.index(name)]) for o in rivals]
+        low, high = e.ci95 or (None, None)
+        outside = [v for v in values if low is not None and high is not None and not low <= v <= high]
+        if outside:
+            words = f"another optimum, as good, has {outside[0]:.6g}: the interval is that of this one alone"
+            told[name] = replace(e, reason=f"{e.reason}; {words}" if e.reason else words)
+    return told
+
+
 def _arrived(problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], worth: float) -> list[StartOutcome]:
-    """The runs that reached the best cost, the best first, to within what moves no estimate by half its spread."""
+    """The runs that reached the optimum, the best first: its cost, to within what moves no estimate by half its spread, or
+    its place, to a thousandth of the ranges, for a cost may scatter by the simulation's own error."""
     slack = max(1e-6 * best.cost, SAME / worth)
-    reached = [(o.cost, o) for o in outcomes if o.cost is not None and o.cost <= best.cost + slack]
+    reached = [
+        (o.cost, o)
+        for o in outcomes
+        if o.cost is not None and (o.cost <= best.cost + slack or (o.status != "failed" and _there(problem, best, o)))
+    ]
     return [o for _, o in sorted(reached, key=lambda pair: pair[0])]
+
+
+def _there(problem: Problem, best: Optimum, outcome: StartOutcome) -> bool:
+    """Whether a run ended where the best one did."""
+    space = problem.coordinates
+    end = space.scaled(np.array([outcome.end[n] for n in problem.names]))
+    return bool((np.abs(end - space.scaled(best.theta)) <= 1e-3 * space.ranges).all())
 
 
 def _stands(problem: Problem, best: Optimum, there: Sequence[StartOutcome]) -> bool:
@@ -238,9 +273,7 @@ def _stands(problem: Problem, best: Optimum, there: Sequence[StartOutcome]) -> b
     """
     if any(o.status == "converged" for o in there) or promised(problem, best.theta) <= SETTLED:
         return True
-    space = problem.coordinates
-    ends = [space.scaled(np.array([o.end[n] for n in problem.names])) for o in there if o.status == "stalled"]
-    return sum(bool((np.abs(x - space.scaled(best.theta)) <= 1e-3 * space.ranges).all()) for x in ends) > 1
+    return sum(o.status == "stalled" and _there(problem, best, o) for o in there) > 1
 
 
 def _held(problem: Problem) -> FrozenMap[str]:
@@ -262,13 +295,11 @@ def _nuisance(problem: Problem, found: dict[str, Estimate]) -> FrozenMap[FrozenM
     )
 
 
-def _noise_text(problem: Problem, output: str, source: str) -> str:
+def _noise_text(problem: Problem, output: str) -> str:
     """Where an output's standard deviation comes from, in words."""
-    if source == GIVEN:
-        return "given"
-    if problem.weights[output] <= floor_of(problem.fitted_experiments, output):
-        return "misfit, at the floor of 1e-6 of the range"
-    return "misfit"
+    weight = problem.weights.get(output)
+    floor = weight is not None and weight <= floor_of(problem.fitted_experiments, output)
+    return source_text(problem.fitted_experiments, output, floor)
 
 
 def _failed(problem: Problem, begins: Sequence[Array], runs: Sequence[OptimiserResult]) -> FitResult:

@@ -9,9 +9,11 @@ import numpy as np
 
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.estimate import fit
 from hvdc_ident.fit.executor import Executor, Progress
+from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual_tests import residual_tests
@@ -123,7 +125,7 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     for r in results:
         nuisance = nuisance | r.nuisance
         for output, source in r.noise_source.items():
-            if source != "given":
+            if from_misfit(source):
                 weights[output] = next(s[output] for s in r.sigma.values() if output in s)
     models = {o: m for r in results for o, m in r.whitening.items()}
     whole = replace(
@@ -165,7 +167,9 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     spare = sum(b.residual.size for b in blocks) - theta.size
     tests = residual_tests(blocks, whole.fitted_experiments)
-    result = replace(result, cost=cost, chi2_per_dof=squares / spare if spare > 0 else None, residual_tests=tests)
+    judged = adequacy(whole, blocks, result.noise_source, result.effective_samples, result.rho)
+    chi2 = squares / spare if spare > 0 else None
+    result = replace(result, cost=cost, chi2_per_dof=chi2, adequacy=judged, residual_tests=tests)
     return assessed(whole, result)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import stdtrit
@@ -26,8 +27,8 @@ def estimates_of(
     """The estimate of every unknown by name.
 
     inner: about the unknowns inside their bounds, the others held there; everything: about all of them.
-    An unknown inside gets value, std and the t interval; the only one on a bound gets its one-sided limit; several on
-    bounds get none, for their limits are not independent.
+    An unknown inside gets value, std and the t interval, as far as the parameter may go by its nature; the only one on a
+    bound gets its one-sided limit; several on bounds get none, for their limits are not independent.
     """
     r, jacobian = stacked(blocks)
     gradient = jacobian.T @ problem.loss.psi(r)
@@ -40,7 +41,9 @@ def estimates_of(
     for unknown, value, slope in zip(problem.unknowns, theta, gradient, strict=True):
         name = unknown.name
         if name not in bound:
-            estimate = _inside(unknown, float(value), inner)
+            own = parameters.get(name)
+            limits = (own.min, own.max) if own is not None else (-math.inf, math.inf)
+            estimate = _inside(unknown, float(value), inner, limits)
         else:
             estimate = _on_bound(unknown, float(value), float(slope), everything, alone=len(bound) == 1)
         unit = unit_of(problem.simulator, nuisances[name]) if name in nuisances else parameters[name].unit
@@ -49,19 +52,39 @@ def estimates_of(
 
 
 def _with(e: Estimate, unit: str, conditional_on: tuple[str, ...]) -> Estimate:
-    return Estimate(e.value, e.std, e.ci95, e.method, tuple(conditional_on), e.std_raw, unit, e.reason)
+    return replace(e, unit=unit, conditional_on=tuple(conditional_on))
 
 
-def _inside(unknown: Free, value: float, known: Uncertainty) -> Estimate:
-    """Value, std and t interval; a reason where the interval is wider than the bounds."""
-    std = known.std(unknown.name)
-    if std is None:
+WIDER = 2.0
+"""From this ratio of an interval to that of independent residuals on, the difference is told in words."""
+
+
+def _inside(unknown: Free, value: float, known: Uncertainty, limits: tuple[float, float]) -> Estimate:
+    """Value, std and t interval, which ends where the parameter does; a reason where it is wider than the bounds.
+
+    limits: what the parameter may be by its nature, in its unit. A parameter whose bounds admit no negative value has none.
+    """
+    std, raw = known.std(unknown.name), known.std(unknown.name, raw=True)
+    if std is None or raw is None:
         return Estimate(value, reason=known.reasons[unknown.name])
+    low, high = max(limits[0], 0.0 if unknown.min >= 0 else -math.inf), limits[1]
+
+    def within(half: float) -> tuple[float, float]:
+        return max(value - half, min(low, value)), min(value + half, max(high, value))
+
     half = float(stdtrit(known.dof, 0.975)) * std
+    plain = float(stdtrit(known.dof_independent, 0.975)) * raw * math.sqrt(known.excess)
     width = unknown.max - unknown.min
-    reason = "the interval is wider than the bounds" if math.isfinite(width) and 2.0 * half > width else ""
-    raw = known.std(unknown.name, raw=True)
-    return Estimate(value, std, (value - half, value + half), "covariance", std_raw=raw, reason=reason)
+    reasons = ["the interval is wider than the bounds"] if math.isfinite(width) and 2.0 * half > width else []
+    if half > WIDER * plain > 0:
+        reasons.append(
+            f"the residuals are correlated, so that {known.rows} rows are worth {sum(known.effective.values()):.3g} "
+            f"independent ones and the interval is {half / plain:.2g} times as wide as if they were independent"
+        )
+    independent = within(plain) if any(known.rho.values()) else None
+    return Estimate(
+        value, std, within(half), "covariance", std_raw=raw, reason="; ".join(reasons), ci95_independent=independent
+    )
 
 
 def _on_bound(unknown: Free, value: float, slope: float, known: Uncertainty, *, alone: bool) -> Estimate:

@@ -8,12 +8,73 @@ import numpy as np
 
 from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.waveform import noise_estimate, noise_floor
 
 FLOOR = 1e-6
 """No standard deviation is below this share of an output's range."""
 
 GIVEN = "given"
+ESTIMATED = "estimated before the event"
 MISFIT = "misfit"
+FEWEST_QUIET = 8
+"""Rows before an event from which the noise of a record is told."""
+
+
+def from_misfit(source: str) -> bool:
+    """Whether a `noise_source` says that the standard deviation is that of the fit's own residual."""
+    return source.startswith(MISFIT)
+
+
+def quiet(experiments: Sequence[Experiment], output: str) -> bool:
+    """Whether every record of an output has rows enough before its event to tell its noise by."""
+    measured = [e for e in experiments if output in e.outputs and e.measured is not None]
+    counts = [
+        0 if e.event is None else int(np.isfinite(e.measured[output][e.time < e.event]).sum())
+        for e in measured
+        if e.measured is not None
+    ]
+    return min(counts, default=0) >= FEWEST_QUIET
+
+
+def unknown_noise(experiments: Sequence[Experiment], sources: Mapping[str, str]) -> dict[str, str]:
+    """Why an output's standard deviation is that of the misfit, by output, as a clause. sources: `noise_source`.
+
+    Data have no noise only where the model itself meets them to the last digits; a record that was measured has some, if not
+    in the rows before the event.
+    """
+    found = {}
+    for output, source in sources.items():
+        if not from_misfit(source):
+            continue
+        if source != MISFIT:
+            found[output] = "the record has no noise (the model meets it to 1e-6 of its range)"
+        elif quiet(experiments, output) and not _moves_before(experiments, output):
+            found[output] = "the record shows no noise before the event"
+        else:
+            found[output] = "its noise is not given, and no quiet rows before an event tell it"
+    return found
+
+
+def _moves_before(experiments: Sequence[Experiment], output: str) -> bool:
+    """Whether a record shows noise above its floor before its event."""
+    for e in experiments:
+        if output in e.outputs and e.measured is not None and e.event is not None:
+            keep = (e.time < e.event) & np.isfinite(e.measured[output])
+            v = e.measured[output]
+            if noise_estimate(e.time[keep], v[keep], e.event) > noise_floor(v[np.isfinite(v)]):
+                return True
+    return False
+
+
+def source_text(experiments: Sequence[Experiment], output: str, floor: bool) -> str:
+    """Where an output's standard deviation comes from, in words. floor: whether the misfit is no larger than `floor_of`."""
+    if source_of(experiments, output) == MISFIT:
+        return f"{MISFIT}, at the floor of 1e-6 of the range" if floor else MISFIT
+    told = [e for e in experiments if output in e.outputs]
+    estimated = [e.name for e in told if output in e.noise_dof]
+    if not estimated:
+        return GIVEN
+    return ESTIMATED if len(estimated) == len(told) else f"{ESTIMATED} in {', '.join(estimated)}, given for the others"
 
 
 def range_of(experiments: Sequence[Experiment], output: str) -> float:

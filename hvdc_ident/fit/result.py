@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
@@ -24,6 +25,7 @@ class Estimate:
     there is none, with the reason. ci95: the 95 % interval; an end that is None is not known.
     method: "covariance" (t times std), "one-sided" (on a bound: the bound and a limit from the curvature) or "none".
     conditional_on: parameters held without which this one could not be told.
+    ci95_independent: the interval as if the residuals were independent, where they are not.
     """
 
     value: float
@@ -34,6 +36,7 @@ class Estimate:
     std_raw: float | None = None
     unit: str = ""
     reason: str = ""
+    ci95_independent: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class FitResult:
     fitted: names of the free parameters. held: the reason for each other one. values: fitted ones and those held at
     given values, as the model takes them. estimates: by parameter. nuisance: by experiment and nuisance.
     cost: half the sum of squared residuals in units of sigma, None where the fit failed.
+    adequacy: whether the residuals are of the size of the noise, with the verdict in words and what to do.
     rmse, rmse_start: by output and experiment, at the optimum and at the start, in the output's unit.
     noise_source: by output, in words. sigma: standard deviation by experiment and output, in the output's unit.
     rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
@@ -85,6 +89,7 @@ class FitResult:
     nuisance: FrozenMap[FrozenMap[Estimate]] = field(default_factory=FrozenMap)
     cost: float | None = None
     chi2_per_dof: float | None = None
+    adequacy: Adequacy | None = None
     rmse: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     rmse_start: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     noise_source: FrozenMap[str] = field(default_factory=FrozenMap)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -31,6 +31,8 @@ class Uncertainty:
     Rows of unknowns in `reasons` mean nothing. singular: whether only combinations of some are determined.
     rho: AR(1) coefficient by output (0 where not significant). effective: the number of independent samples by output.
     dof: degrees of freedom of Student's t for the intervals; infinite where the noise is known and white.
+    dof_independent: the same if the residuals were independent. rows: all compared ones. excess: what `corrected` was
+    multiplied by, for the misfit is larger than the noise.
     """
 
     names: tuple[str, ...]
@@ -41,6 +43,9 @@ class Uncertainty:
     rho: FrozenMap[float]
     effective: FrozenMap[float]
     dof: float
+    dof_independent: float = np.inf
+    rows: int = 0
+    excess: float = 1.0
 
     def std(self, name: str, *, raw: bool = False) -> float | None:
         """Standard deviation in the unknown's unit; None where there is a reason against it."""
@@ -48,6 +53,15 @@ class Uncertainty:
             return None
         i = self.names.index(name)
         return float(np.sqrt((self.raw if raw else self.corrected)[i, i]))
+
+    def widened(self, factor: float) -> Uncertainty:
+        """The same with the corrected variances multiplied; what the noise was then comes from the residuals."""
+        if factor == 1.0:
+            return self
+        dof = max(1.0, sum(self.effective.values()) - len(self.names))
+        alone = min(self.dof_independent, float(max(1, self.rows - len(self.names))))
+        corrected = self.corrected * factor
+        return replace(self, corrected=corrected, dof=min(self.dof, dof), dof_independent=alone, excess=factor)
 
     def correlation(self) -> dict[str, dict[str, float]]:
         """Correlation of the estimates between those that have a standard deviation."""
@@ -122,6 +136,8 @@ def uncertainty(
         FrozenMap(rho),
         FrozenMap(effective),
         float(dof),
+        float(min(noise_dof, max(1, count - p) if from_misfit else np.inf)),
+        count,
     )
 
 

@@ -12,6 +12,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.executor import Executor, Progress
+from hvdc_ident.fit.noise import unknown_noise
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.frozen import FrozenMap
@@ -100,9 +101,9 @@ def _data_notes(so_far: Findings, optimum: Optimum, result: FitResult) -> None:
     elif rows == unknowns:
         so_far.notes.append(f"{rows} measured values for as many unknowns leave nothing to tell a wrong model by.")
     if optimum.deterministic:
-        names = ", ".join(optimum.deterministic)
-        so_far.notes.append(f"The records of {names} have no noise: standard deviations are those of the misfit.")
-        so_far.remark = "The data have no noise; what noise they stand for is taken from the misfit."
+        reasons = unknown_noise(so_far.problem.fitted_experiments, result.noise_source)
+        so_far.notes += [f"{o}: {why}; its standard deviation is that of the misfit." for o, why in reasons.items()]
+        so_far.remark = f"The noise is that of the misfit ({'; '.join(dict.fromkeys(reasons.values()))})."
     if result.status in ("two-optima", "not-converged"):
         so_far.notes.append(f"Pilot fit: {result.status}, {result.message}.")
 

@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.executor import Executor, Progress
-from hvdc_ident.fit.noise import GIVEN, MISFIT, source_of
+from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, source_of
 from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import Block
@@ -83,7 +83,7 @@ class Optimum:
 
     @property
     def deterministic(self) -> tuple[str, ...]:
-        """Outputs whose standard deviation is the misfit's, for their records have no noise."""
+        """Outputs whose standard deviation is the misfit's, for their noise is not known."""
         experiments = self.problem.fitted_experiments
         return tuple(o for o in self.problem.outputs if source_of(experiments, o) == MISFIT)
 
@@ -142,7 +142,7 @@ def pilot(
     weights = {
         o: next(s[o] for s in result.sigma.values() if o in s)
         for o, source in result.noise_source.items()
-        if source != GIVEN
+        if from_misfit(source)
     }
     weighted = problem.with_(weights={**problem.weights, **weights})
     theta = [result.values[f.name] for f in problem.free]

@@ -128,7 +128,7 @@ def recommend(
     at = FrozenMap({n: whole.value(n) for n in whole.names})
     text = advice(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked))
     if whole.deterministic:
-        text += " The data have no noise: the misfit stands for it in these intervals."
+        text += " The misfit stands for the noise in these intervals."
     others = tuple(_others(ranked, best))
     count = len({r.trial for r in ranked})
     return Recommendation(best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text)

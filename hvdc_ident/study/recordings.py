@@ -12,6 +12,7 @@ import numpy as np
 from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.files import digest
+from hvdc_ident.fit.noise import FEWEST_QUIET
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
@@ -30,11 +31,13 @@ MEDIAN_EFFICIENCY = 0.37
 class NoiseNote:
     """The standard deviation an output's noise is taken to have, in its unit, and where that comes from.
 
-    source: "given" or "estimated"; "floor": the record is deterministic, weights come from the misfit of the fit.
+    source: "given"; "estimated", from the rows before the event; "floor": those rows show no noise, and weights come from
+    the misfit of the fit; "residual": no rows lie before an event, so that the fit's own residual has to tell, std being
+    the least it may be.
     """
 
     std: float
-    source: Literal["given", "estimated", "floor"]
+    source: Literal["given", "estimated", "floor", "residual"]
 
 
 @dataclass
@@ -178,7 +181,7 @@ def _experiment(
         inputs=FrozenMap(inputs),
         values=FrozenMap(table.values),
         measured=measured,
-        noise=FrozenMap({o: n.std for o, n in notes.items() if n.source != "floor"}),
+        noise=FrozenMap({o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}),
         noise_dof=FrozenMap(
             {o: _noise_dof(time[np.isfinite(scaled[o])], event) for o, n in notes.items() if n.source == "estimated"}
         ),
@@ -354,8 +357,10 @@ def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, f
 
 
 def _noise(given: float | None, time: Array, values: Array, event: float | None) -> NoiseNote:
-    """The larger of what is given, else estimated, and the floor; where that acts the data are deterministic."""
+    """The larger of what is given, else estimated before the event, and the floor; where that acts the data show no noise."""
     floor = noise_floor(values)
+    if given is None and (event is None or int(np.isfinite(values[time < event]).sum()) < FEWEST_QUIET):
+        return NoiseNote(floor, "residual")
     std = given if given is not None else noise_estimate(time, values, event)
     if std <= floor:
         return NoiseNote(floor, "floor")
@@ -364,8 +369,8 @@ def _noise(given: float | None, time: Array, values: Array, event: float | None)
 
 def _noise_dof(time: Array, event: float | None) -> float:
     """What the rows behind an estimated standard deviation are worth: it is a median's, of efficiency 0.37."""
-    before = int((time < event).sum()) if event is not None else 0
-    return max(1.0, MEDIAN_EFFICIENCY * (before if before >= 8 else time.size))
+    assert event is not None
+    return max(1.0, MEDIAN_EFFICIENCY * int((time < event).sum()))
 
 
 def _instrument(line: schema.Instrument) -> FrozenMap[float]:

@@ -39,7 +39,7 @@ def summary_text(found: dict[str, Any]) -> str:
         lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}")
     for name, e in found["experiments"].items():
         event = f"event at {e['event']:g} s" if e["event"] is not None else "no event"
-        noise = ", ".join(f"{o} {n['std']:.3g} ({n['source']})" for o, n in e["noise"].items())
+        noise = ", ".join(_noise(o, n) for o, n in e["noise"].items())
         start, end = e["time"]
         lines.append(
             f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
@@ -47,6 +47,15 @@ def summary_text(found: dict[str, Any]) -> str:
         lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
     lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
     return "\n".join(lines)
+
+
+def _noise(output: str, note: dict[str, Any]) -> str:
+    """The noise of one output, or what stands in for it."""
+    if note["source"] == "residual":
+        return f"{output} from the residual of the fit (not given, and no quiet rows before an event)"
+    if note["source"] == "floor":
+        return f"{output} none above {note['std']:.3g} (before the event; the residual of the fit stands in)"
+    return f"{output} {note['std']:.3g} ({note['source']})"
 
 
 def _experiment(e: Experiment, study: Study) -> dict[str, Any]:

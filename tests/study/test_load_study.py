@@ -10,6 +10,7 @@ import pytest
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.study import recordings
 from hvdc_ident.study.study import Study, load_study
+from hvdc_ident.study.summary import summary, summary_text
 from hvdc_ident.units import conversion, same_unit
 
 TIME = np.arange(101) * 0.01
@@ -100,6 +101,14 @@ def test_noise_is_given_estimated_or_the_floor(tmp_path: Path) -> None:
     assert given.noise["d"]["Irorder2"].source == "given" and given.experiments[0].noise["Irorder2"] == 0.02
     smooth = loaded(tmp_path)
     assert smooth.noise["d"]["Irorder2"].source == "floor" and not smooth.experiments[0].noise
+
+
+def test_without_quiet_rows_before_an_event_the_noise_is_left_to_the_residual(tmp_path: Path) -> None:
+    noisy = 0.4 + 1e-3 * np.random.default_rng(1).standard_normal(101)
+    for place in ("event = 0.0", "event = 0.05"):
+        study = loaded(tmp_path, place, Irorder2=noisy)
+        assert study.noise["d"]["Irorder2"].source == "residual" and not study.experiments[0].noise
+        assert "from the residual of the fit" in summary_text(summary(study))
 
 
 def test_drive_instrument_interpolation_and_role(tmp_path: Path) -> None:

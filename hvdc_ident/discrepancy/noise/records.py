@@ -20,7 +20,7 @@ from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.whitening import AR, autoregression, segments
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
-from hvdc_ident.waveform import event_time, noise_floor
+from hvdc_ident.waveform import event_time, noise_floor, row_scatter
 
 FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
@@ -88,7 +88,8 @@ class Quiet:
 
     std: their standard deviation if they were white; moves: whether there is noise in them at all. given: the standard
     deviation told; step: what the whole records are rounded to; rounded: their noise when below that. floor: the least a
-    record can hold. longer: an AR model of several coefficients, where there are rows enough. even: evenly spaced rows.
+    record can hold. scatter: the white noise that all rows show from one to the next. longer: an AR model of several
+    coefficients, where there are rows enough. even: evenly spaced rows.
     """
 
     records: tuple[Array, ...]
@@ -98,6 +99,7 @@ class Quiet:
     step: float
     rounded: float
     floor: float
+    scatter: float | None
     longer: AR
     even: bool
 
@@ -127,7 +129,25 @@ def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
     std = float(np.sqrt(power / max(rows - 2 * len(records), 1))) if rows else 0.0
     moves = std > 1e-12 * scale and (given is None or std >= 1e-3 * given) and (given is not None or std > floor)
     longer = autoregression(records) if moves and even and rows >= LONG * len(records) else ()
-    return Quiet(records, std, moves, given, step, rounded, floor, longer if len(longer) > 1 else (), even)
+    return Quiet(
+        records,
+        std,
+        moves,
+        given,
+        step,
+        rounded,
+        floor,
+        _scatter(experiments, output),
+        longer if len(longer) > 1 else (),
+        even,
+    )
+
+
+def _scatter(experiments: Sequence[Experiment], output: str) -> float | None:
+    """The white noise from row to row over all records of an output; None where one of them does not show it."""
+    found = [row_scatter(e.time, e.measured[output]) for e in experiments if e.measured is not None]
+    known = [s for s in found if s is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known and len(known) == len(found) else None
 
 
 def _colours(quiet: Mapping[str, Quiet], short: Mapping[str, Likelihood]) -> dict[str, Colour]:
@@ -163,6 +183,10 @@ def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> Noise:
     if given is None and std <= quiet.floor:
         if step > 0.0:
             return Noise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+        if rows == 0 and quiet.scatter is not None:
+            return Noise(
+                quiet.scatter, (), 0.0, step, "the scatter from row to row, for no rows lie before an event", 0
+            )
         return Noise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
     model = (colour.rho,) if colour.tanh else quiet.longer
     if colour.tanh and found is not None:

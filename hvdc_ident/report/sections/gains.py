@@ -35,9 +35,15 @@ STATUS = {
 def _outcome(fit: dict[str, Any]) -> str:
     """What became of the fit, said first."""
     status = str(fit.get("status", ""))
-    return (
+    judged = fit.get("adequacy") or {}
+    said = (
         f"<p><strong>{text(STATUS.get(status, status))}</strong> ({text(status)}): {text(fit.get('message', ''))}.</p>"
     )
+    if judged.get("text"):
+        head = "The model does not fit these records" if judged["verdict"] == "does-not-fit" else "On the noise"
+        what = f" Next: {text(judged['next'])}." if judged.get("next") else ""
+        said += f"<p><strong>{head}</strong>: {text(judged['text'])}.{what}</p>"
+    return said
 
 
 def _more(fit: dict[str, Any]) -> str:
@@ -142,10 +148,14 @@ def _weights(fit: dict[str, Any]) -> str:
     given = [o for o in sources if o not in misfit]
     parts = []
     if given:
-        parts.append(f"Intervals rest on the noise given or estimated before the event for {text(', '.join(given))}.")
+        chi2 = (fit.get("adequacy") or {}).get("chi2_per_dof")
+        beside = "" if chi2 is None else f", against which χ² per degree of freedom is {number(chi2, 3)}"
+        parts.append(
+            f"Intervals rest on the noise given or estimated before the event for {text(', '.join(given))}{beside}."
+        )
     if misfit:
         parts.append(
-            f"{text(', '.join(misfit))}: the data are deterministic, so the standard deviation comes from the misfit."
+            f"{text(', '.join(misfit))}: the noise is not known, so the standard deviation is that of the misfit."
         )
     return f"<p class='small'>{' '.join(parts)}</p>"
 

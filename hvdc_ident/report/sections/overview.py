@@ -60,9 +60,12 @@ def _adequate(fit: dict[str, Any]) -> str:
     chi = fit.get("chi2_per_dof")
     if chi is None or any("misfit" in str(s) for s in (fit.get("noise_source") or {}).values()):
         return ""
-    left = "the model explains the recordings down to their noise"
-    if chi >= 1.5:
-        left = "more than noise is left over, so the model lacks something"
+    verdict = (fit.get("adequacy") or {}).get("verdict", "fits" if chi < 1.5 else "does-not-fit")
+    left = {
+        "does-not-fit": "more than noise is left over, so the model lacks something",
+        "noise-understated": "the residual is white and above the noise told, which may be too small",
+        "noise-overstated": "the noise told is larger than what the residual shows",
+    }.get(verdict, "the model explains the recordings down to their noise")
     return f"χ² per degree of freedom is {number(chi, 3)}: {left}."
 
 

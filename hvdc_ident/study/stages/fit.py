@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stage import Options, Outcome, Stage
@@ -40,6 +40,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 
         result = gated_fit(problem, report, fit, force=options.force, whole=fitting.as_reported(study))
     data = {**result.to_dict(), **_context(study, options, report, result)}
+    if data["adequacy"]:
+        data["adequacy"]["next"] = data["adequacy"]["next"].replace("STUDY", study.path.name)
     if result.status == "failed":
         return Outcome(data, failed=result.message)
     through = fitting.with_settings(study, gated(problem, gate(report, options.force)))
@@ -55,7 +57,13 @@ def _context(study: Study, options: Options, report: Mapping[str, Any], result: 
     return {
         "forced": [n for n in options.force if n in result.fitted and n not in report["identifiable"]],
         "candidates": {
-            n: {"start": f.start, "min": f.min, "max": f.max, "unit": study.model.parameters[n].unit}
+            n: {
+                "start": f.start,
+                "min": f.min,
+                "max": f.max,
+                "searched": f.drawn,
+                "unit": study.model.parameters[n].unit,
+            }
             for n, f in study.candidates.items()
         },
         "units": {o: study.model.outputs[o].unit for o in result.rmse},
@@ -88,15 +96,63 @@ def _files(
 
 
 def told(data: Mapping[str, Any]) -> list[str]:
-    """The status, then every estimate in the form it may be stated in, then what is held."""
+    """The status and the verdict on the residuals, then every estimate as it may be stated, then what is held."""
     lines = [f"{data['status']}: {data['message']}"]
+    judged = data.get("adequacy") or {}
+    lines += [f"{WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
+    lines += [f"Next: {judged['next']}"] if judged.get("next") else []
+    beside = _beside(data)
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
-        low, high = e["ci95"] or (None, None)
-        interval = "" if low is None or high is None else f", 95 %: {low:.6g} to {high:.6g}"
-        lines.append(f"{name} = {e['value']:.6g}{unit}{interval}" + (f" ({e['reason']})" if e["reason"] else ""))
+        lines.append(f"{name} = {e['value']:.6g}{unit}{_interval(e['ci95'], beside)}" + _note(e))
     held = [n for n in data["candidates"] if n not in data["estimates"]]
-    return lines + [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
+    lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
+    return lines + _searched(data)
+
+
+WORDS = {
+    "does-not-fit": "The model does not fit these records",
+    "noise-understated": "The noise may be understated",
+    "noise-overstated": "The noise is overstated",
+    "not-judged": "Not judged",
+    "fits": "The model fits",
+}
+"""What a verdict of `fit.adequacy` begins with on the screen."""
+
+
+def _beside(data: Mapping[str, Any]) -> str:
+    """What every interval has beside it: how large the residual is against the noise the interval rests on."""
+    chi2 = (data.get("adequacy") or {}).get("chi2_per_dof")
+    return f"chi2/dof {chi2:.3g}" if chi2 is not None else "noise from the residual"
+
+
+def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:
+    low, high = ci95 or (None, None)
+    if low is None and high is None:
+        return ""
+    if low is None or high is None:
+        return f", 95 %: {'below' if low is None else 'above'} {high if low is None else low:.6g} ({beside})"
+    return f", 95 %: {low:.6g} to {high:.6g} ({beside})"
+
+
+def _note(estimate: Mapping[str, Any]) -> str:
+    """The reason that goes with an estimate, and the interval of independent residuals where it is a far smaller one."""
+    from hvdc_ident.fit.intervals import WIDER
+
+    plain, ci95 = estimate.get("ci95_independent"), estimate["ci95"]
+    text = estimate["reason"]
+    if plain and ci95 and None not in ci95 and ci95[1] - ci95[0] > WIDER * (plain[1] - plain[0]):
+        why = "" if "residuals are correlated" in text else "the residuals are correlated; "
+        text = f"{text.rstrip('.')}; {why}" if text else why
+        text += f"as if they were independent: {plain[0]:.6g} to {plain[1]:.6g}"
+    return f" ({text})" if text else ""
+
+
+def _searched(data: Mapping[str, Any]) -> list[str]:
+    """The range of each fitted parameter that has a bound missing: the results speak of what lies in it."""
+    rows = {n: c for n, c in data["candidates"].items() if n in data["fitted"] and None in (c["min"], c["max"])}
+    ranges = [f"{n} {c['searched'][0]:.4g} to {c['searched'][1]:.4g}" for n, c in rows.items() if c.get("searched")]
+    return [f"Without bounds of their own, starts were drawn from: {', '.join(ranges)}."] if ranges else []
 
 
 STAGE = Stage(

@@ -1,0 +1,232 @@
+"""The size of a fit's residuals beside that of the noise: whether the model fits, and whether the noise told can be right.
+
+The mean squared residual per degree of freedom (chi2/dof) is 1 where a right model meets the noise that was told. It is
+judged twice: it has to differ from 1 by more than chance allows (the F quantile, of the independent samples in the residual
+and of those behind an estimated noise), and by enough to matter. It matters from 2 on: more than half of the residual's
+power is then not noise, and intervals that rest on the noise alone cover less than that half. Below 1/2 they are too wide in
+the same proportion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.special import fdtri
+
+from hvdc_ident.fit.noise import ESTIMATED, GIVEN, from_misfit
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.weights import MAD
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.trajectory import Array
+from hvdc_ident.waveform import row_scatter
+
+LEVEL = 1e-3
+"""Chance of a verdict against the model or the noise where both are right, over all outputs together."""
+MATTERS = 2.0
+"""Ratio of the residual's power to the noise's from which intervals that rest on the noise are wrong (see above)."""
+NEXT = "hvdc-ident diagnose STUDY"
+
+Verdict = Literal["fits", "does-not-fit", "noise-understated", "noise-overstated", "not-judged"]
+
+
+@dataclass(frozen=True)
+class Size:
+    """The residual of one output. ratio: its power over that of the noise, per degree of freedom.
+
+    low, high: between them the ratio says nothing; noise: the standard deviation told or, where none was, the scatter from
+    row to row, in the output's unit; None where there is neither. white: whether the residual has no significant
+    autocorrelation.
+    """
+
+    ratio: float | None
+    low: float
+    high: float
+    noise: float | None
+    white: bool
+    verdict: Verdict
+
+    @property
+    def times(self) -> float | None:
+        """How many times the noise the residual is."""
+        return None if self.ratio is None else float(np.sqrt(self.ratio))
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """What the size of the residuals says.
+
+    verdict: fits; does-not-fit; noise-understated (white residuals above the noise told: not the mark of a wrong model);
+    noise-overstated; not-judged (no noise is known but the residual's own). chi2_per_dof: over all outputs, against the noise
+    told. outputs: by output. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
+    """
+
+    verdict: Verdict
+    chi2_per_dof: float | None
+    outputs: FrozenMap[Size] = field(default_factory=FrozenMap)
+    text: str = ""
+    next: str = ""
+
+    @property
+    def widening(self) -> float:
+        """The factor of the estimates' variances that the excess of the residual over the noise told calls for.
+
+        The misfit then stands for the noise, as it does where none is told; 1 where the residual is no larger.
+        """
+        above = self.verdict in ("does-not-fit", "noise-understated")
+        return max(self.chi2_per_dof or 1.0, 1.0) if above else 1.0
+
+
+def adequacy(
+    problem: Problem,
+    blocks: Sequence[Block],
+    sources: Mapping[str, str],
+    effective: Mapping[str, float],
+    rho: Mapping[str, float],
+) -> Adequacy:
+    """The verdict on the residuals at an optimum of the problem.
+
+    blocks: with residuals in units of sigma. By output: sources (`noise_source`), effective (independent samples), rho (the
+    residuals' AR(1) coefficient, 0 where it is not significant).
+    """
+    samples = sum(b.residual.size for b in blocks)
+    unknowns = len(problem.names)
+    if samples <= unknowns:
+        return Adequacy("not-judged", None, text="no more rows than unknowns: nothing is left to judge the fit by")
+    share = 1.0 - unknowns / samples
+    level = LEVEL / max(len(problem.outputs), 1)
+    sizes = {}
+    for output in problem.outputs:
+        own = [b for b in blocks if b.output == output]
+        sizes[output] = _size(problem, output, own, share, (effective[output], rho[output]), sources[output], level)
+    told = [b for b in blocks if not from_misfit(sources[b.output])]
+    power = sum(_power(problem, b.residual) * b.residual.size for b in told)
+    chi2 = power / (sum(b.residual.size for b in told) * share) if told else None
+    verdict = _together(sizes)
+    text, what = _words(problem, sizes, verdict, sources)
+    return Adequacy(verdict, chi2, FrozenMap(sizes), text, what)
+
+
+def _power(problem: Problem, residual: Array) -> float:
+    """The mean squared residual; under a robust loss by the median, for outliers are not noise."""
+    if problem.loss.linear:
+        return float(np.mean(residual**2))
+    return (MAD * float(np.median(np.abs(residual)))) ** 2
+
+
+def _size(
+    problem: Problem,
+    output: str,
+    blocks: Sequence[Block],
+    share: float,
+    independence: tuple[float, float],
+    source: str,
+    level: float,
+) -> Size:
+    """The size of one output's residual. share: of the rows that the unknowns leave free. independence: effective, rho."""
+    residual = np.concatenate([b.residual for b in blocks])
+    effective, white = _independent(residual.size, independence), independence[1] == 0.0
+    spare = max(effective - residual.size * (1.0 - share), 1.0)
+    if not from_misfit(source):
+        noise: float | None = float(np.sqrt(sum(b.sigma**2 * b.residual.size for b in blocks) / residual.size))
+        ratio, behind = _power(problem, residual) / share, problem.noise_dof
+    else:
+        scatter = _scatter(problem, output)
+        if scatter is None:
+            return Size(None, 0.0, np.inf, None, white, "not-judged")
+        noise, rows = scatter
+        misfit = np.concatenate([b.residual * b.sigma for b in blocks])
+        ratio, behind = _power(problem, misfit) / share / noise**2, 0.5 * rows
+    high = max(MATTERS, _quantile(spare, behind, 1.0 - level))
+    # Of few independent samples the unknowns take a larger share than of the rows.
+    low = min(1.0 / MATTERS, _quantile(spare, behind, level) * spare / (effective * share))
+    verdict: Verdict = "fits"
+    if ratio > high:
+        verdict = "noise-understated" if white and not from_misfit(source) else "does-not-fit"
+    elif ratio < low and not from_misfit(source):
+        verdict = "noise-overstated"
+    return Size(ratio, low, high, noise, white, verdict)
+
+
+def _independent(rows: int, independence: tuple[float, float]) -> float:
+    """The independent samples in so many rows; of correlated ones at the upper end of what their coefficient may be, for
+    artanh of it has a standard error of 1/sqrt(rows) (Fisher)."""
+    effective, rho = independence
+    if rho == 0.0:
+        return max(effective, 1.0)
+    upper = float(np.tanh(np.arctanh(min(rho, 1.0 - 1e-9)) + 3.0 / np.sqrt(rows)))
+    return max(min(effective, rows * (1.0 - upper) / (1.0 + upper)), 1.0)
+
+
+def _quantile(dof: float, behind: float, chance: float) -> float:
+    """The F quantile of dof and `behind` degrees of freedom; an infinite number of them is a large one."""
+    return float(fdtri(dof, min(behind, 1e9), chance))
+
+
+def _scatter(problem: Problem, output: str) -> tuple[float, float] | None:
+    """The white noise that the rows of an output show by themselves, and how many rows that rests on."""
+    found = []
+    for e in problem.fitted_experiments:
+        if output in e.outputs and e.measured is not None:
+            keep = e.compared & np.isfinite(e.measured[output])
+            one = row_scatter(e.time[keep], e.measured[output][keep])
+            if one is None:
+                return None
+            found.append((one, int(keep.sum())))
+    rows = sum(n for _, n in found)
+    return (float(np.sqrt(sum(s * s * n for s, n in found) / rows)), rows) if rows else None
+
+
+def _together(sizes: Mapping[str, Size]) -> Verdict:
+    """The worst verdict of any output."""
+    order: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
+    return min((s.verdict for s in sizes.values()), key=order.index)
+
+
+def _words(
+    problem: Problem, sizes: Mapping[str, Size], verdict: Verdict, sources: Mapping[str, str]
+) -> tuple[str, str]:
+    """The verdict in words, and what to do."""
+    parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
+    text = "; ".join(p for p in parts if p)
+    if verdict == "does-not-fit":
+        more = "the intervals hold the misfit in place of the noise, and a systematic misfit may still move the estimates beyond them"
+        return f"{text}: {more}", NEXT
+    values = ", ".join(
+        f"{o} = {s.noise * s.times:.3g}" for o, s in sizes.items() if s.verdict == verdict and s.noise and s.times
+    )
+    if verdict == "noise-understated":
+        return text, f"state noise = {{{values}}} if the instrument may be as noisy as that; else {NEXT}"
+    if verdict == "noise-overstated":
+        return (
+            text,
+            f"state noise = {{{values}}}, or leave it out to have it estimated: the intervals are too wide as they are",
+        )
+    return text, ""
+
+
+def _line(output: str, size: Size, source: str) -> str:
+    """What is said of one output."""
+    if size.verdict == "not-judged" or size.times is None or size.ratio is None:
+        return (
+            f"the noise of {output} is taken from the fit's own residual, which then cannot tell whether the model fits"
+        )
+    kind = "stated" if source == GIVEN else "estimated" if source.startswith(ESTIMATED) else "row-to-row"
+    ratio = f"chi2/dof {size.ratio:.3g}"
+    if size.verdict == "noise-overstated":
+        return f"the {kind} noise of {output} is {_times(1.0 / size.times)} what the residual shows ({ratio})"
+    if size.verdict == "noise-understated":
+        return (
+            f"the residual of {output} is white and {_times(size.times)} the {kind} noise ({ratio}): that noise is too "
+            "small, or the model lacks something too fast for these rows to show"
+        )
+    if size.verdict == "does-not-fit":
+        return f"the residual of {output} is {_times(size.times)} the {kind} noise ({ratio})"
+    return ""
+
+
+def _times(factor: float) -> str:
+    return f"{factor:.2g} times" if factor < 100 else f"{factor:,.0f} times"
