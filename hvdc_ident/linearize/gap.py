@@ -144,7 +144,9 @@ def gap(first: LinearModel, second: LinearModel, tolerance: float = 1e-4) -> flo
         return 1.0
     graphs = [_graph(m) for m in (first, second)]
     scale = _scale(graphs)
-    return max(_directed(graphs[i], graphs[1 - i], scale, tolerance, near) for i in (0, 1))
+    first_on, second_on = (_on_circle(graph, scale) for graph in graphs)
+    there = _directed(first_on, second_on, tolerance, near)
+    return max(there, _directed(second_on, first_on, tolerance, near))
 
 
 def _graph(model: LinearModel) -> StateSpace:
@@ -175,25 +177,27 @@ def _scale(graphs: list[StateSpace]) -> float:
     return float(np.exp(np.mean(np.log(poles)))) if poles.size else 1.0
 
 
-def _response(graph: StateSpace, omega: Array) -> Complex:
-    """(frequency, rows, inputs) of [M; N]."""
+def _on_circle(graph: StateSpace, scale: float) -> Complex:
+    """(points, rows, inputs) of [M; N] over the whole circle: the upper half, then its conjugate, mirrored."""
     a, b, c, d = graph
+    points = 8 * LARGEST
+    omega = scale * np.tan((np.arange(points // 2) + 0.5) * np.pi / points)
     if a.shape[0] == 0:
-        return np.broadcast_to(d.astype(complex), (omega.size, *d.shape))
-    inner = 1j * omega[:, None, None] * np.eye(a.shape[0]) - a
-    return c @ np.linalg.solve(inner, np.broadcast_to(b, (omega.size, *b.shape))) + d
+        upper = np.broadcast_to(d.astype(complex), (omega.size, *d.shape))
+    else:
+        inner = 1j * omega[:, None, None] * np.eye(a.shape[0]) - a
+        upper = c @ np.linalg.solve(inner, np.broadcast_to(b, (omega.size, *b.shape))) + d
+    return np.concatenate([np.conj(upper[::-1]), upper])
 
 
-def _directed(graph: StateSpace, other: StateSpace, scale: float, tolerance: float, least: float) -> float:
+def _directed(graph: Complex, other: Complex, tolerance: float, least: float) -> float:
     """sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of other* graph, and not below `least`.
 
     Where the operator's spectrum reaches down to s no sequence attains it, the bound rises as 1/size^2 and a third of the
     last rise is still to come: it then stays below the nu-gap, which is the gap.
     """
-    points = 16 * LARGEST
-    theta = (np.arange(points) + 0.5) * 2 * np.pi / points - np.pi
-    omega = scale * np.tan(theta / 2)
-    product = np.conj(np.swapaxes(_response(other, omega), 1, 2)) @ _response(graph, omega)
+    product = np.conj(np.swapaxes(other, 1, 2)) @ graph
+    points = product.shape[0]
     squared = np.conj(np.swapaxes(product, 1, 2)) @ product
     # T'T = Toeplitz(product* product) - H'H, H the Hankel operator of the coefficients before 0: all rows of T at once.
     symbol, whole = _coefficients(product), _coefficients(squared)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from hvdc_ident.linearize.arrays import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import Gradient, LinearModel
+    from hvdc_ident.model.definition import Model
 
 ZERO = 1e-8
 """An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
@@ -198,3 +200,46 @@ def gradient_of(model: LinearModel, parameter: str) -> Gradient:
             )
         raise unknown_name("parameter", parameter, model.gradients, where=f"linear model '{model.name}'")
     return model.gradients[parameter]
+
+
+# --- names ---
+
+SHARE = 0.5
+"""A part names a mode where it takes part at least so much as the part that takes part most."""
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMode:
+    """A mode, the parts that name it joined by " + ", and the participation of each part (they sum to 1)."""
+
+    mode: Mode
+    name: str
+    parts: FrozenMap[float]
+
+
+def parts_of(model: Model) -> FrozenMap[str]:
+    """Return the part of each state: its description, or its name where it has none; a delay belongs to the state it feeds."""
+    parts = {name: s.description or name for name, s in model.states.items()}
+    for delay in (*model.delays, *model.sampled):
+        fed = [n for n, s in model.states.items() if any(v.name == delay for v in s.derivative.free_symbols)]
+        parts[delay] = parts[fed[0]] if fed else delay
+    return FrozenMap(parts)
+
+
+def named_modes(linear: LinearModel, parts: Mapping[str, str]) -> tuple[NamedMode, ...]:
+    """Return the modes of a linear model with their names; of a conjugate pair the upper one.
+
+    parts: the part of each state, as `parts_of` gives it. States of a delay's approximant go with the delay.
+    """
+    return tuple(named(mode, parts) for mode in linear.modes() if mode.eigenvalue.imag >= 0)
+
+
+def named(mode: Mode, parts: Mapping[str, str]) -> NamedMode:
+    """Return a mode with the name that the parts which take part in it most give it."""
+    shares: dict[str, float] = {}
+    for state, share in mode.participation.items():
+        part = parts.get(state) or parts.get(state.split(".")[0], state)
+        shares[part] = shares.get(part, 0.0) + share
+    ranked = sorted(shares.items(), key=lambda item: -item[1])
+    name = " + ".join(part for part, share in ranked if share >= SHARE * ranked[0][1])
+    return NamedMode(mode, name, FrozenMap(ranked))

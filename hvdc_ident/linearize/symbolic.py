@@ -31,6 +31,10 @@ class SymbolicTransfer:
         """The transfer function."""
         return self.numerator / self.denominator
 
+    def rounded(self, digits: int = 5) -> tuple[str, str]:
+        """Numerator and denominator as text by powers of s, numbers to some digits."""
+        return tuple(str(sp.N(sp.collect(e, S), digits)) for e in (self.numerator, self.denominator))  # type: ignore[return-value]
+
     def latex(self, digits: int = 5) -> str:
         """The formula in LaTeX, by powers of s, numbers to some digits."""
         top, bottom = (_latex(e, digits) for e in (self.numerator, self.denominator))

@@ -18,6 +18,7 @@ from hvdc_ident.errors import ComputationError, InputError, StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.sensitivity.axes import Samples
 from hvdc_ident.sensitivity.sweep import Progress, Runner, sweep
 from hvdc_ident.sensitivity.text import table_text
@@ -91,7 +92,7 @@ class Screening:
 
 
 def morris(
-    model: Model,
+    model: AnyModel,
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     *,
@@ -137,7 +138,7 @@ def morris(
 
 
 def sobol(
-    model: Model,
+    model: AnyModel,
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     *,
@@ -205,7 +206,7 @@ def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str,
 
 
 def _errors(
-    model: Model,
+    model: AnyModel,
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     x: Array,

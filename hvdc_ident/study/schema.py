@@ -32,6 +32,11 @@ def _effect_names(value: Any) -> Any:
     raise ValueError(f'effects: neither "all" nor a list of names: {value!r}')
 
 
+def _as_list(value: Any) -> Any:
+    """The value as a list, where it is one name."""
+    return [value] if isinstance(value, str) else value
+
+
 def _whitening(value: Any) -> Any:
     """The way of whitening; true and false are words for two of them."""
     return {True: "pre-event", False: "no"}[value] if isinstance(value, bool) else value
@@ -60,7 +65,7 @@ class Effect(Table):
     """[[model.effect]]: an effect that the model has from the start."""
 
     effect: Name
-    at: Annotated[Names, BeforeValidator(lambda v: [v] if isinstance(v, str) else v)]
+    at: Annotated[Names, BeforeValidator(_as_list)]
     parameters: dict[Name, FiniteFloat | Name] = {}
     source: Name | Names | None = Field(default=None, alias="from")
     expression: Annotated[str, StringConstraints(max_length=2000)] | None = None
@@ -176,12 +181,79 @@ class Experiment(Table):
         return self
 
 
+class Trim(Table):
+    """[linearize] trim: the values that outputs are to have at the operating point, and the inputs that are set for it.
+
+    inputs: values of other inputs. free: inputs or parameters to be found; left out, the inputs that move the outputs.
+    """
+
+    outputs: Annotated[dict[Name, FiniteFloat], Field(min_length=1)]
+    inputs: dict[Name, FiniteFloat] = {}
+    free: Names | None = None
+
+
+class Reduce(Table):
+    """[linearize] reduce: a model of fewer states, so many or as few as keep the error within a tolerance."""
+
+    order: Annotated[int, Field(ge=0)] | None = None
+    tolerance: Positive | None = None
+    match_dc: bool = False
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Reduce:
+        if (self.order is None) == (self.tolerance is None):
+            raise ValueError("give either order (states that stay) or tolerance (largest error of the gain)")
+        return self
+
+
+class Cut(Table):
+    """[linearize] plant: the signals that go into the plant and those the controller measures on it."""
+
+    inputs: Annotated[Names, BeforeValidator(_as_list)]
+    outputs: Annotated[Names, BeforeValidator(_as_list)]
+
+
+class Port(Table):
+    """[[linearize.port]]: where an impedance is seen, d and q or one dc signal each; band: Hz."""
+
+    name: FileName
+    source: Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
+    voltage: Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
+    current: Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
+    angle: Name = "0"
+    band: Annotated[list[Positive], Field(min_length=2, max_length=2)] = [0.1, 1000.0]
+    points: Annotated[int, Field(ge=2, le=100_000)] = 200
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Port:
+        if not self.band[0] < self.band[1]:
+            raise ValueError("band: its end is not above its start")
+        if not len(self.source) == len(self.voltage) == len(self.current):
+            raise ValueError("source, voltage and current need as many signals each: two (d, q), or one (dc)")
+        if len(self.source) == 1 and self.angle != "0":
+            raise ValueError("angle: a dc port has none")
+        return self
+
+
 class Linearize(Table):
-    """[linearize]: between which inputs and outputs, and where."""
+    """[linearize]: between which inputs and outputs, where, and what is wanted of the linear model.
+
+    break_at: signals at which loops are opened for their margins. plant: where plant and controller meet, for the
+    coprime factor margin. compare: another model, a shipped one or a path. scale: the size of an input or output that
+    counts as 1 in norms, gaps and the reduction. formula: parameters to be shown as symbols in the transfer functions.
+    """
 
     inputs: Names | None = None
     outputs: Names | None = None
     at: Literal["steady", "start"] = "steady"
+    trim: Trim | None = None
+    break_at: Annotated[Names, BeforeValidator(_as_list)] | None = None
+    plant: Cut | None = None
+    reduce: Reduce | None = None
+    compare: Name | None = None
+    scale: dict[Name, Positive] = {}
+    formula: Names | None = None
+    port: list[Port] = []
 
 
 class Sweep(Table):
@@ -215,6 +287,20 @@ class Sweep(Table):
             if self.scale == "log" and self.min <= 0:
                 raise ValueError("a log scale needs min above 0")
         return self
+
+
+class Screening(Table):
+    """[screening]: which parameters matter over their whole ranges, by Morris' elementary effects or Sobol's indices.
+
+    parameters: default, all candidates; each over its bounds. trajectories: of Morris; samples: of Sobol, a power of 2.
+    against: "data", or "base", the model's own run.
+    """
+
+    method: Literal["morris", "sobol"] = "morris"
+    parameters: Names | None = None
+    trajectories: Annotated[int, Field(ge=2, le=100_000)] = 20
+    samples: Annotated[int, Field(ge=2, le=1_048_576)] = 256
+    against: Literal["data", "base"] = "data"
 
 
 class Identifiability(Table):
@@ -283,6 +369,7 @@ class StudyFile(Table):
     experiment: list[Experiment] = []
     linearize: Linearize | None = None
     sweep: list[Sweep] = []
+    screening: Screening | None = None
     identifiability: Identifiability | None = None
     fit: Fit | None = None
     diagnose: Diagnose | None = None

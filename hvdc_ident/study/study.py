@@ -14,6 +14,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
+from hvdc_ident.study.linear import check_linear
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
 from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
@@ -26,7 +27,7 @@ class Study:
     model: with its parameterisation, effects and [model.values]. candidates: what may be estimated, with start and
     bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
     settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study.
-    against: the other model that sweeps are compared with, where they are.
+    against: the other model that sweeps are compared with, where they are; compared: that of the linear model.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Study:
     settings: schema.StudyFile
     sources: FrozenMap[str]
     against: AnyModel | None = None
+    compared: AnyModel | None = None
 
     @property
     def folder(self) -> Path:
@@ -67,6 +69,7 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
     where = file.name
     model, model_sources = _model(settings.model, file, trust)
     other, other_sources = _compared_with(settings, file, trust)
+    compared, compared_sources = _linear_model_compared_with(settings, file, trust)
     recordings = Recordings(file.parent)
     model = with_unknowns(settings, model, where)
     candidates = _candidates(settings, model, where)
@@ -80,8 +83,11 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
         experiments=experiments,
         noise=noise,
         settings=settings,
-        sources=FrozenMap({where: digest(content), **model_sources, **other_sources, **recordings.digests}),
+        sources=FrozenMap(
+            {where: digest(content), **model_sources, **other_sources, **compared_sources, **recordings.digests}
+        ),
         against=other,
+        compared=compared,
     )
     _check_questions(study, where)
     return study
@@ -141,11 +147,24 @@ def _compared_with(settings: schema.StudyFile, file: Path, trust: bool) -> tuple
     name = against_of(settings.sweep, f"{file.name}, sweep")
     if name in ("data", "base"):
         return None, {}
-    source, sources = _source(name, file, "sweep.against")
+    return _other_model(name, file, "sweep.against", trust)
+
+
+def _linear_model_compared_with(
+    settings: schema.StudyFile, file: Path, trust: bool
+) -> tuple[AnyModel | None, dict[str, str]]:
+    """The other model that the linear model is compared with, where it is, and its file's hash."""
+    asked = settings.linearize.compare if settings.linearize else None
+    return _other_model(asked, file, "linearize.compare", trust) if asked else (None, {})
+
+
+def _other_model(name: str, file: Path, place: str, trust: bool) -> tuple[AnyModel, dict[str, str]]:
+    """A model that a study names beside its own, and its file's hash."""
+    source, sources = _source(name, file, place)
     try:
         return load_model(source, trust=trust), sources
     except InputError as e:
-        raise e.at(f"{file.name}, sweep.against") from None
+        raise e.at(f"{file.name}, {place}") from None
 
 
 def _is_path(source: str) -> bool:
@@ -188,6 +207,7 @@ def _check_questions(study: Study, where: str) -> None:
     if s.linearize:
         _all_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
         _all_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
+        check_linear(study, where)
     for line in s.sweep:
         _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
@@ -195,6 +215,8 @@ def _check_questions(study: Study, where: str) -> None:
         from hvdc_ident.study.sweeps import axes_of
 
         axes_of(s.sweep, 0, f"{where}, sweep")
+    if s.screening:
+        _all_known("candidate", s.screening.parameters, study.candidates, f"{where}, screening.parameters")
     if s.identifiability:
         _all_known("candidate", s.identifiability.pair, study.candidates, f"{where}, identifiability.pair")
     for number, group in enumerate(s.fit.groups if s.fit else (), start=1):

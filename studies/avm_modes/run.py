@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.linearize import linearize
-from hvdc_ident.linearize.parts import named_modes, parts_of, path_delay
+import numpy as np
+
+from hvdc_ident.linearize import LinearModel, linearize
+from hvdc_ident.linearize.modal import named_modes, parts_of
 from hvdc_ident.models import load_model
 
 CASES = ("vsc-hvdc-avm", "vsc-hvdc-avm-unfiltered", "vsc-hvdc-avm-authors")
@@ -19,6 +21,13 @@ PATHS = {  # what: (input that moves both, from, to)
     "dc voltage measurement": ("Vdcref1", "Vdc1", "Vdc1_m"),
 }
 OMEGA = 1.0  # rad/s, far below every mode
+
+
+def path_delay(linear: LinearModel, source: str, before: str, after: str, omega: float = 1.0) -> float:
+    """The delay in s from one output to another at omega in rad/s, both driven by one input: -arg(after/before)/omega."""
+    response = linear.response(np.array([omega]))[0, :, linear.input_names.index(source)]
+    ratio = response[linear.output_names.index(after)] / response[linear.output_names.index(before)]
+    return float(-np.angle(ratio) / omega)
 
 
 def main(name: str) -> dict[str, Any]:

@@ -96,3 +96,146 @@ def test_a_model_without_rest_is_bad_input(study, tmp_path):
     (tmp_path / "smib.toml").write_text(SMIB.replace("value = 0.5", "value = 5.0"))
     result = run("linearize", study, "--out", tmp_path / "r")
     assert result.exit_code == 2 and "d(w)/dt" in result.output and "Traceback" not in result.output
+
+
+# --- what [linearize] asks for beside the linear model ---
+
+SERVO = """schema = 1
+name = "servo"
+[parameters]
+K = {value = 25.0}
+gain = {value = 1.0}
+[inputs]
+r = {value = 1.0}
+d = {value = 0.0}
+[states]
+x1 = {derivative = "x2"}
+x2 = {derivative = "x3"}
+x3 = {derivative = "u + d - 10*x1 - 10*x2 - 10*x3"}
+[signals]
+e = "r - y"
+u = "gain*e"
+y = "K*x1"
+[outputs]
+y = "y"
+e = "e"
+"""
+
+
+@pytest.fixture
+def servo(tmp_path):
+    """25/(s^3 + 10 s^2 + 10 s + 10) with unit feedback: the example of Seiler, Packard and Gahinet."""
+    (tmp_path / "servo.toml").write_text(SERVO)
+    (tmp_path / "other.toml").write_text(SERVO.replace("value = 25.0", "value = 20.0").replace('"servo"', '"other"'))
+    path = tmp_path / "study.toml"
+    path.write_text(
+        'schema = 1\nname = "servo"\n[model]\nsource = "servo.toml"\n[linearize]\ninputs = ["r"]\noutputs = ["y"]\n'
+    )
+    return path
+
+
+def linearization(study, tmp_path, text):
+    study.write_text(study.read_text() + text)
+    result = run("linearize", study, "--out", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    return json.loads((tmp_path / "r/linearization.json").read_text()), result.output
+
+
+def test_every_key_of_linearize_is_answered(servo, tmp_path):
+    data, shown = linearization(
+        servo,
+        tmp_path,
+        'break_at = "u"\nplant = {inputs = "u", outputs = "y"}\nreduce = {order = 2, match_dc = true}\n'
+        'compare = "other.toml"\nscale = {y = 2.0}\nformula = ["K"]\ntrim = {outputs = {y = 0.5}, free = ["r"]}\n'
+        '[[linearize.port]]\nname = "shaft"\nsource = "d"\nvoltage = "y"\ncurrent = "d"\nband = [0.01, 1]\n',
+    )
+    margins = data["margins"]["loops"]["u"]
+    assert margins["disk_margin"]["gain"] == pytest.approx(1.5942, abs=5e-5)  # published
+    assert margins["gain_margin"]["value"] == pytest.approx(3.6, rel=1e-9)  # 10 x 10 - 10 over 25
+    ncf = data["margins"]["ncf_margin"]
+    w = np.logspace(-3, 3, 20001) * 1j
+    p = 25 / (w**3 + 10 * w**2 + 10 * w + 10)
+    assert ncf["value"] == pytest.approx((np.abs(1 + p) / np.sqrt(2 * (1 + np.abs(p) ** 2))).min(), rel=1e-5)
+    assert ncf["value"] <= ncf["attainable"]
+    closed, other = p / (1 + p) / 2, 0.8 * p / (1 + 0.8 * p) / 2
+    chordal = np.abs(closed - other) / np.sqrt((1 + np.abs(closed) ** 2) * (1 + np.abs(other) ** 2))
+    assert data["comparison"]["nu_gap"] == pytest.approx(chordal.max(), rel=1e-5)
+    assert data["norms"]["whole"]["hinf"]["value"] == pytest.approx(np.abs(closed).max(), rel=1e-5)
+    assert data["reduced"]["order"] == 2 and data["reduced"]["error"]["value"] <= data["reduced"]["bound"]
+    assert data["trim"]["found"]["r"] == pytest.approx(0.5 * (10 + 25) / 25)
+    assert data["operating_point"]["outputs"]["y"] == pytest.approx(0.5)
+    assert "K" in data["formulas"][0]["numerator"]
+    rows = (tmp_path / "r/impedance.shaft.csv").read_text().splitlines()
+    f, re, im = (float(v) for v in rows[1].split(","))
+    assert complex(re, im) == pytest.approx(25 / ((1j * f) ** 3 + 10 * (1j * f) ** 2 + 10j * f + 35))
+    for words in (
+        "loop at u",
+        "coprime factor margin",
+        "nu-gap",
+        "reduced from 3 to 2",
+        "port shaft",
+        "trimmed to y = 0.5",
+    ):
+        assert words in shown
+    page = run("report", servo, "--out", tmp_path / "r")
+    assert page.exit_code == 0, page.output
+    text = (tmp_path / "r/report.html").read_text()
+    assert "Margins" in text and "nu-gap" in text and "Impedance at ports" in text and "Reduced from 3" in text
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('break_at = "nothing"', "break_at"),
+        ('break_at = "r"', "break_at"),
+        ('plant = {inputs = "u", outputs = "nothing"}', "plant"),
+        ("reduce = {order = 2, tolerance = 0.1}", "either order"),
+        ("reduce = {order = 9}", "out of range"),
+        ('compare = "nowhere.toml"', "nowhere.toml"),
+        ("scale = {x1 = 2.0}", "scale"),
+        ('formula = ["r"]', "formula"),
+        ("trim = {outputs = {y = 0.5}}", "free="),
+        ("trim = {outputs = {x1 = 0.5}}", "trim.outputs"),
+        ('port = [{name = "p", source = ["d"], voltage = ["y", "e"], current = ["d"]}]', "as many signals"),
+        ('port = [{name = "p", source = ["d"], voltage = ["nothing"], current = ["d"]}]', "voltage"),
+    ],
+)
+def test_what_linearize_cannot_do_is_said(servo, tmp_path, line, words):
+    servo.write_text(servo.read_text() + line + "\n")
+    result = run("linearize", servo, "--out", tmp_path / "r")
+    assert result.exit_code in (1, 2) and words in result.output and "Traceback" not in result.output
+
+
+def test_an_unstable_loop_has_no_margins(servo, tmp_path):
+    card = tmp_path / "servo.toml"
+    card.write_text(card.read_text().replace("gain = {value = 1.0}", "gain = {value = 4.0}"))
+    data, shown = linearization(servo, tmp_path, 'break_at = "u"\nplant = {inputs = "u", outputs = "y"}\n')
+    assert not data["margins"]["stable"] and data["margins"]["ncf_margin"]["value"] == 0.0
+    assert "not stable: they have no margins" in shown and data["norms"]["whole"]["hinf"] is None
+
+
+def test_screen_ranks_the_candidates(tmp_path):
+    """y = a u + 0.01 b: only a matters."""
+    pytest.importorskip("SALib")
+    (tmp_path / "m.toml").write_text(
+        'schema = 1\nname = "m"\n[parameters]\na = {value = 1.0}\nb = {value = 1.0}\n[inputs]\nu = {value = 0.0}\n'
+        '[states]\nx = {derivative = "a*u + 0.01*b - x"}\n[outputs]\ny = "x"\n'
+    )
+    t = np.linspace(0, 5, 51)
+    rows = "\n".join(
+        f"{a},{b},{c}" for a, b, c in zip(t, np.where(t < 1, 0.0, 1.0), 1.5 - 1.5 * np.exp(-t), strict=True)
+    )
+    (tmp_path / "d.csv").write_text("time,u,y\n" + rows + "\n")
+    path = tmp_path / "study.toml"
+    path.write_text(
+        'schema = 1\nname = "s"\n[model]\nsource = "m.toml"\n[parameters]\na = {min = 0.5, max = 2.5}\n'
+        'b = {min = 0.5, max = 2.5}\n[[experiment]]\nname = "step"\ndata = "d.csv"\ninputs = ["u"]\noutputs = ["y"]\n'
+        "noise = {y = 0.01}\n[screening]\ntrajectories = 6\n"
+    )
+    result = run("screen", path, "--out", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    measures = json.loads((tmp_path / "r/screening.json").read_text())["measures"]["y"]["step"]
+    assert measures["a"]["mu_star"] > 20 * measures["b"]["mu_star"]
+    path.write_text(path.read_text().replace("b = {min = 0.5, max = 2.5}", "b = {start = 1.0}"))
+    refused = run("screen", path, "--out", tmp_path / "q")
+    assert refused.exit_code == 2 and "no range" in refused.output

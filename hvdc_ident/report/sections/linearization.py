@@ -29,7 +29,15 @@ def _render(results: Results) -> str:
     if not modes:
         return ""
     point = data.get("operating_point") or {}
-    return _point(data, point) + _modes(modes) + _limits(point) + _bode(data)
+    return (
+        _point(data, point)
+        + _modes(modes)
+        + _limits(point)
+        + _bode(data)
+        + _margins(data)
+        + _ports(data)
+        + _others(data)
+    )
 
 
 def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
@@ -52,8 +60,12 @@ def _modes(modes: list[dict[str, Any]]) -> str:
         shares = sorted(m["participation"].items(), key=lambda item: -item[1])[:3]
         states = ", ".join(f"{n} {v:.2f}" for n, v in shares if v >= 0.05)
         value = number(re) if im == 0 else f"{number(re)} ± {number(im)}j"
-        rows.append([value, number(m["frequency_hz"]), number(m["damping"], 3), text(states), text(m.get("kind", ""))])
-    return table(["eigenvalue, rad/s", "frequency, Hz", "damping", "states that take part", "kind"], rows, words=(3, 4))
+        name = str(m.get("name", ""))
+        name = "" if name in m["participation"] or all(n in m["participation"] for n in name.split(" + ")) else name
+        row = [value, number(m["frequency_hz"]), number(m["damping"], 3), text(name), text(states)]
+        rows.append([*row, text(m.get("kind", ""))])
+    header = ["eigenvalue, rad/s", "frequency, Hz", "damping", "mode of", "states that take part", "kind"]
+    return table(header, rows, words=(3, 4, 5))
 
 
 def _limits(point: dict[str, Any]) -> str:
@@ -95,6 +107,119 @@ def _bode(data: dict[str, Any]) -> str:
         axes.grid(True, color="#dddddd", linewidth=0.5)
         axes.yaxis.set_label_coords(-0.08, 0.5)
     return f"<figure>{svg(fig, 'Bode diagram of the linear model')}</figure>"
+
+
+def _hertz(omega: Any) -> str:
+    return number(omega / (2 * np.pi)) if isinstance(omega, int | float) else number(omega)
+
+
+def _margins(data: dict[str, Any]) -> str:
+    """The margins of each loop, of all at once, and of plant and controller."""
+    found = data.get("margins")
+    if not found:
+        return ""
+    page = "<h3>Margins</h3>"
+    if found.get("stable") is False:
+        page += "<p>The closed loops are not stable: they have no margins.</p>"
+    elif found.get("loops"):
+        rows = []
+        for name, m in found["loops"].items():
+            gain, phase, disk = m["gain_margin"], m["phase_margin_deg"], m["disk_margin"]
+            delay = m["delay_margin_s"]["value"]
+            rows.append(
+                [
+                    text(name),
+                    number(gain["value"]) if gain["value"] is not None else "unlimited",
+                    number(phase["value"]) if phase["value"] is not None else "unlimited",
+                    _hertz(phase["omega"]),
+                    number(1e3 * delay) if delay is not None else "unlimited",
+                    number(m["modulus_margin"]["value"], 3),
+                    number(disk["value"], 3),
+                ]
+            )
+        header = ["loop opened at", "gain", "phase, degrees", "at, Hz", "delay, ms", "modulus", "disk"]
+        page += table(header, rows)
+        if len(rows) > 1:
+            disk = found["disk_margin"]
+            page += (
+                f"<p>All loops at once: disk margin {number(disk['value'], 3)} at {_hertz(disk['omega'])} Hz, so every gain "
+                f"may change by a factor of {number(disk['gain'], 3)} and every phase by {number(disk['phase_deg'], 3)} "
+                "degrees, either way and independently.</p>"
+            )
+    if "ncf_margin" in found:
+        n = found["ncf_margin"]
+        page += (
+            f"<p>Between plant ({text(', '.join(n['inputs']))} to {text(', '.join(n['outputs']))}) and controller the "
+            f"normalised coprime factor margin is {number(n['value'])}; the largest that any controller attains is "
+            f"{number(n['attainable'])}.</p>"
+        )
+    return page
+
+
+def _ports(data: dict[str, Any]) -> str:
+    """The size of each port's impedance over frequency, and whether it is passive."""
+    ports = data.get("ports") or []
+    if not ports:
+        return ""
+    fig = figure(7.5, 2.9, {"left": 0.1, "right": 0.99, "bottom": 0.17, "top": 0.97})
+    axes = fig.subplots()
+    k, words = 0, []
+    for port in ports:
+        omega = np.array(port["omega"], dtype=float)
+        values = np.abs(np.array(port["real"], dtype=float) + 1j * np.array(port["imag"], dtype=float))
+        for i, o in enumerate(port["outputs"]):
+            for j, u in enumerate(port["inputs"]):
+                style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": LINES[k % len(LINES)]}
+                label = port["name"] if len(port["inputs"]) == 1 else f"{port['name']} {o}{u}"
+                axes.loglog(omega / (2 * np.pi), np.maximum(values[:, i, j], 1e-12), label=label, **style)
+                k += 1
+        least = port["least_real_part"]
+        side = "passive over the band" if least["value"] >= 0 else "not passive"
+        words.append(
+            f"{text(port['name'])} is {side}: the least real part is {number(least['value'])} at "
+            f"{_hertz(least['omega'])} Hz"
+        )
+    axes.set_xlabel("frequency, Hz")
+    axes.set_ylabel("impedance")
+    axes.legend(fontsize="small")
+    axes.grid(True, color="#dddddd", linewidth=0.5)
+    drawn = svg(fig, "Impedance of the ports over frequency")
+    return f"<h3>Impedance at ports</h3><figure>{drawn}</figure><p>{'; '.join(words)}.</p>"
+
+
+def _others(data: dict[str, Any]) -> str:
+    """The comparison with another model, and the reduced model, in a sentence each."""
+    page = ""
+    c = data.get("comparison")
+    if c:
+        winding = (
+            ""
+            if c["winding"] == 0
+            else "; the winding condition fails, so that no controller of one need suit the other"
+        )
+        attainable = c.get("attainable_margin")
+        room = (
+            "" if attainable is None else f" (any controller of this one has a margin of at most {number(attainable)})"
+        )
+        apart = c.get("difference")
+        gain = (
+            "" if not apart else f" The gains differ by up to {number(apart['value'])}, at {_hertz(apart['omega'])} Hz."
+        )
+        page += (
+            f"<p>Against {text(c['other'])}: nu-gap {number(c['nu_gap'])}{room}, largest at {_hertz(c['omega'])} Hz"
+            f"{winding}.{gain}</p>"
+        )
+    r = data.get("reduced")
+    if r:
+        dc = ", with the dc gain kept" if r["match_dc"] else ""
+        page += (
+            f"<p>Reduced from {r['states_before']} to {r['order']} states{dc}: the gain differs by up to "
+            f"{number(r['error']['value'])} (bound {number(r['bound'])}).</p>"
+        )
+    for f in data.get("formulas") or []:
+        shown = f.get("reason") or f"({f['numerator']}) / ({f['denominator']})"
+        page += f"<p>{text(f['output'])} from {text(f['input'])}: <code>{text(shown)}</code></p>"
+    return page
 
 
 SECTION = Section(order=25, title="Linear model", render=_render)

@@ -23,16 +23,17 @@ MOST_DRAWN = 12
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for."""
     from hvdc_ident.linearize import jacobian_error
+    from hvdc_ident.study.linear import analyses, modes_of
 
     model = linear_model(study)
     point = model.point
     assert point is not None
-    options.progress(1, 2, "modes and transfer functions")
+    options.progress(1, 3, "modes and transfer functions")
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     data = {
         **model.to_dict(),
         "operating_point": point.to_dict(),
-        "modes": [m.to_dict() for m in model.modes()],
+        "modes": modes_of(study, model),
         "transfer_functions": [f.to_dict() for f in functions],
         "method": model.provenance["method"],
         "jacobian_error": jacobian_error(point.model, point, model.output_names),
@@ -40,24 +41,34 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     }
     if len(functions) <= MOST_DRAWN:
         data["frequency_response"] = model.bode().to_dict()
+    options.progress(2, 3, "norms, margins, ports and comparisons")
+    more, files = analyses(study, model)
+    data |= more
     for key in ("schema", "kind", "model"):
         data.pop(key, None)
-    return Outcome(data)
+    return Outcome(data, files)
 
 
 def linear_model(study: Study) -> LinearModel:
     """The linear model that a study's [linearize] asks for; without that table between all inputs and outputs."""
-    from hvdc_ident.linearize import find_operating_point, linearize
+    from hvdc_ident.linearize import linearize
+    from hvdc_ident.study.linear import operating_point
 
     asked = study.settings.linearize
-    point = find_operating_point(study.model, study.values, at=asked.at if asked else "steady")
     return linearize(
         study.model,
-        point,
+        operating_point(study),
         inputs=asked.inputs if asked else None,
         outputs=asked.outputs if asked else None,
         sensitivities=list(study.candidates),
     )
+
+
+def told(data: Mapping[str, Any]) -> list[str]:
+    """The operating point, the modes that oscillate, then margins, ports, comparison and reduction."""
+    from hvdc_ident.study.linear import lines
+
+    return lines(data)
 
 
 STAGE = Stage(
@@ -67,4 +78,5 @@ STAGE = Stage(
     run=run,
     wanted=lambda study: study.settings.linearize is not None,
     order=20,
+    tell=told,
 )

@@ -1,0 +1,36 @@
+"""Which parameters matter over their whole ranges: a table of the screening's measures."""
+
+from __future__ import annotations
+
+from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.results import Results
+from hvdc_ident.report.section import Section
+
+COLUMNS = {
+    "morris": {"mu_star": "mean size of the effect", "mu": "mean effect", "sigma": "spread of the effect"},
+    "sobol": {"S1": "share by itself", "ST": "share with the others"},
+}
+
+
+def _render(results: Results) -> str:
+    data = results.get("screening")
+    if not data.get("measures"):
+        return ""
+    columns = COLUMNS[data["method"]]
+    first = next(iter(columns))
+    rows = []
+    for output, line in data["measures"].items():
+        for experiment, measures in line.items():
+            for p in sorted(measures, key=lambda n: -measures[n][first]):
+                values = [number(measures[p][n], 3) for n in columns]
+                rows.append([text(output), text(experiment), text(p), *values])
+    method = "Morris' elementary effects" if data["method"] == "morris" else "Sobol's indices"
+    against = "the recordings" if data["against"] == "data" else "the model's own run"
+    head = (
+        f"<p>{method} of the RMSE against {against}, every parameter over its whole range; {data['evaluations']} runs, "
+        f"{data['failed']} failed.</p>"
+    )
+    return head + table(["output", "experiment", "parameter", *columns.values()], rows, words=(0, 1, 2))
+
+
+SECTION = Section(order=27, title="Global sensitivity", render=_render)

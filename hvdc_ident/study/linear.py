@@ -1,0 +1,328 @@
+"""What a study's [linearize] asks for beside the linear model: trimming, margins, norms, ports, comparison, reduction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from hvdc_ident.errors import HvdcIdentError, StudyError, unknown_name
+from hvdc_ident.model.definition import Model
+from hvdc_ident.study import schema
+
+if TYPE_CHECKING:
+    from hvdc_ident.linearize import LinearModel, OperatingPoint
+    from hvdc_ident.linearize.port import Port
+    from hvdc_ident.study.study import Study
+
+MOST_NORMS = 12
+"""Channels up to which the norms of each are given beside those of the whole."""
+
+
+def check_linear(study: Study, where: str) -> None:
+    """Raise StudyError or UnknownNameError where [linearize] names what the model lacks."""
+    asked, model = study.settings.linearize, study.model
+    if asked is None:
+        return
+    place = f"{where}, linearize"
+    inner = [*model.states]
+    if isinstance(model, Model):
+        inner += [*model.signals, *model.algebraic]
+    elif asked.break_at or asked.plant or asked.port or asked.formula:
+        raise StudyError(
+            "loops, ports and formulas need the model's equations",
+            where=place,
+            expected="a model card or a shipped model",
+            got="an FMU",
+            hint="leave break_at, plant, port and formula out",
+        )
+    trim = asked.trim
+    if trim is not None:
+        _known("output", trim.outputs, model.outputs, f"{place}.trim.outputs")
+        _known("input", trim.inputs, model.inputs, f"{place}.trim.inputs")
+        _known("input or parameter", trim.free, [*model.inputs, *model.parameters], f"{place}.trim.free")
+    _known("signal", asked.break_at, inner, f"{place}.break_at")
+    if asked.plant:
+        _known("signal", [*asked.plant.inputs, *asked.plant.outputs], inner, f"{place}.plant")
+    channels = [*(asked.inputs or model.inputs), *(asked.outputs or model.outputs)]
+    _known("input or output of [linearize]", asked.scale, channels, f"{place}.scale")
+    _known("parameter", asked.formula, model.parameters, f"{place}.formula")
+    for port in asked.port:
+        _check_port(port, study, f"{place}.port '{port.name}'")
+    names = [p.name for p in asked.port]
+    doubled = next((n for n in names if names.count(n) > 1), None)
+    if doubled is not None:
+        raise StudyError(f"two ports are called '{doubled}'", where=place)
+    if study.compared is not None:
+        _known("input", asked.inputs or model.inputs, study.compared.inputs, f"{place}.compare '{study.compared.name}'")
+        _known("output", asked.outputs or model.outputs, study.compared.outputs, f"{place}.compare")
+
+
+def _check_port(port: schema.Port, study: Study, where: str) -> None:
+    from hvdc_ident.expression import parse
+
+    model = study.model
+    assert isinstance(model, Model)
+    _known("signal", port.source, model.slots, f"{where}, source")
+    known = [*model.inputs, *model.states, *model.signals, *model.algebraic, *model.parameters]
+    for key, texts in (("voltage", port.voltage), ("current", port.current), ("angle", [port.angle])):
+        for text in texts:
+            try:
+                names = sorted(s.name for s in parse(text).free_symbols)
+            except HvdcIdentError as e:
+                raise e.at(f"{where}, {key}") from None
+            _known("name", names, known, f"{where}, {key}")
+
+
+def _known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str) -> None:
+    for name in names or ():
+        if name not in known:
+            raise unknown_name(kind, name, known, where=where)
+
+
+def operating_point(study: Study, values: Mapping[str, float] | None = None) -> OperatingPoint:
+    """Return the operating point that [linearize] asks for: at rest, at the given starts, or trimmed.
+
+    values: of the candidates; left out, those of a plain simulation.
+    """
+    from hvdc_ident.linearize import find_operating_point
+
+    asked = study.settings.linearize
+    at = asked.at if asked else "steady"
+    fixed = dict(study.values if values is None else values)
+    if asked is None or asked.trim is None:
+        return find_operating_point(study.model, fixed, at=at)
+    trim = asked.trim
+    free = trim.free or ()
+    return find_operating_point(
+        study.model,
+        {n: v for n, v in fixed.items() if n not in free},
+        free,
+        guess={n: v for n, v in fixed.items() if n in free},
+        inputs=trim.inputs,
+        outputs=trim.outputs,
+        at=at,
+    )
+
+
+def modes_of(study: Study, linear: LinearModel) -> list[dict[str, Any]]:
+    """Return every mode as plain numbers, with a name from the parts of the plant that take part in it where these are known."""
+    from hvdc_ident.linearize.modal import named, parts_of
+
+    if not isinstance(study.model, Model):
+        return [m.to_dict() for m in linear.modes()]
+    parts = parts_of(study.model)
+    modes = [named(m, parts) for m in linear.modes()]
+    return [{**m.mode.to_dict(), "name": m.name, "parts": dict(m.parts)} for m in modes]
+
+
+def analyses(study: Study, linear: LinearModel) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what is asked for beside the linear model, by key of the JSON, and the files to write beside it by name."""
+    asked = study.settings.linearize or schema.Linearize()
+    scaled = linear.scaled(asked.scale)
+    data: dict[str, Any] = {"norms": _norms(scaled)}
+    files: dict[str, str] = {}
+    if asked.scale:
+        data["scale"] = dict(asked.scale)
+    if asked.trim is not None:
+        data["trim"] = _trimmed(asked.trim, linear)
+    if asked.break_at or asked.plant:
+        data["margins"] = _margins(asked, linear)
+    if asked.reduce is not None:
+        data["reduced"] = _reduced(asked.reduce, scaled)
+    if study.compared is not None:
+        data["comparison"] = _compared(study, scaled)
+    if asked.formula:
+        data["formulas"] = _formulas(study, linear, asked.formula)
+    if asked.port:
+        data["ports"], files = _ports(asked.port, linear)
+    return data, files
+
+
+def _norms(linear: LinearModel) -> dict[str, Any]:
+    """Norms of the whole, and of each channel where these are few."""
+    pairs = [(i, o) for o in linear.output_names for i in linear.input_names]
+    found: dict[str, Any] = {"whole": linear.norms()}
+    if len(pairs) <= MOST_NORMS:
+        found["channels"] = [{"input": i, "output": o, **linear.channel(i, o).norms()} for i, o in pairs]
+    return found
+
+
+def _trimmed(trim: schema.Trim, linear: LinearModel) -> dict[str, Any]:
+    point = linear.point
+    assert point is not None
+    free = trim.free
+    if free is None:
+        own = point.search
+        moved = [n for n, i in point.model.inputs.items() if n not in trim.inputs and point.inputs[n] != i.value]
+        free = moved if own is None else [own.system.inputs[k] for k in own.freed_u]
+    found = {**point.inputs, **point.parameters}
+    return {"outputs": dict(trim.outputs), "inputs": dict(trim.inputs), "found": {n: found[n] for n in free}}
+
+
+def _margins(asked: schema.Linearize, linear: LinearModel) -> dict[str, Any]:
+    from hvdc_ident.linearize.gap import ncf_margin
+    from hvdc_ident.linearize.loop import loop, plant_and_controller
+    from hvdc_ident.linearize.margins import loop_margins
+
+    point = linear.point
+    assert point is not None and isinstance(point.model, Model)
+    found: dict[str, Any] = {}
+    if asked.break_at:
+        found = loop_margins(loop(point.model, asked.break_at, point)).to_dict()
+    if asked.plant:
+        plant, controller = plant_and_controller(point.model, asked.plant.inputs, asked.plant.outputs, point)
+        found["ncf_margin"] = {
+            **ncf_margin(plant, controller).to_dict(),
+            "attainable": ncf_margin(plant).value,
+            "inputs": asked.plant.inputs,
+            "outputs": asked.plant.outputs,
+        }
+    return found
+
+
+def _reduced(asked: schema.Reduce, linear: LinearModel) -> dict[str, Any]:
+    """The reduced model with the error it has and the bound that was known beforehand."""
+    from hvdc_ident.linearize.compare import difference
+    from hvdc_ident.linearize.norms import linf_norm
+
+    found = linear.reduce(asked.order, asked.tolerance, match_dc=asked.match_dc)
+    error = linf_norm(difference(linear, found.model)).to_dict()
+    return {**found.to_dict(), "error": error, "states_before": len(linear.state_names)}
+
+
+def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:
+    """The other model's linear model at the same inputs and, by name, parameters, against this one's."""
+    from hvdc_ident.linearize import find_operating_point, linearize
+    from hvdc_ident.linearize.compare import compare
+
+    point, other = linear.point, study.compared
+    assert point is not None and other is not None
+    same = {n: v for n, v in point.inputs.items() if n in other.inputs}
+    at = find_operating_point(other, same)
+    second = linearize(other, at, inputs=linear.input_names, outputs=linear.output_names)
+    asked = study.settings.linearize
+    return compare(linear, second.scaled(asked.scale if asked else {})).to_dict()
+
+
+def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[dict[str, Any]]:
+    """Each transfer function with some parameters as symbols; where there is none, the reason."""
+    from hvdc_ident.errors import LinearizationError
+    from hvdc_ident.linearize.symbolic import symbolic_transfer
+
+    model = study.model
+    assert isinstance(model, Model)
+    found: list[dict[str, Any]] = []
+    for o in linear.output_names:
+        for i in linear.input_names:
+            try:
+                f = symbolic_transfer(model, i, o, parameters, linear.point)
+            except LinearizationError as e:
+                found.append({"input": i, "output": o, "reason": e.what})
+            else:
+                top, bottom = f.rounded()
+                found.append({"input": i, "output": o, "numerator": top, "denominator": bottom, "latex": f.latex()})
+    return found
+
+
+def port_of(table: schema.Port) -> Port:
+    """Return the port that a table of the study describes."""
+    from hvdc_ident.linearize.port import Port
+
+    source, voltage, current = (
+        (v[0], v[1]) if len(v) == 2 else (v[0],) for v in (table.source, table.voltage, table.current)
+    )
+    return Port(source, voltage, current, table.angle)
+
+
+def _ports(tables: list[schema.Port], linear: LinearModel) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """The impedance of each port, and a file of each."""
+    import numpy as np
+
+    from hvdc_ident.linearize.export.csv_response import text
+    from hvdc_ident.linearize.port import port_impedance
+
+    point = linear.point
+    assert point is not None and isinstance(point.model, Model)
+    found, files = [], {}
+    for table in tables:
+        omega = 2 * np.pi * np.geomspace(table.band[0], table.band[1], table.points)
+        z = port_impedance(point.model, port_of(table), omega, point)
+        passive = np.linalg.eigvalsh(z.values + np.conj(np.swapaxes(z.values, 1, 2)))[:, 0] / 2
+        k = int(np.argmin(passive))
+        found.append(
+            {
+                "name": table.name,
+                **z.to_dict(),
+                "least_real_part": {"value": float(passive[k]), "omega": float(omega[k])},
+            }
+        )
+        files[f"impedance.{table.name}.csv"] = text(z)
+    return found, files
+
+
+def lines(data: Mapping[str, Any]) -> list[str]:
+    """Return the lines that the stage prints."""
+    values = [complex(*m["eigenvalue"]) for m in data["modes"] if "sliding mean" not in str(m["kind"])]
+    right = max((v.real for v in values), default=None)
+    found = []
+    if right is not None:
+        verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
+        found.append(f"operating point: {verdict}, rightmost eigenvalue {right:.4g} 1/s")
+    for m in data["modes"]:
+        if m["eigenvalue"][1] > 0:
+            shares = sorted(m["participation"], key=lambda n: -m["participation"][n])[:3]
+            found.append(f"mode at {m['frequency_hz']:.4g} Hz, damping {100 * m['damping']:.3g} %: {', '.join(shares)}")
+    if "trim" in data:
+        wanted = ", ".join(f"{n} = {v:g}" for n, v in data["trim"]["outputs"].items())
+        made = ", ".join(f"{n} = {v:.6g}" for n, v in data["trim"]["found"].items())
+        found.append(f"trimmed to {wanted}: {made or 'nothing had to move'}")
+    found += _margin_lines(data.get("margins", {}))
+    for port in data.get("ports", ()):
+        least = port["least_real_part"]
+        side = "passive" if least["value"] >= 0 else "not passive"
+        found.append(
+            f"port {port['name']}: {side} over the band, least real part {least['value']:.4g} at "
+            f"{least['omega'] / math.tau:.4g} Hz"
+        )
+    if "comparison" in data:
+        c = data["comparison"]
+        found.append(
+            f"against {c['other']}: nu-gap {c['nu_gap']:.4g}"
+            + ("" if c["winding"] == 0 else " (the winding condition fails)")
+            + ("" if c["attainable_margin"] is None else f", attainable margin {c['attainable_margin']:.4g}")
+        )
+    if "reduced" in data:
+        r = data["reduced"]
+        found.append(
+            f"reduced from {r['states_before']} to {r['order']} states: error {r['error']['value']:.4g}, bound "
+            f"{r['bound']:.4g}" + (", dc gain matched" if r["match_dc"] else "")
+        )
+    for f in data.get("formulas", ()):
+        text = f.get("reason") or f"({f['numerator']}) / ({f['denominator']})"
+        found.append(f"{f['output']} from {f['input']}: {text}")
+    return found
+
+
+def _margin_lines(found: Mapping[str, Any]) -> list[str]:
+    """The margins of each loop, of all together, and of plant and controller."""
+    if not found:
+        return []
+    result = []
+    if "stable" in found and not found["stable"]:
+        result.append("the closed loops are not stable: they have no margins")
+    for name, m in (found.get("loops") or {}).items() if found.get("stable") else ():
+        gain, phase, disk = m["gain_margin"], m["phase_margin_deg"], m["disk_margin"]
+        first = "unlimited" if gain["value"] is None or gain["value"] > 1e12 else f"{gain['value']:.4g}"
+        second = "unlimited" if phase["value"] is None or abs(phase["value"]) > 360 else f"{phase['value']:.4g} degrees"
+        crossover = "" if second == "unlimited" else f" at {phase['omega'] / math.tau:.4g} Hz"
+        result.append(
+            f"loop at {name}: gain margin {first}, phase margin {second}{crossover}, disk {disk['value']:.3g}"
+        )
+    if found.get("stable") and len(found["loops"]) > 1:
+        disk = found["disk_margin"]
+        result.append(f"all loops at once: disk margin {disk['value']:.3g}, phase {disk['phase_deg']:.3g} degrees")
+    if "ncf_margin" in found:
+        n = found["ncf_margin"]
+        result.append(f"coprime factor margin {n['value']:.4g}; the largest attainable {n['attainable']:.4g}")
+    return result

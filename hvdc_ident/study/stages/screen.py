@@ -1,0 +1,80 @@
+"""The stage `screen`: which candidates matter over their whole ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from hvdc_ident.study.stage import Options, Outcome, Stage
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+
+def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+    """Morris' elementary effects or Sobol's indices of each output's RMSE in each experiment."""
+    import math
+
+    from hvdc_ident.errors import StudyError
+    from hvdc_ident.sensitivity.global_screening import morris, sobol
+    from hvdc_ident.study.at_work import workers_of
+    from hvdc_ident.study.needs import need_candidates, need_experiments
+    from hvdc_ident.study.schema import Screening
+
+    need_experiments(study, "screen")
+    need_candidates(study, "screen")
+    asked = study.settings.screening or Screening()
+    names = asked.parameters or list(study.candidates)
+    ranges = {n: (study.candidates[n].min, study.candidates[n].max) for n in names}
+    open_ended = [n for n, r in ranges.items() if not (math.isfinite(r[0]) and math.isfinite(r[1]))]
+    if open_ended:
+        raise StudyError(
+            f"'{open_ended[0]}' has no range to be screened over",
+            where=f"{study.path.name}, parameters.{open_ended[0]}",
+            expected="min and max",
+            hint=f"{open_ended[0]} = {{min = ..., max = ...}}, or leave it out of [screening] parameters",
+        )
+    with workers_of(options) as pool:
+        common: dict[str, Any] = {
+            "against": asked.against,
+            "values": study.values,
+            "seed": options.seed,
+            "executor": pool,
+            "progress": options.progress,
+        }
+        asked_for = (study.model, study.experiments, ranges)
+        if asked.method == "morris":
+            found = morris(*asked_for, trajectories=asked.trajectories, **common)
+        else:
+            found = sobol(*asked_for, samples=asked.samples, **common)
+    data = {
+        **found.to_dict(),
+        "against": asked.against,
+        "ranges": {n: list(r) for n, r in ranges.items()},
+        "units": {o: study.model.outputs[o].unit for o, _ in found.series},
+    }
+    return Outcome(data)
+
+
+def told(data: Mapping[str, Any]) -> Sequence[str]:
+    """The parameters of each output and experiment, the one that matters most first."""
+    name, text = ("mu_star", "mean effect") if data["method"] == "morris" else ("ST", "total share")
+    found = [f"{data['evaluations']} runs, {data['failed']} failed"]
+    for output, line in data["measures"].items():
+        for experiment, measures in line.items():
+            order = sorted(measures, key=lambda p: -measures[p][name])
+            unit = f" {data['units'][output]}".rstrip() if name == "mu_star" else ""
+            listed = ", ".join(f"{p} {measures[p][name]:.3g}{unit}" for p in order)
+            found.append(f"{output} in {experiment}, {text} on the RMSE: {listed}")
+    return found
+
+
+STAGE = Stage(
+    name="screen",
+    file="screening.json",
+    summary="Which candidates matter over their whole ranges.",
+    run=run,
+    wanted=lambda study: study.settings.screening is not None,
+    order=27,
+    tell=told,
+)
