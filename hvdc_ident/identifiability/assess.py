@@ -70,6 +70,7 @@ def identifiability(
     )
     optimum, result = pilot(first, starts=starts, seed=seed, executor=executor, progress=progress)
     _data_notes(so_far, optimum, result)
+    so_far.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
     left = narrow.insensitive(so_far, optimum)
     left = narrow.lost(so_far, left) if left else None
     last = narrow.profiled(so_far, left, executor) if left else None
@@ -166,6 +167,7 @@ def _assembled(
         bootstrap=resampled,
         sensitivities=_sensitivities(so_far, whole),
         not_judged=unjudged,
+        optima=so_far.optima,
     )
 
 

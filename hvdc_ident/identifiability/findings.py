@@ -9,6 +9,7 @@ from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.executor import Progress
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.identifiability.combinations import Combination
+from hvdc_ident.identifiability.optima import OtherOptimum
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.verdicts import Verdict
 
@@ -19,6 +20,7 @@ class Findings:
 
     problem: all candidates free. found: the first verdict on each. held: reason by parameter. remark: said of every
     parameter. quiet: whether no input moves. unmoved: parameters that show only where an input is moved that was not.
+    ends: where the starts of the pilot fit ended, with their costs. optima: others as good as the last one.
     """
 
     problem: Problem
@@ -33,6 +35,8 @@ class Findings:
     remark: str = ""
     quiet: bool = False
     unmoved: tuple[str, ...] = ()
+    ends: tuple[tuple[Mapping[str, float], float], ...] = ()
+    optima: tuple[OtherOptimum, ...] = ()
 
     def __post_init__(self) -> None:
         self.free: dict[str, Free] = {f.name: f for f in self.problem.free}

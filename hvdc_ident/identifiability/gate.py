@@ -71,8 +71,8 @@ def gated_fit(
 ) -> FitResult:
     """The fit of the identifiable set, its estimates as the report allows them to be stated.
 
-    report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak parameters get the profile's interval
-    and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
+    report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak and local parameters get the profile's
+    interval and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
     whole: whether the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
     Where nothing is left to fit the status is "failed" and the message says so. One that is held on a bound makes the
     status "at-bound", for that is where the fit of all would have ended.
@@ -122,6 +122,8 @@ def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate, *,
     other_set = bool(through.forced) or not whole
     if interval is None or (other_set and not weak):
         return replace(e, std=None, std_raw=None) if weak else e
+    if line["verdict"] == "locally-identifiable" and not interval[0] <= e.value <= interval[1]:
+        return replace(e, reason=f"at another optimum than the report's. {line['reason']}")
     if not interval[0] <= e.value <= interval[1]:
         return (
             replace(e, std=None, std_raw=None, ci95=None, method="none", reason="the fit and the pilot fit disagree")
@@ -131,7 +133,9 @@ def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate, *,
     if not weak:
         return replace(e, std=line["std"], ci95=interval, method="profile")
     note = " (its interval is that of the report's own fit, of all data and without forced ones)" if other_set else ""
-    return replace(e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"weak: {line['reason']}{note}")
+    return replace(
+        e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"{line['verdict']}: {line['reason']}{note}"
+    )
 
 
 def _interval(line: Mapping[str, Any]) -> tuple[float, float] | None:

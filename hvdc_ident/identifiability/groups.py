@@ -89,6 +89,7 @@ def _merged(a: IdentifiabilityReport, b: IdentifiabilityReport) -> Identifiabili
         notes=(*a.notes, *b.notes),
         pair=a.pair or b.pair,
         not_judged=(*a.not_judged, *b.not_judged),
+        optima=(*a.optima, *b.optima),
     )
 
 

@@ -23,8 +23,10 @@ from hvdc_ident.identifiability.evidence import (
     thresholds,
 )
 from hvdc_ident.identifiability.findings import Findings
+from hvdc_ident.identifiability.optima import other_optima
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.structure import Structure
+from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.sensitivity.fisher import (
     independent,
     inflation_index,
@@ -33,6 +35,10 @@ from hvdc_ident.sensitivity.fisher import (
     rise_over_range,
 )
 from hvdc_ident.trajectory import Array
+
+WORTH = 0.02
+"""A fall of the cost by less than this share of a threshold moves no interval: the walks of profiles restart from there too."""
+RESTARTS = 3
 
 
 def structural(so_far: Findings, structure: Structure) -> None:
@@ -97,6 +103,7 @@ def lost(so_far: Findings, optimum: Optimum) -> Optimum | None:
 
 def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | None = None) -> Optimum | None:
     """The optimum of the set all of whose profiles are closed, with a verdict on every member."""
+    better = 0
     while optimum is not None:
         limits = thresholds(optimum)
         so_far.thresholds |= limits
@@ -121,6 +128,16 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
         by_name = joint_limits(optimum, around.by_name, limits, again, seed=so_far.seed)
         opened = [n for n, p in by_name.items() if not bounded(p)]
         if not opened:
+            so_far.tell("other optima")
+            others = other_optima(optimum, limits, so_far.ends)
+            if others and others[0].rise < -WORTH * min(limits.values()) and better < RESTARTS:
+                so_far.notes.append(
+                    f"A better optimum was found, from elsewhere: the cost fell by {-others[0].rise:.3g}."
+                )
+                better += 1
+                optimum = Optimum(optimum.problem, np.array([others[0].values[n] for n in optimum.problem.names]))
+                continue
+            so_far.optima = others
             _closed(so_far, optimum, by_name, physical)
             return optimum
         combo = _open_combination(so_far, optimum, opened)
@@ -133,6 +150,14 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
             so_far.combinations.append(replace(combo, held=(victim,)))
         optimum = so_far.without(optimum, {victim: so_far.found[victim].reason})
     return None
+
+
+def _locally(so_far: Findings, judged: Verdict, profile: Profile) -> Verdict:
+    """The verdict, local where another optimum as good has a value outside the interval of this one."""
+    low, high = profile.lower.limit, profile.upper.limit
+    assert low is not None and high is not None
+    rivals = [o for o in so_far.optima if o.rise < profile.threshold and not low <= o.values[profile.name] <= high]
+    return verdicts.local(judged, [o.values[profile.name] for o in rivals], rivals[0].rise) if rivals else judged
 
 
 def _open_combination(so_far: Findings, optimum: Optimum, opened: Sequence[str]) -> Combination | None:
@@ -168,6 +193,7 @@ def _closed(
             continue
         best = max(shares, key=lambda e: shares[e][n])
         judged = verdicts.closed(p, free, spread[n].std, float(index[i]), partner(optimum, i), f"'{best}'", unit)
+        judged = _locally(so_far, judged, p)
         given = conditional.get(n, ())
         judged = replace(judged, conditional_on=given)
         if n in so_far.found:  # a member of a combination: its verdict stands, its interval is that of the set fitted

@@ -17,6 +17,7 @@ from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.heterogeneity import Heterogeneity, Misspecification
+from hvdc_ident.identifiability.optima import OtherOptimum
 from hvdc_ident.identifiability.recommend import Recommendation
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
@@ -35,8 +36,9 @@ class IdentifiabilityReport:
 
     parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
     reason of each other one. not_judged: those of the held that noise alone would tell, which only the misfit hides: a
-    diagnosis leaves them free. combinations: what is seen of those that cannot be told apart. collinear: subsets with
-    their index, worst first within each size. shares: of each parameter's information, by experiment.
+    diagnosis leaves them free. optima: others, of the set fitted, that are as good as the best within the noise.
+    combinations: what is seen of those that cannot be told apart. collinear: subsets with their index, worst first within
+    each size. shares: of each parameter's information, by experiment.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
     search met. bootstrap: the estimates of the set fitted, from experiments drawn anew, where there are enough.
     sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
@@ -61,6 +63,7 @@ class IdentifiabilityReport:
     bootstrap: Bootstrap | None = None
     sensitivities: LocalSensitivities | None = None
     not_judged: tuple[str, ...] = ()
+    optima: tuple[OtherOptimum, ...] = ()
 
     @property
     def conditional_on(self) -> dict[str, tuple[str, ...]]:
@@ -74,6 +77,7 @@ class IdentifiabilityReport:
             "parameters": {n: _verdict(v) for n, v in self.parameters.items()},
             "identifiable": list(self.identifiable),
             "not_judged": list(self.not_judged),
+            "optima": [{"values": dict(o.values), "cost_rise": o.rise} for o in self.optima],
             "held": {n: {"value": v, "reason": why} for n, (v, why) in self.held.items()},
             "combinations": [
                 {
@@ -181,6 +185,7 @@ def _verdict(v: Verdict) -> dict[str, Any]:
         "collinearity": v.collinearity,
         "partner": v.partner,
         "conditional_on": v.conditional_on,
+        "optima": list(v.optima),
     }
 
 

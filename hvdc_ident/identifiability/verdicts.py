@@ -18,6 +18,7 @@ VerdictName = Literal[
     "not-judged",
     "weak",
     "at-bound",
+    "locally-identifiable",
     "identifiable",
 ]
 WIDE = 0.5
@@ -36,7 +37,8 @@ class Verdict:
     std, relative_std: only of identifiable ones. sensitivity_norm: of its whitened, scaled column. collinearity: by how
     much the others widen its standard deviation. partner: the one most collinear with it. conditional_on: parameters
     held without which it could not be told. profile: the evidence. ci95_experiments: from experiments drawn anew.
-    scale: what widths are compared with, the value or, where 0 is admissible, the range.
+    scale: what widths are compared with, the value or, where 0 is admissible, the range. optima: its value at every optimum
+    that is as good, the best first, where there are several.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Verdict:
     profile: Profile | None = None
     ci95_experiments: tuple[float, float] | None = None
     scale: float | None = None
+    optima: tuple[float, ...] = ()
 
     def noted(self, *notes: str) -> Verdict:
         """The verdict with remarks added to its reason."""
@@ -165,6 +168,23 @@ def closed(
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
     relative = std / abs(profile.value) if profile.value else None
     return replace(judged, verdict="identifiable", reason=f"{text}.", std=std, relative_std=relative)
+
+
+def local(judged: Verdict, others: Sequence[float], rise: float) -> Verdict:
+    """Known about each of several optima, and not which: others, their values; rise: of the cost at the next best."""
+    low, high = judged.ci95 or (None, None)
+    assert low is not None and high is not None
+    half = 0.5 * (high - low)
+    values = tuple(dict.fromkeys(others))
+    unit = f" {judged.unit}" if judged.unit else ""
+    this = f"{_digits(judged.value, half)}{unit} (95 %: {_digits(low, half)} … {_digits(high, half)})"
+    other = " and ".join(f"{_digits(v, half)}{unit}" for v in values)
+    text = f"{this} explains these records, and so does {other} with other values beside it (cost higher by {max(rise, 0.0):.2g}): "
+    reason = f"{text}only other knowledge can choose."
+    if judged.verdict != "identifiable":
+        reason = f"{reason} About the first: {judged.reason.removeprefix('It is ')}"
+    optima = (judged.value, *values)
+    return replace(judged, verdict="locally-identifiable", reason=reason, std=None, relative_std=None, optima=optima)
 
 
 def _digits(value: float, half: float) -> str:
