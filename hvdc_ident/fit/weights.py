@@ -48,7 +48,7 @@ def weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tu
     rivals = distinct(problem, ends)[1:4]
     once = len(problem.outputs) == 1 and problem.loss.linear and not problem.priors
     for _ in range(20):
-        weights = _misfit_weights(problem, best.theta, open_outputs)
+        weights = misfit_weights(problem, best.theta, open_outputs)
         settled = all(abs(weights[o] / problem.weights.get(o, np.inf) - 1.0) < 0.01 for o in open_outputs)
         problem = problem.with_(weights={**problem.weights, **weights})
         if once or settled:
@@ -98,7 +98,7 @@ def cost_of(problem: Problem, theta: Array) -> float | None:
     return 0.5 * float(r @ r)
 
 
-def _misfit_weights(problem: Problem, theta: Array, outputs: Sequence[str]) -> dict[str, float]:
+def misfit_weights(problem: Problem, theta: Array, outputs: Sequence[str]) -> dict[str, float]:
     """The RMSE of each output over all its records, freed of the fitted unknowns' share, in its unit.
 
     For a whitened problem it is the standard deviation of the whitened residual that becomes 1. With a robust loss the

@@ -115,7 +115,7 @@ def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
     if n < FEWEST:
         return ()
     most = min(most, n // 10)
-    covariance = [sum(float(r[k:] @ r[: r.size - k]) for r in records) / n for k in range(most + 1)]
+    covariance = [sum(float(r[k:] @ r[: max(r.size - k, 0)]) for r in records) / n for k in range(most + 1)]
     if covariance[0] <= 0:
         return ()
     best: tuple[float, AR] = (n * np.log(covariance[0]), ())

@@ -17,10 +17,10 @@ from hvdc_ident.fit.profile import Walk
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability import narrow, verdicts
-from hvdc_ident.identifiability.evidence import pair_of, told_by_noise
+from hvdc_ident.identifiability.evidence import pair_of, thresholds, told_by_noise
 from hvdc_ident.identifiability.findings import Findings
 from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogeneity, misspecification
-from hvdc_ident.identifiability.pilot import Optimum, pilot
+from hvdc_ident.identifiability.pilot import Optimum, pilot, unfitted
 from hvdc_ident.identifiability.recommend import Recommendation, recommend
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structure import Structure
@@ -63,15 +63,16 @@ def identifiability(
     so_far.tell("structure")
     structure = structure_of(subject if isinstance(subject, Model) else None, problem, seed)
     narrow.structural(so_far, structure)
-    first = replace(
-        problem,
-        free=tuple(f for f in problem.free if f.name not in so_far.held),
-        held=problem.held | {n: so_far.free[n].start for n in so_far.held},
-    )
-    optimum, result = pilot(first, starts=starts, seed=seed, executor=executor, progress=progress)
+    free = tuple(f for f in problem.free if f.name not in so_far.held)
+    if free:
+        first = replace(problem, free=free, held=problem.held | {n: so_far.free[n].start for n in so_far.held})
+        optimum, result = pilot(first, starts=starts, seed=seed, executor=executor, progress=progress)
+    else:
+        optimum, result = unfitted(problem)
     _data_notes(so_far, optimum, result)
     so_far.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
-    left = narrow.insensitive(so_far, optimum)
+    so_far.thresholds = thresholds(optimum)
+    left = narrow.insensitive(so_far, optimum) if free else None
     left = narrow.lost(so_far, left) if left else None
     last = narrow.profiled(so_far, left, executor) if left else None
     report = _assembled(so_far, structure, optimum, last, result, executor)

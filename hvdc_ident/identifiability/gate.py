@@ -103,12 +103,15 @@ def gated_fit(
 
 
 def _nothing_to_fit(report: Mapping[str, Any]) -> str:
-    text = "no candidate can be estimated from these data; every one is held, with its reason"
+    """Every candidate with its verdict, and what to do."""
+    said = ", ".join(f"{n} is {line['verdict']}" for n, line in report["parameters"].items())
     unjudged = report.get("not_judged", ())
+    diagnose = (
+        f"{', '.join(unjudged)} may be once the misfit is explained: run hvdc-ident diagnose; " if unjudged else ""
+    )
     return (
-        f"{text}; {', '.join(unjudged)} may be once the misfit is explained: run hvdc-ident diagnose"
-        if unjudged
-        else text
+        f"no candidate can be estimated from these data: {said}. Try: {diagnose}`hvdc-ident identify STUDY` says why and "
+        "what to measure next; --force NAME fits one all the same"
     )
 
 

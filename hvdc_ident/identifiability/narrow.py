@@ -59,7 +59,6 @@ def structural(so_far: Findings, structure: Structure) -> None:
 
 def insensitive(so_far: Findings, optimum: Optimum) -> Optimum | None:
     """The optimum without the parameters whose whole range changes nothing, confirmed by refits at both ends."""
-    so_far.thresholds = thresholds(optimum)
     matrix, names = optimum.information.matrix, optimum.names
     out: dict[str, str] = {}
     for i, n in enumerate(names):

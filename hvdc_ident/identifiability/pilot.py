@@ -18,6 +18,7 @@ from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
+from hvdc_ident.fit.weights import misfit_weights
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.sensitivity.fisher import Information
 from hvdc_ident.trajectory import Array
@@ -151,6 +152,27 @@ def pilot(
     return Optimum(weighted, np.array(theta, dtype=float)), result
 
 
+def unfitted(problem: Problem) -> tuple[Optimum, FitResult]:
+    """The start values in place of an optimum, where the structure leaves no candidate to fit.
+
+    Standard deviations that are not given are the misfit's there. Raises SimulationError as `pilot` does.
+    """
+    message = "no pilot fit, for the structure leaves no candidate to fit"
+    try:
+        weights = misfit_weights(problem, problem.start, _not_given(problem))
+    except SimulationError as error:
+        raise _failure(problem, str(error)) from None
+    weighted = problem.with_(weights={**problem.weights, **weights})
+    source = FrozenMap({o: source_of(problem.fitted_experiments, o) for o in problem.outputs})
+    result = FitResult("failed", message, (), FrozenMap(), FrozenMap(problem.held), noise_source=source)
+    return Optimum(weighted, problem.start), result
+
+
+def _not_given(problem: Problem) -> list[str]:
+    """The outputs whose standard deviation is not given."""
+    return [o for o in problem.outputs if source_of(problem.fitted_experiments, o) != GIVEN]
+
+
 def failing(problem: Problem) -> dict[str, SimulationError]:
     """The experiments that cannot be simulated at the start values, each with its error."""
     found = {}
@@ -181,4 +203,4 @@ def _failure(problem: Problem, message: str) -> SimulationError:
     )
 
 
-__all__ = ["Optimum", "failing", "pilot", "unknown_of"]
+__all__ = ["Optimum", "failing", "pilot", "unfitted", "unknown_of"]

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.errors import ComputationError, InputError, StudyError, unknown_name
+from hvdc_ident.errors import ComputationError, SteadyStateError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
@@ -85,9 +85,16 @@ def task_of(
     if "poles" in want or "bode" in want:
         from hvdc_ident.linearize import find_operating_point, linearize
 
+        try:
+            point = find_operating_point(model, base)
+        except SteadyStateError as e:
+            hint = 'want = ["rmse"], which needs no operating point, or base values in [model.values] that have one'
+            raise SteadyStateError(
+                e.what, where=f"sweep, {e.where}", expected=e.expected, got=e.got, hint=hint
+            ) from None
         at = linearize(
             model,
-            find_operating_point(model, base),
+            point,
             inputs=linear[0] if linear else None,
             outputs=linear[1] if linear else None,
         )
@@ -105,9 +112,7 @@ def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMa
         found = simulate(model, first, base, outputs=first.outputs or None).statistics.method
     except ComputationError:
         return "rosenbrock"
-    except InputError as e:
-        if type(e).__name__ != "SteadyStateError":
-            raise
+    except SteadyStateError:
         return "rosenbrock"
     return "explicit" if found == "explicit" else "rosenbrock"
 

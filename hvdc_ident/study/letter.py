@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hvdc_ident.errors import ComputationError
 from hvdc_ident.model.card import read_card
 from hvdc_ident.report.letter import STAGE, write_letter
 from hvdc_ident.report.results import Results
@@ -14,10 +15,14 @@ from hvdc_ident.study.study import Study
 
 
 def letter(study: Study, folder: Path, options: Options) -> tuple[Path, Done]:
-    """The path of the letter in the folder, and the diagnosis it tells of, which is run where the folder has none."""
+    """The path of the letter in the folder, and the diagnosis it tells of, which is run where the folder has none.
+
+    Raises ComputationError with the reason where the diagnosis fails.
+    """
     done = have_stage(study, "diagnose", folder, options)
-    if not done.failed:
-        attach(folder)
+    if done.failed:
+        raise ComputationError("there is no diagnosis to write a letter about", where="letter", got=done.failed)
+    attach(folder)
     return write_letter(folder), done
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.errors import HvdcIdentError, StudyError, unknown_name
+from hvdc_ident.errors import HvdcIdentError, SteadyStateError, StudyError, unknown_name
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study import schema
 
@@ -83,7 +83,8 @@ def _known(kind: str, names: Iterable[str] | None, known: Collection[str], where
 def operating_point(study: Study, values: Mapping[str, float] | None = None) -> OperatingPoint:
     """Return the operating point that [linearize] asks for: at rest, at the given starts, or trimmed.
 
-    values: of the candidates; left out, those of a plain simulation.
+    values: of the candidates; left out, those of a plain simulation. Raises SteadyStateError, with what a study can do
+    about it, where there is none.
     """
     from hvdc_ident.linearize import find_operating_point
 
@@ -91,7 +92,13 @@ def operating_point(study: Study, values: Mapping[str, float] | None = None) -> 
     at = asked.at if asked else "steady"
     fixed = dict(study.values if values is None else values)
     if asked is None or asked.trim is None:
-        return find_operating_point(study.model, fixed, at=at)
+        try:
+            return find_operating_point(study.model, fixed, at=at)
+        except SteadyStateError as e:
+            hint = "other values in [model.values], or a `guess` for the states in the model card"
+            if at == "steady":
+                hint += '; [linearize] at = "start" for states that have a start and never rest'
+            raise SteadyStateError(e.what, where=e.where, expected=e.expected, got=e.got, hint=hint) from None
     trim = asked.trim
     free = trim.free or ()
     return find_operating_point(

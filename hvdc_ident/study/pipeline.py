@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from hvdc_ident.errors import ComputationError
+from hvdc_ident.errors import ComputationError, HvdcIdentError, LinearizationError, SteadyStateError
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
 from hvdc_ident.study.store import exclusive, source_hash
@@ -54,15 +54,25 @@ def have_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
 def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
     """Every stage the study asks for, in order, written to the folder; those that stand there unchanged are kept.
 
-    A stage that fails ends the run of those that build on it; the others run.
+    A stage that fails ends the run of those that build on it; the others run. One that finds no steady state or linear
+    model where it needs it fails so, too, unless no other stage has a result: then its error is raised, with nothing
+    written.
     """
     done: dict[str, Done] = {}
+    refused: dict[str, SteadyStateError | LinearizationError] = {}
     with exclusive(folder):
         for wanted in (s for s in stages() if s.wanted(study)):
-            if any(done[b].failed for b in wanted.after if b in done):
+            if any(b in refused or (b in done and done[b].failed) for b in wanted.after):
                 continue
-            done[wanted.name] = _kept_or_run(study, wanted, folder, options)
-    return list(done.values())
+            try:
+                done[wanted.name] = _kept_or_run(study, wanted, folder, options)
+            except (SteadyStateError, LinearizationError) as error:
+                refused[wanted.name] = error
+        if refused and all(d.failed for d in done.values()):
+            raise next(iter(refused.values()))
+        for name, reason in refused.items():
+            done[name] = _written(study, stage(name), folder, options, _failed(reason))
+    return [done[s.name] for s in stages() if s.name in done]
 
 
 def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) -> None:
@@ -82,8 +92,16 @@ def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options) ->
 def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any]) -> Done:
     try:
         outcome = wanted.run(study, replace(options, folder=folder), earlier)
-    except ComputationError as e:
-        outcome = Outcome({"status": "failed", "message": str(e)}, failed=str(e))
+    except ComputationError as error:
+        outcome = _failed(error)
+    return _written(study, wanted, folder, options, outcome)
+
+
+def _failed(error: HvdcIdentError) -> Outcome:
+    return Outcome({"status": "failed", "message": str(error)}, failed=str(error))
+
+
+def _written(study: Study, wanted: Stage, folder: Path, options: Options, outcome: Outcome) -> Done:
     heading = heading_of(study, options.seed)
     mark = "" if outcome.failed else _mark(study, wanted, options)
     data = plain({**heading, "stage": wanted.name, "fingerprint": mark, "files": list(outcome.files), **outcome.data})

@@ -63,7 +63,11 @@ def fallback(search: Search, opened: Round) -> Fallback:
 def _places(search: Search, opened: Round) -> list[str]:
     """Slots inside the model that are heard at the outputs."""
     paths = opened.answers()
-    inner = [p for p in slot_signals(paths) if kind_of(opened.before.model, p) in ("signal", "algebraic")]
+    inner = [
+        p
+        for p in slot_signals(opened.before.model, paths)
+        if kind_of(opened.before.model, p) in ("signal", "algebraic")
+    ]
     inner = [p for p in inner if search.looks_at(p)]
     path = next(iter(paths.values()))
     heard = []
@@ -151,7 +155,7 @@ def _curve(search: Search, opened: Round) -> Fallback:
     """The hidden input over time or over a signal, whichever explains more for its number of knots."""
     paths, nominal = opened.answers(), opened.before.nominal()
     begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())
-    signals = source_signals(opened.before.model, slot_signals(paths))
+    signals = source_signals(opened.before.model, slot_signals(opened.before.model, paths))
     hats = over_time(paths)
 
     def shape(place: str, over: str, at: Array, functions: Sequence[Callable[[str, Path], Array]]) -> _Shape:

@@ -44,7 +44,7 @@ def filters(search: Search, found: Round, nominal: Nominal) -> tuple[Trial, ...]
     """Filters refitted where they score best, those that no chain of the catalogue's effects is: first a band alone, then one
     that is off below and above it too. nominal: the model before the round, projected."""
     paths, before = found.answers(), found.before
-    signals, times = slot_signals(paths, before.placed), [path.time for path in paths.values()]
+    signals, times = slot_signals(before.model, paths, before.placed), [path.time for path in paths.values()]
     everywhere = candidates(before.model, signals, times, ("filter",), search.places)
     whole = tuple(c for c in everywhere if found.reaches(c))
     scores = scored(nominal, whole, paths, bootstraps=0, seed=search.seed, executor=search.executor)

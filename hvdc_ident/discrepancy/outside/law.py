@@ -147,7 +147,7 @@ def _price(search: Search, found: Round) -> float:
 def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Form]:
     """Of every slot the terms that are chosen there; what brings most first."""
     before, nominal = found.before, found.before.nominal()
-    signals = slot_signals(paths, before.placed)
+    signals = slot_signals(before.model, paths, before.placed)
     sources = source_signals(before.model, signals)
     drawn = draws(before.problem, nominal.blocks, before.noise, nominal.fitted(), AGAIN, search.seed + 77)
     noise, price = nominal.projected(np.vstack(drawn)), _price(search, found)

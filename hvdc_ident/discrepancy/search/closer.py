@@ -33,7 +33,7 @@ def closer_look(
     before, found, options = opened.before, opened.candidates, search.options
     asked = [c for c in found if effects()[c.effect].scanned and _worth_a_scan(c) and wanted(c)]
     times = [a.time for a in opened.paths.values()]
-    signals = slot_signals(opened.paths, before.placed)
+    signals = slot_signals(before.model, opened.paths, before.placed)
     dense = [every_size(c, SlotSignal.of(times, signals[c.at[0]])) for c in asked]
     if all(isinstance(p, Along) for p in opened.paths.values()):
         dense += [widened(c) for c in found if not c.still and bent(c) and wanted(c)]

@@ -35,7 +35,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     options, nominal = search.options, before.nominal()
     search.tell(0, 1, f"round {number}: the model's answers at every slot")
     paths = runs(before.model, nominal)
-    signals = slot_signals(paths, before.placed)
+    signals = slot_signals(before.model, paths, before.placed)
     found = candidates(
         before.model,
         signals,

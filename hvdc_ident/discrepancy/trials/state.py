@@ -16,6 +16,7 @@ from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
 from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.trajectory import Array
 
 
@@ -98,11 +99,15 @@ class Round:
         return float(t[k]), self.scores.p(float(t[k])), k
 
 
-def slot_signals(paths: Mapping[str, Path], placed: Sequence[Placed] = ()) -> dict[str, tuple[Array, ...]]:
-    """The signal at every slot that all experiments have, one array an experiment.
+def slot_signals(
+    model: AnyModel, paths: Mapping[str, Path], placed: Sequence[Placed] = ()
+) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot of the model that all experiments have, one array an experiment.
 
-    placed: effects that are in the model already; nothing is looked for inside them.
+    An instrument has slots of its own in the run of its experiment, which are none of the model's. placed: effects that
+    are in the model already; nothing is looked for inside them.
     """
-    common = [p for p in next(iter(paths.values())).slots if all(p in a.slots for a in paths.values())]
+    first, *others = (a.slots for a in paths.values())
+    common = [p for p in first if p in model.slots and all(p in slots for slots in others)]
     outer = [p for p in common if not any(one.use.made(p) for one in placed)]
     return {p: tuple(a.signal(p) for a in paths.values()) for p in outer}

@@ -79,7 +79,7 @@ def _formulas(
 ) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
     """A library, the slot's own signal first in it, and formulas as places in that: powers, magnitudes and products of the
     signal with what is brought in, or with any; each also beside a gain."""
-    others = (source,) if source else source_signals(before.model, slot_signals(paths))
+    others = (source,) if source else source_signals(before.model, slot_signals(before.model, paths))
     library = terms([own, *(s for s in others if s != own)])
     near = [k for k, t in enumerate(library) if t.form != "x" and (own in t.signals or source in t.signals)]
     return library, [*((k,) for k in near), *((k, 0) for k in near)]

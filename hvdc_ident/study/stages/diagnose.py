@@ -32,7 +32,10 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         why = f"nothing can be diagnosed before the stage identify has run: {report.get('message', 'it failed')}"
         return Outcome({"status": "failed", "message": why}, failed=why)
     if not gate(report, diagnosis=True).fitted:
-        why = "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own"
+        why = (
+            "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own. "
+            "Try: `hvdc-ident identify STUDY` says why of each, and what to measure next"
+        )
         return Outcome({"status": "failed", "message": why}, failed=why)
     with executor_of(study, options, "diagnose") as executor:
         found = diagnose(
