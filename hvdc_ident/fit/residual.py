@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.errors import StudyError
+from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.fit.rounding import Rounding
@@ -19,6 +19,10 @@ from hvdc_ident.fit.unsettled import freed
 from hvdc_ident.fit.whitening import AR, GAP, segments, whitened
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
+
+LARGEST = 1e100
+"""Residuals and derivatives beyond this leave the range of floats (1e308) once products of two are scaled and summed: no
+factorisation of them would end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +228,12 @@ def residual_blocks(
             both = np.empty((misfit.size, 1 + slopes.shape[1]))
             both[:, 0] = per_deviation(misfit, weight, record.profile)
             both[:, 1:] = per_deviation(slopes, weight, record.profile)
+            if not np.abs(both).max(initial=0.0) < LARGEST:
+                raise SimulationError(
+                    f"output '{output}' or its sensitivity is too large to be squared",
+                    where=f"experiment '{experiment.name}'",
+                    expected=f"below {LARGEST:g} standard deviations",
+                )
             treated = treatment.applied(both, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
         block = Block(

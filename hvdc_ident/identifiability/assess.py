@@ -122,7 +122,9 @@ def _assembled(
     bound = {n for n, v in so_far.found.items() if v.verdict == "at-bound"}
     fitted = tuple(n for n in so_far.free if last is not None and n in last.names and n not in bound)
     held = {
-        n: (so_far.found[n].value, so_far.found[n].reason) if n in bound else (so_far.free[n].start, so_far.held[n])
+        n: (so_far.found[n].value, so_far.found[n].reason)
+        if n in bound
+        else (so_far.held_at.get(n, so_far.free[n].start), so_far.held[n])
         for n in so_far.free
         if n not in fitted
     }

@@ -81,7 +81,9 @@ def told_by_noise(whole: Optimum, kept: Sequence[str], others: Sequence[str]) ->
         part = whole.information.select(trial).matrix
         if len(independent(part, whole.error)) < len(trial):
             continue
-        halves = np.sqrt(2.0 * TWO_SIDED * np.diag(np.linalg.inv(part)))
+        lengths = np.sqrt(np.diag(part))
+        inverse = np.linalg.inv(part / np.outer(lengths, lengths))
+        halves = np.sqrt(2.0 * TWO_SIDED * np.diag(inverse)) / lengths
         if all(h * slope[m] < _room(free[m], whole.value(m)) for m, h in zip(trial, halves.tolist(), strict=True)):
             chosen = trial
             found[n] = float(halves[-1] * slope[n])

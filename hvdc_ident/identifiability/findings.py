@@ -18,7 +18,8 @@ from hvdc_ident.identifiability.verdicts import Verdict
 class Findings:
     """One assessment's findings; it grows while the assessment runs.
 
-    problem: all candidates free. found: the first verdict on each. held: reason by parameter. remark: said of every
+    problem: all candidates free. found: the first verdict on each. held: reason by parameter. held_at: the value of a held one
+    where that is not its start. remark: said of every
     parameter. quiet: whether no input moves. unmoved: parameters that show only where an input is moved that was not.
     ends: where the starts of the pilot fit ended, with their costs. optima: others as good as the last one.
     """
@@ -29,6 +30,7 @@ class Findings:
     progress: Progress | None = None
     found: dict[str, Verdict] = field(default_factory=dict)
     held: dict[str, str] = field(default_factory=dict)
+    held_at: dict[str, float] = field(default_factory=dict)
     combinations: list[Combination] = field(default_factory=list)
     thresholds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -52,10 +54,22 @@ class Findings:
         self.found.setdefault(verdict.name, verdict)
 
     def without(self, optimum: Optimum, out: Mapping[str, str]) -> Optimum | None:
-        """The optimum with those held at their start values, with their reasons; None where nothing is left."""
+        """The optimum with those held at their start values, with their reasons; None where nothing is left.
+
+        Where the model cannot be run so, they are held at their values at the optimum, and their reasons say it.
+        """
         if not out:
             return optimum
         self.held |= out
         if len(out) == len(optimum.names):
             return None
-        return optimum.held(out, {n: self.free[n].start for n in out})
+        fewer = optimum.held(out, {n: self.free[n].start for n in out})
+        for n in out:
+            value = fewer.problem.held[n]
+            if value != self.free[n].start:
+                unit = f" {self.units[n]}" if self.units[n] else ""
+                remark = f"It is held at {value:.4g}{unit}: at its start value, {self.free[n].start:.4g}, the model cannot be run."
+                self.held_at[n] = value
+                self.held[n] = f"{self.held[n]} {remark}"
+                self.found[n] = self.found[n].noted(remark)
+        return fewer

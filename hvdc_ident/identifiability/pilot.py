@@ -110,19 +110,25 @@ class Optimum:
         return float(self.theta[self.problem.names.index(name)])
 
     def held(self, why: Mapping[str, str], values: Mapping[str, float]) -> Optimum:
-        """The optimum with some parameters held at given values, found from this one.
+        """The optimum with some parameters held, found from this one; what at is in its problem.
 
-        Raises FitError where the rest cannot be simulated there, or nothing is left to fit.
+        values: what they are to be held at. Where the rest cannot be simulated there, they stay at their best values.
+        Raises FitError where nothing is left to fit.
         """
         left = tuple(f for f in self.problem.free if f.name not in why)
-        fewer = replace(self.problem, free=left, held=self.problem.held | values, why=self.problem.why | why)
+        if not left:
+            raise FitError("nothing is left to fit", got=f"{', '.join(why)} held")
         theta = np.array([v for n, v in zip(self.problem.names, self.theta, strict=True) if n not in why])
-        try:
+
+        def moved(to: Mapping[str, float]) -> Optimum:
+            fewer = replace(self.problem, free=left, held=self.problem.held | to, why=self.problem.why | why)
             end = descend(LeastSquares.of(fewer), theta, np.zeros(theta.size, dtype=bool), enough=1e-6)
-        except SimulationError as error:
-            text = ", ".join(f"{n} = {values[n]:g}" for n in why)
-            raise FitError(f"the model cannot be run with {text}: {error}", hint="another start for them") from None
-        return Optimum(fewer, end.theta)
+            return Optimum(fewer, end.theta)
+
+        try:
+            return moved(values)
+        except SimulationError:
+            return moved({n: self.value(n) for n in why})
 
 
 def pilot(

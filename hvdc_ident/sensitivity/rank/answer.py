@@ -201,8 +201,11 @@ class Ask:
         if relative:
             matrix = np.array([[float(x) for x in i.terms[0][1]] for i in found])
         else:
-            values = [self.model.parameters[n].value or 1e-3 * self.model.parameters[n].size for n in names]
-            matrix = np.array([i.slopes(values) for i in found])
+            values = [np.float64(self.model.parameters[n].value or 1e-3 * self.model.parameters[n].size) for n in names]
+            with np.errstate(all="ignore"):
+                matrix = np.array([i.slopes(values) for i in found])
+            if not np.isfinite(matrix).all():  # a power or a quotient that has no slope at these values
+                return (), False
         null = np.linalg.svd(matrix)[2][len(matrix) :] if free else np.zeros((0, len(names)))
         scaled = [v / v[leading(v)] for v in null]
         return tuple(tuple(float(round(x, 12)) + 0.0 for x in v) for v in scaled), relative
