@@ -380,6 +380,19 @@ def export(
         str | None, typer.Option("--kind", metavar="me|cs", help="One kind of FMU; default both.", show_default=False)
     ] = None,
     source_only: Annotated[bool, typer.Option("--source-only", help="An FMU of sources, without a binary.")] = False,
+    values: Annotated[
+        str | None,
+        typer.Option(
+            "--values",
+            metavar="given|start|fitted",
+            help="Which values; default the fitted ones where a fit stands in the results, else the given ones.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder of results with the fit; default STUDY-results."),
+    ] = None,
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
@@ -388,10 +401,11 @@ def export(
     from hvdc_ident.study.export import fmu_options, write
     from hvdc_ident.study.study import load_study
 
-    written = write(load_study(study, trust), to, linear, fmu_options(fmi, kind, source_only))
+    written = write(load_study(study, trust), to, linear, fmu_options(fmi, kind, source_only), values, out)
     size = written.path.stat().st_size
     if json:
-        _print_json({"schema": 1, "file": written.path.as_posix(), "bytes": size, "note": written.note})
+        about = {"bytes": size, "values": written.values, "note": written.note}
+        _print_json({"schema": 1, "file": written.path.as_posix(), **about})
     _say(f"{written.path}: {size} bytes" + (f"; {written.note}" if written.note else ""), json=json, quiet=quiet)
 
 

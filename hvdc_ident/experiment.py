@@ -106,7 +106,8 @@ class Experiment:
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
     offsets: constants added to inputs all along, in their units. starts: states that begin at a value and not at rest.
     nuisance: what is unknown about this experiment alone and is estimated with it: "time-shift", or the name of an input
-    (its offset), a state (its start) or a parameter (a value of its own).
+    (its offset), a state (its start) or a parameter (a value of its own). search: of such parameters where
+    a fit begins and its bounds, (start, min, max); of one not named they are the model's.
     """
 
     name: str
@@ -125,6 +126,7 @@ class Experiment:
     noise_dof: FrozenMap[float] = field(default_factory=FrozenMap)
     starts: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_profile: FrozenMap[Array] = field(default_factory=FrozenMap)
+    search: FrozenMap[tuple[float, float, float]] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)
@@ -136,7 +138,7 @@ class Experiment:
             )
         time.setflags(write=False)
         object.__setattr__(self, "time", time)
-        for name in ("inputs", "values", "noise", "offsets", "noise_dof", "starts", "noise_profile"):
+        for name in ("inputs", "values", "noise", "offsets", "noise_dof", "starts", "noise_profile", "search"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
         if self.measured is not None and not np.array_equal(self.measured.time, time):

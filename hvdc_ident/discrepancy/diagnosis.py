@@ -62,8 +62,9 @@ def diagnose(
 
     subject: a model; or anything that can be simulated, with effects at its inputs and outputs only.
     experiments: with measured outputs; those of role "holdout" judge, the others are fitted. parameters: what may be
-    fitted, with start (the given gains) and bounds. effects: names of the catalogue to try, "all" beside others for what is
-    tried by default. places: slots to try them at, a tuple for one effect at several slots with shared parameters (default:
+    fitted, with start and bounds, and with the given value, which the results are told against. effects: names of the catalogue
+    to try, "all" beside others for what is tried by default. places: slots to try them at, a tuple for one effect at several
+    slots with shared parameters (default:
     every slot, and families of like slots).
     material: by output, an error (in its unit) below which a gap is of no interest. held: values of other parameters.
     report: `IdentifiabilityReport.to_dict()` of these data, whose identifiable set is fitted; without one, the set that
@@ -147,7 +148,7 @@ def _assembled(
         last = other.refit
         tests = tests_of(search, last)
     augmented = None if last is first else last.model.with_values(_own(last))
-    given = with_given(first, {f.name: f.start for f in free})
+    given = with_given(first, {f.name: f.given for f in free})
     responses_found = responses(model, first, augmented, last)
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
     return Diagnosis(
@@ -161,9 +162,9 @@ def _assembled(
         detectable=detectable(outcome, search.options),
         gap=gap(given, first, last),
         remaining=remaining(first, last, tests, search),
-        parameters_before=FrozenMap({f.name: f.start for f in free}),
-        parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.start) for f in free}),
-        parameters_after=FrozenMap({f.name: last.values.get(f.name, f.start) for f in free}),
+        parameters_before=FrozenMap({f.name: f.given for f in free}),
+        parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.given) for f in free}),
+        parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),
         augmented=augmented,
         fallback=None if other is None else other.to_dict(),
         bode=responses_found,

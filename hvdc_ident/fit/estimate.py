@@ -103,7 +103,8 @@ def fit(
         cost=best.cost,
         chi2_per_dof=squares / (samples - best.theta.size) if samples > best.theta.size else None,
         rmse=problem.rmse(best.theta),
-        rmse_start=problem.rmse(problem.start),
+        rmse_start=problem.rmse_start,
+        rmse_given=problem.rmse_given,
         adequacy=judged,
         noise_source=FrozenMap(noise),
         sigma=problem.sigma,
@@ -310,6 +311,7 @@ def _failed(problem: Problem, begins: Sequence[Array], runs: Sequence[OptimiserR
         fitted=tuple(f.name for f in problem.free),
         held=_held(problem),
         values=FrozenMap(problem.held),
-        rmse_start=problem.rmse(problem.start),
+        rmse_start=problem.rmse_start,
+        rmse_given=problem.rmse_given,
         starts=_outcomes(problem, begins, runs, weigh=False),
     )

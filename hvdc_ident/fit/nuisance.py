@@ -45,7 +45,8 @@ def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[Free, ...]:
     """The unknowns of the experiment alone, in the order it names them.
 
     A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0, a state's start at
-    the model's guess, without bounds. A parameter has the start and the bounds that the simulator gives it.
+    the model's guess, without bounds. A parameter has the start and the bounds of the experiment's `search`, else the
+    simulator's.
     Raises StudyError for a nuisance that is not known here.
     """
     return tuple(_free(simulator, experiment, name) for name in experiment.nuisance)
@@ -76,7 +77,8 @@ def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> Free:
     if nuisance == TIME_SHIFT:
         return _clock(experiment, name)
     if nuisance in simulator.parameters:
-        return Free.of(name, simulator.parameters[nuisance])
+        search = dict(zip(("start", "min", "max"), experiment.search.get(nuisance, ()), strict=False))
+        return Free.of(name, simulator.parameters[nuisance], **search)
     known, states = _inputs(simulator), _states(simulator)
     if nuisance in states:
         return Free(name, states[nuisance].guess or 0.0, scale=1.0)

@@ -128,6 +128,21 @@ class Problem:
         """(p,): the first guess."""
         return np.array([u.start for u in self.unknowns])
 
+    @property
+    def given(self) -> Array:
+        """(p,): the values that the model came with."""
+        return np.array([u.given for u in self.unknowns])
+
+    @cached_property
+    def rmse_start(self) -> dict[str, dict[str, float | None]]:
+        """The table of RMSE at the first guess."""
+        return self.rmse(self.start)
+
+    @cached_property
+    def rmse_given(self) -> dict[str, dict[str, float | None]]:
+        """The table of RMSE at the given values."""
+        return self.rmse_start if np.array_equal(self.given, self.start) else self.rmse(self.given)
+
     @cached_property
     def coordinates(self) -> Coordinates:
         """The scaled coordinates of the unknowns."""

@@ -69,7 +69,8 @@ class FitResult:
     given values, as the model takes them. estimates: by parameter. nuisance: by experiment and nuisance.
     cost: half the sum of squared residuals in units of sigma, None where the fit failed.
     adequacy: whether the residuals are of the size of the noise, with the verdict in words and what to do.
-    rmse, rmse_start: by output and experiment, at the optimum and at the start, in the output's unit.
+    rmse, rmse_given, rmse_start: by output and experiment, at the optimum, at the given values and at the start, in the
+    output's unit.
     noise_source: by output, in words. sigma: standard deviation by experiment and output, in the output's unit.
     rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
     correlation: between the estimates. residual_tests: by output and experiment. starts: outcomes of the multistart.
@@ -92,6 +93,7 @@ class FitResult:
     adequacy: Adequacy | None = None
     rmse: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     rmse_start: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    rmse_given: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     noise_source: FrozenMap[str] = field(default_factory=FrozenMap)
     sigma: FrozenMap[FrozenMap[float]] = field(default_factory=FrozenMap)
     rho: FrozenMap[float] = field(default_factory=FrozenMap)

@@ -21,6 +21,8 @@ class Free:
     """An unknown of a fit, everything in its own unit.
 
     start: first guess. min, max: bounds of the search (infinite: none). scale: a typical size, 0 means |start|, or 1.
+    given: the value that the model came with (left out: the start); a parameter that is not estimated stays there, and
+    results are compared with it. It need not lie within the bounds of the search.
     Scaling: by logarithm where min > 0 and max/min > 10 (a gain known to a decade), else by the range (0 may be
     admissible), else, without bounds, by the typical size. Raises StudyError where the bounds do not hold the start.
     """
@@ -30,10 +32,13 @@ class Free:
     min: float = -math.inf
     max: float = math.inf
     scale: float = 0.0
+    given: float = math.nan
 
     def __post_init__(self) -> None:
-        for name in ("start", "min", "max", "scale"):
+        for name in ("start", "min", "max", "scale", "given"):
             object.__setattr__(self, name, float(getattr(self, name)))
+        if math.isnan(self.given):
+            object.__setattr__(self, "given", self.start)
         if not (self.min < self.max and self.min <= self.start <= self.max and math.isfinite(self.start)):
             raise StudyError(
                 f"the start or the bounds of '{self.name}' are wrong",
@@ -44,8 +49,10 @@ class Free:
 
     @classmethod
     def of(cls, name: str, parameter: Parameter, **changes: float) -> Free:
-        """The unknown that a model's parameter is, with some of start, min, max, scale changed."""
-        fields = {"start": parameter.value, "min": parameter.min, "max": parameter.max, "scale": parameter.scale}
+        """The unknown that a model's parameter is, given and begun at its value; with some of the fields changed."""
+        value = changes.get("given", parameter.value)
+        fields = {"start": value, "given": value}
+        fields |= {"min": parameter.min, "max": parameter.max, "scale": parameter.scale}
         return cls(name, **{**fields, **changes})
 
     def on_bound(self, value: float) -> bool:

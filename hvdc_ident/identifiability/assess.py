@@ -52,7 +52,8 @@ def identifiability(
     """What the experiments tell about the candidates: a verdict on each, the set to fit, and what to measure next.
 
     subject: a model, or anything that can be simulated (then the structure is judged by numbers, at random points).
-    candidates: the parameters to judge, with start and bounds. held: values of other parameters.
+    candidates: the parameters to judge, with start, bounds and the given values, at which those are held that these data
+    do not tell. held: values of other parameters.
     pair: two candidates whose common profile is wanted too, over twice their intervals, where both are fitted.
     Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
     """
@@ -65,7 +66,7 @@ def identifiability(
     narrow.structural(so_far, structure)
     free = tuple(f for f in problem.free if f.name not in so_far.held)
     if free:
-        first = replace(problem, free=free, held=problem.held | {n: so_far.free[n].start for n in so_far.held})
+        first = replace(problem, free=free, held=problem.held | {n: so_far.free[n].given for n in so_far.held})
         optimum, result = pilot(first, starts=starts, seed=seed, executor=executor, progress=progress)
     else:
         optimum, result = unfitted(problem)
@@ -124,7 +125,7 @@ def _assembled(
     held = {
         n: (so_far.found[n].value, so_far.found[n].reason)
         if n in bound
-        else (so_far.held_at.get(n, so_far.free[n].start), so_far.held[n])
+        else (so_far.held_at.get(n, so_far.free[n].given), so_far.held[n])
         for n in so_far.free
         if n not in fitted
     }
@@ -191,7 +192,7 @@ def _unjudged(so_far: Findings, whole: Optimum, fitted: Sequence[str], at: Optim
 
 def _whole(so_far: Findings, at: Optimum) -> Optimum:
     """All candidates free, at the values found or held."""
-    values = {**{n: f.start for n, f in so_far.free.items()}, **at.problem.values(at.theta)}
+    values = {**{n: f.given for n, f in so_far.free.items()}, **at.problem.values(at.theta)}
     theta = [values[n] for n in so_far.free]
     theta += [v for u, v in zip(at.problem.names, at.theta, strict=True) if u not in so_far.free]
     return Optimum(replace(so_far.problem, weights=at.problem.weights), np.array(theta, dtype=float))

@@ -21,7 +21,7 @@ class Combination:
 
     members: in the order listed. seen: the combinations, in words. kind: "structural" (no data could tell) or
     "practical" (these data do not). direction: the change of the members that leaves the outputs alone, in scaled
-    coordinates (relative, or share of the range). held: those put at their start value so that the others can be told.
+    coordinates (relative, or share of the range). held: those put at their given value so that the others can be told.
     text: the finding in words where `seen` has none.
     """
 

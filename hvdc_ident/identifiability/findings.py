@@ -54,7 +54,7 @@ class Findings:
         self.found.setdefault(verdict.name, verdict)
 
     def without(self, optimum: Optimum, out: Mapping[str, str]) -> Optimum | None:
-        """The optimum with those held at their start values, with their reasons; None where nothing is left.
+        """The optimum with those held at their given values, with their reasons; None where nothing is left.
 
         Where the model cannot be run so, they are held at their values at the optimum, and their reasons say it.
         """
@@ -63,12 +63,12 @@ class Findings:
         self.held |= out
         if len(out) == len(optimum.names):
             return None
-        fewer = optimum.held(out, {n: self.free[n].start for n in out})
+        fewer = optimum.held(out, {n: self.free[n].given for n in out})
         for n in out:
             value = fewer.problem.held[n]
-            if value != self.free[n].start:
+            if value != self.free[n].given:
                 unit = f" {self.units[n]}" if self.units[n] else ""
-                remark = f"It is held at {value:.4g}{unit}: at its start value, {self.free[n].start:.4g}, the model cannot be run."
+                remark = f"It is held at {value:.4g}{unit}: at its given value, {self.free[n].given:.4g}, the model cannot be run."
                 self.held_at[n] = value
                 self.held[n] = f"{self.held[n]} {remark}"
                 self.found[n] = self.found[n].noted(remark)

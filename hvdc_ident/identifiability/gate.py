@@ -88,6 +88,7 @@ def gated_fit(
             reasons,
             values,
             estimates=_at_bound(report, through),
+            rmse_given=problem.rmse_given,
         )
     result = fit(gated(problem, through))
     if result.status == "failed":
@@ -95,7 +96,10 @@ def gated_fit(
     estimates = {n: _stated(n, e, report, through, whole=whole) for n, e in result.estimates.items()}
     on_bound = _at_bound(report, through)
     ordered = {n: {**estimates, **on_bound}.get(n) for n in report["parameters"]}
-    result = replace(result, estimates=FrozenMap({n: e for n, e in ordered.items() if e is not None}))
+    stated = FrozenMap({n: e for n, e in ordered.items() if e is not None})
+    # What is held on a bound was given elsewhere: before the fit it stood there.
+    before = problem.rmse_given if on_bound else result.rmse_given
+    result = replace(result, estimates=stated, rmse_given=before)
     if not on_bound or result.status not in ("converged", "at-bound"):
         return result
     held = f"held on a bound: {', '.join(on_bound)}"

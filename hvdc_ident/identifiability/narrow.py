@@ -48,7 +48,7 @@ def structural(so_far: Findings, structure: Structure) -> None:
     so_far.combinations += [replace(c, held=tuple(n for n in c.members if n in stuck)) for c in structure.combinations]
     for c in structure.combinations:
         for n in c.members:
-            at = so_far.free[n].start if n in stuck else None
+            at = so_far.free[n].given if n in stuck else None
             others = [m for m in c.members if m in stuck]
             so_far.judge(verdicts.structural(n, c.words, at, so_far.units[n], others, local=structure.local))
     for n in stuck:
@@ -95,7 +95,7 @@ def lost(so_far: Findings, optimum: Optimum) -> Optimum | None:
     so_far.combinations += [replace(c, held=tuple(n for n in c.members if n in out)) for c in combos]
     for n in members:
         words = next(c.words for c in combos if n in c.members)
-        at = so_far.free[n].start if n in out else optimum.value(n)
+        at = so_far.free[n].given if n in out else optimum.value(n)
         so_far.judge(verdicts.lost(n, words, at, so_far.units[n]))
     return so_far.without(optimum, {n: so_far.found[n].reason for n in out})
 

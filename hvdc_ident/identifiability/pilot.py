@@ -159,19 +159,19 @@ def pilot(
 
 
 def unfitted(problem: Problem) -> tuple[Optimum, FitResult]:
-    """The start values in place of an optimum, where the structure leaves no candidate to fit.
+    """The given values in place of an optimum, where the structure leaves no candidate to fit.
 
     Standard deviations that are not given are the misfit's there. Raises SimulationError as `pilot` does.
     """
     message = "no pilot fit, for the structure leaves no candidate to fit"
     try:
-        weights = misfit_weights(problem, problem.start, _not_given(problem))
+        weights = misfit_weights(problem, problem.given, _not_given(problem))
     except SimulationError as error:
         raise _failure(problem, str(error)) from None
     weighted = problem.with_(weights={**problem.weights, **weights})
     source = FrozenMap({o: source_of(problem.fitted_experiments, o) for o in problem.outputs})
     result = FitResult("failed", message, (), FrozenMap(), FrozenMap(problem.held), noise_source=source)
-    return Optimum(weighted, problem.start), result
+    return Optimum(weighted, problem.given), result
 
 
 def _not_given(problem: Problem) -> list[str]:

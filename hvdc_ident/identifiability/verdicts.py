@@ -82,7 +82,7 @@ def structural(
     *,
     local: bool = False,
 ) -> Verdict:
-    """Only a combination shows, whatever the data. held_at: its start value where it is one of those held.
+    """Only a combination shows, whatever the data. held_at: its given value where it is one of those held.
 
     local: whether that was found from numbers at a few points.
     """
@@ -99,7 +99,7 @@ def insensitive(free: Free, rise: float, threshold: float, unit: str, also: str 
     span = f"Anywhere between {free.min:.4g} and {_with_unit(free.max, unit)}"
     told = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
-    return Verdict(free.name, "insensitive", f"{span} {told}{why}. {also}".rstrip(), free.start, unit)
+    return Verdict(free.name, "insensitive", f"{span} {told}{why}. {also}".rstrip(), free.given, unit)
 
 
 def practical(profile: Profile, words: str, unit: str) -> Verdict:

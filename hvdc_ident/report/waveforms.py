@@ -71,14 +71,14 @@ def waveforms(
 ) -> Figure:
     """The recorded and simulated output over time, and below it measured minus simulated, on a sheet that is wiped first.
 
-    before, after: tables with the columns OUTPUT and OUTPUT.measured, at the start values and at the estimates; with
+    before, after: tables with the columns OUTPUT and OUTPUT.measured, at the given values and at the estimates; with
     OUTPUT.low and OUTPUT.high the band between them is shaded.
     """
     top, strip = sheet.wiped()
     shown = after if after is not None else before
     if shown is not None:
         top.plot(*visible(shown.time, shown[f"{output}.measured"]), color=MEASURED, linewidth=1.0, label="measured")
-    for table, color, label in ((before, BEFORE, "before: start values"), (after, AFTER, "after: fitted")):
+    for table, color, label in ((before, BEFORE, "before: given values"), (after, AFTER, "after: fitted")):
         if table is None:
             continue
         dashes = (0, (5, 2)) if table is before else "-"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import StudyError
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study.study import Study
+from hvdc_ident.study.values import ValueSet, value_set
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
@@ -26,10 +27,11 @@ class FmuOptions:
 
 @dataclass(frozen=True)
 class Written:
-    """A file that was written, and what is to be said of it."""
+    """A file that was written, what is to be said of it, and the name of the set of values that it holds, of a study."""
 
     path: Path
     note: str = ""
+    values: str = ""
 
 
 def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOptions | None:
@@ -51,13 +53,20 @@ def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOpti
 
 
 def export(
-    source: Study | Model | LinearModel, path: str | Path, linear: bool = False, fmu: FmuOptions | None = None
+    source: Study | Model | LinearModel,
+    path: str | Path,
+    linear: bool = False,
+    fmu: FmuOptions | None = None,
+    values: str | None = None,
+    folder: str | Path | None = None,
 ) -> Path:
     """The path, written in the format of its ending: .toml, .fmu and .mo are the model, .ssv its parameters, the others its linear model.
 
     source: a study, a model (linearised at its steady state) or a linear model. linear: the linear model even where the
-    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. Raises StudyError for an ending that is not
-    known, and where the model is not of the kind that the ending needs.
+    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. values: of a study, "given", "start" or
+    "fitted"; left out, the fitted ones where a fit stands in its folder of results (folder, by default the study's own),
+    else the given ones. The file says which it holds. Raises StudyError for an ending that is not known, where the model
+    is not of the kind that the ending needs, and where fitted values are asked for and none stand.
 
     >>> import tempfile
     >>> from hvdc_ident import export, load_model
@@ -65,13 +74,18 @@ def export(
     ...     export(load_model("vsc-hvdc-link"), f"{folder}/link.mat").name
     'link.mat'
     """
-    return write(source, path, linear, fmu).path
+    return write(source, path, linear, fmu, values, folder).path
 
 
 def write(
-    source: Study | Model | LinearModel, path: str | Path, linear: bool = False, fmu: FmuOptions | None = None
+    source: Study | Model | LinearModel,
+    path: str | Path,
+    linear: bool = False,
+    fmu: FmuOptions | None = None,
+    values: str | None = None,
+    folder: str | Path | None = None,
 ) -> Written:
-    """The same, with what is to be said of the file: whether an FMU holds a binary."""
+    """The same, with what is to be said of the file: which values it holds, whether an FMU holds a binary."""
     from hvdc_ident.linearize.export import formats
     from hvdc_ident.linearize.export import write as write_linear
 
@@ -80,49 +94,57 @@ def write(
     nonlinear = isinstance(source, Study | Model) and not linear
     if fmu is not None and ending != ".fmu":
         raise StudyError("options of an FMU do not go with this ending", where=str(path), expected="a file *.fmu")
-    if nonlinear and ending in _WRITERS:
-        assert isinstance(source, Study | Model)
-        return _WRITERS[ending](source, path, fmu or FmuOptions())
-    if ending not in formats():
+    if ending not in formats() and not (nonlinear and ending in _WRITERS):
         known = sorted({*formats(), *(_WRITERS if nonlinear else ())})
         raise StudyError("no export has this ending", where=str(path), expected=f"one of {', '.join(known)}")
-    return Written(write_linear(_linear(source), path))
+    if values is not None and not isinstance(source, Study):
+        raise StudyError("a model has one set of values: its own", where="values", expected="a study", got=repr(values))
+    chosen = value_set(source, values, None if folder is None else Path(folder)) if isinstance(source, Study) else None
+    if nonlinear and ending in _WRITERS:
+        assert isinstance(source, Study | Model)
+        written = _WRITERS[ending](source, chosen, path, fmu or FmuOptions())
+    else:
+        written = Written(write_linear(_linear(source, chosen), path))
+    if chosen is None:
+        return written
+    return Written(written.path, "; ".join(t for t in (written.note, chosen.note) if t), chosen.name)
 
 
-def _card(source: Study | Model, path: Path, _: FmuOptions) -> Written:
-    from hvdc_ident.model.card import save_card
+def _card(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
+    from hvdc_ident.files import write_text
+    from hvdc_ident.model.card import write_card
 
-    return Written(save_card(_model(source), path))
+    head = f"# {' '.join(chosen.note.split())}\n" if chosen else ""
+    return Written(write_text(path, head + write_card(_model(source, chosen))))
 
 
-def _fmu(source: Study | Model, path: Path, options: FmuOptions) -> Written:
+def _fmu(source: Study | Model, chosen: ValueSet | None, path: Path, options: FmuOptions) -> Written:
     from hvdc_ident.fmu.export import export_fmu
 
     ends = [float(e.time[-1]) for e in source.experiments] if isinstance(source, Study) else []
     stop = max((t for t in ends if t > 0.0), default=1.0)
     found = export_fmu(
-        _model(source), path, version=options.version, kinds=options.kinds, binary=options.binary, stop=stop
+        _described(source, chosen), path, version=options.version, kinds=options.kinds, binary=options.binary, stop=stop
     )
     return Written(found.path, f"FMI {found.version}, {' and '.join(found.kinds)}; {found.note}")
 
 
-def _modelica(source: Study | Model, path: Path, _: FmuOptions) -> Written:
+def _modelica(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.fmu.export.modelica import save_modelica
 
-    return Written(save_modelica(_model(source), path))
+    return Written(save_modelica(_described(source, chosen), path))
 
 
-def _parameters(source: Study | Model, path: Path, _: FmuOptions) -> Written:
+def _parameters(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.files import write_text
     from hvdc_ident.study.tables import ssv
 
     model = source.model if isinstance(source, Study) else source
-    values = {n: q.value for n, q in model.parameters.items()}
-    values |= dict(source.values) if isinstance(source, Study) else {}
-    return Written(write_text(path, ssv(values, source.name)))
+    values = {n: q.value for n, q in model.parameters.items()} | (dict(chosen.values) if chosen else {})
+    return Written(write_text(path, ssv(values, source.name, chosen.note if chosen else "")))
 
 
-_WRITERS: dict[str, Callable[[Study | Model, Path, FmuOptions], Written]] = {
+_WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions], Written]] = {
     ".toml": _card,
     ".fmu": _fmu,
     ".mo": _modelica,
@@ -130,18 +152,28 @@ _WRITERS: dict[str, Callable[[Study | Model, Path, FmuOptions], Written]] = {
 }
 
 
-def _model(source: Study | Model) -> Model:
+def _model(source: Study | Model, chosen: ValueSet | None) -> Model:
+    """The model with the chosen values."""
     if isinstance(source, Model):
         return source
     if not isinstance(source.model, Model):
         raise StudyError("the model's equations are not here to be written", where=source.path.name, got="an FMU")
-    return source.model.with_values(dict(source.values)) if source.values else source.model
+    return source.model.with_values(dict(chosen.values)) if chosen and chosen.values else source.model
 
 
-def _linear(source: Study | Model | LinearModel) -> LinearModel:
+def _described(source: Study | Model, chosen: ValueSet | None) -> Model:
+    """The same, with a description that says which values they are, for formats without comments."""
+    model = _model(source, chosen)
+    if chosen is None:
+        return model
+    return replace(model, description=f"{(model.description or model.name).rstrip('. ')}; {chosen.note}")
+
+
+def _linear(source: Study | Model | LinearModel, chosen: ValueSet | None) -> LinearModel:
     from hvdc_ident.linearize import linearize
     from hvdc_ident.study.stages.linearize import linear_model
 
     if isinstance(source, Study):
-        return linear_model(source)
+        assert chosen is not None
+        return linear_model(source, chosen)
     return linearize(source) if isinstance(source, Model) else source

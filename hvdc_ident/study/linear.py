@@ -83,14 +83,14 @@ def _known(kind: str, names: Iterable[str] | None, known: Collection[str], where
 def operating_point(study: Study, values: Mapping[str, float] | None = None) -> OperatingPoint:
     """Return the operating point that [linearize] asks for: at rest, at the given starts, or trimmed.
 
-    values: of the candidates; left out, those of a plain simulation. Raises SteadyStateError, with what a study can do
+    values: of the parameters; left out, the given ones. Raises SteadyStateError, with what a study can do
     about it, where there is none.
     """
     from hvdc_ident.linearize import find_operating_point
 
     asked = study.settings.linearize
     at = asked.at if asked else "steady"
-    fixed = dict(study.values if values is None else values)
+    fixed = dict(study.given if values is None else values)
     if asked is None or asked.trim is None:
         try:
             return find_operating_point(study.model, fixed, at=at)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from hvdc_ident.errors import StudyError
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hvdc_ident.errors import ComputationError, SteadyStateError, StudyError
 from hvdc_ident.study.study import Study
 
 
@@ -22,7 +25,7 @@ def need_candidates(study: Study, stage: str) -> None:
     """Raises StudyError where the study names no parameter to estimate."""
     if not study.candidates:
         known = ", ".join(list(study.model.parameters)[:8])
-        hint = f"[parameters] with lines like NAME = {{start = 1, min = 0, max = 10}}; the model has {known}"
+        hint = f"[parameters] with lines like NAME = {{given = 1, min = 0, max = 10}}; the model has {known}"
         raise StudyError(
             f"{stage} needs parameters to estimate and the study names none", where=study.path.name, hint=hint
         )
@@ -38,3 +41,24 @@ def need_start(study: Study) -> None:
     for experiment in study.experiments:
         with suppress(SimulationError):
             simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
+
+
+@contextmanager
+def at_given(study: Study) -> Iterator[None]:
+    """Run what is inside at the given values.
+
+    A model that has no steady state there is wrong input (SteadyStateError). Where the study's search begins elsewhere it
+    is a finding about the vendor's values, a ComputationError, which ends this stage and not those that fit.
+    """
+    try:
+        yield
+    except SteadyStateError as e:
+        if study.start == study.given:
+            raise
+        raise ComputationError(
+            f"at the given values {e.what}",
+            where=e.where,
+            expected=e.expected,
+            got=e.got,
+            hint="given = ... in [parameters] states the vendor's value; a fit begins at `start` and is not touched",
+        ) from None

@@ -103,8 +103,10 @@ def _failed(error: HvdcIdentError) -> Outcome:
 
 def _written(study: Study, wanted: Stage, folder: Path, options: Options, outcome: Outcome) -> Done:
     heading = heading_of(study, options.seed)
-    mark = "" if outcome.failed else _mark(study, wanted, options)
-    data = plain({**heading, "stage": wanted.name, "fingerprint": mark, "files": list(outcome.files), **outcome.data})
+    mark = "" if outcome.failed else _mark(study, wanted, folder, options)
+    about = {"stage": wanted.name, "fingerprint": mark, "files": list(outcome.files)}
+    taken = {"options": {n: getattr(options, n) for n in wanted.takes}} if wanted.takes else {}
+    data = plain({**heading, **about, **taken, **outcome.data})
     for name, text in outcome.files.items():
         write_text(folder / name, text)
     write_text(folder / wanted.file, json_pieces(data))
@@ -133,22 +135,48 @@ def version() -> str:
 
 def _kept(study: Study, wanted: Stage, folder: Path, options: Options) -> dict[str, Any] | None:
     """The stage's JSON in the folder, where it is whole and nothing that decides it has changed."""
-    try:
-        data = json.loads((folder / wanted.file).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if (
-        not isinstance(data, dict)
-        or not data.get("fingerprint")
-        or data["fingerprint"] != _mark(study, wanted, options)
-    ):
+    data = _read(folder / wanted.file)
+    if not data.get("fingerprint") or data["fingerprint"] != _mark(study, wanted, folder, options):
         return None
     files = data.get("files")
     return data if isinstance(files, list) and all((folder / str(f)).is_file() for f in files) else None
 
 
-def _mark(study: Study, wanted: Stage, options: Options) -> str:
-    """A hash of all that decides a stage's result: the study, its files, the seed, this software."""
+def standing(study: Study, name: str, folder: Path) -> tuple[dict[str, Any], str]:
+    """The stage's JSON in the folder whatever its seed and options were, and why it does not stand; "" where it does.
+
+    Nothing is run. Without a result there the JSON is empty.
+    """
+    wanted = stage(name)
+    data = _read(folder / wanted.file)
+    if not data:
+        return {}, f"no {name} has run"
+    if data.get("sources") != dict(study.sources):
+        return data, f"the {name} in {folder} is of an earlier state of the study or its files"
+    if not data.get("fingerprint"):
+        end = str(data.get("message", "no reason is kept")).rstrip(".")
+        return data, f"the {name} in {folder} ended as {data.get('status', 'failed')}: {end}"
+    known: dict[str, Any] = data["options"] if isinstance(data.get("options"), dict) else {}
+    taken: dict[str, Any] = {n: tuple(known[n]) for n in wanted.takes if isinstance(known.get(n), list)}
+    if _kept(study, wanted, folder, Options(seed=int(data.get("seed", 0)), **taken)) is None:
+        return data, f"the {name} in {folder} is of another version of hvdc_ident, or not whole"
+    return data, ""
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The JSON object of a file; empty where there is none."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
+def _mark(study: Study, wanted: Stage, folder: Path, options: Options) -> str:
+    """A hash of all that decides a stage's result: the study, its files, the seed, this software, the results it uses."""
     parts = [wanted.name, *(f"{n}={h}" for n, h in study.sources.items()), str(options.seed), version(), source_hash()]
     parts += [f"{name}={getattr(options, name)}" for name in wanted.takes if getattr(options, name)]
+    for name in wanted.uses:
+        data, why = standing(study, name, folder)
+        parts.append(f"{name}={why or data['fingerprint']}")
     return digest("\n".join(parts).encode())

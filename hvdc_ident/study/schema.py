@@ -91,10 +91,12 @@ class Prior(Table):
 class Candidate(Table):
     """One line of [parameters]: a parameter that may be estimated; what is left out is the model's own.
 
+    given: the value that the model came with, the vendor's; start: where the search begins, else the given value.
     prior: what is known beforehand. tie: an expression of other parameters that this one follows; it is then no
     candidate. per-experiment: it has a value of its own in every experiment, as a nuisance.
     """
 
+    given: FiniteFloat | None = None
     start: FiniteFloat | None = None
     min: FiniteFloat | None = None
     max: FiniteFloat | None = None
@@ -104,9 +106,9 @@ class Candidate(Table):
 
     @model_validator(mode="after")
     def _tie_alone(self) -> Candidate:
-        others = (self.start, self.min, self.max, self.prior)
+        others = (self.given, self.start, self.min, self.max, self.prior)
         if self.tie is not None and (self.per_experiment or any(v is not None for v in others)):
-            raise ValueError("tie: a tied parameter has neither start, bounds nor prior of its own")
+            raise ValueError("tie: a tied parameter has neither start, bounds nor prior of its own, nor a given value")
         return self
 
 

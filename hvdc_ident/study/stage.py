@@ -67,6 +67,7 @@ class Stage:
     name: its command. file: its JSON in DIR. run: the work, given the study, the options and the data of the stages it
     builds on, by name; what the study lacks for it is a StudyError. wanted: whether `run STUDY` includes it.
     after: the stages it builds on; they run first. order: place among the stages of a run.
+    uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `Options` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON.
     """
@@ -78,6 +79,7 @@ class Stage:
     wanted: Callable[[Study], bool]
     order: int
     after: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
 

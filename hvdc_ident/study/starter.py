@@ -36,6 +36,7 @@ source = "vsc-hvdc-link"          # a shipped model (`hvdc-ident models`), or th
 # parameters = {T = 0.0016}
 
 # What may be estimated: where to begin and where to look. All other parameters stay at the model's values.
+# given = ... states the vendor's value; if left out, the model's. Results are compared with it, never with start.
 [parameters]
 KPVDC = {start = 20, min = 10, max = 40}
 KIVDC = {start = 650, min = 550, max = 950}

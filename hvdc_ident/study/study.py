@@ -17,15 +17,15 @@ from hvdc_ident.study import schema
 from hvdc_ident.study.linear import check_linear
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
-from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
+from hvdc_ident.study.unknowns import free_of, with_nuisances, with_unknowns
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
     """A study that holds together.
 
-    model: with its parameterisation, effects and [model.values]. candidates: what may be estimated, with start and
-    bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
+    model: with its parameterisation, effects, [model.values] and given values. candidates: what may be estimated, with
+    given value, start and bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
     settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study.
     against: the other model that sweeps are compared with, where they are; compared: that of the linear model.
     """
@@ -47,15 +47,24 @@ class Study:
         return self.path.with_name(f"{self.path.stem}-results")
 
     @property
-    def start(self) -> FrozenMap[float]:
-        """The candidates' start values by name: where an estimation begins."""
-        return FrozenMap({name: free.start for name, free in self.candidates.items()})
+    def given(self) -> FrozenMap[float]:
+        """The values that the model came with, of the parameters listed in [parameters]: the vendor's.
+
+        What `given` says there, else [model.values], else the model's own. Simulations, linear models and sweeps are made
+        with them, parameters that cannot be estimated are held at them, and results are compared with them.
+        """
+        return FrozenMap({n: self.model.parameters[n].value for n in self._listed})
 
     @property
-    def values(self) -> FrozenMap[float]:
-        """The candidates' values for a plain simulation: what [model.values] states, else the start."""
-        stated = self.settings.model.values
-        return FrozenMap({name: stated.get(name, free.start) for name, free in self.candidates.items()})
+    def start(self) -> FrozenMap[float]:
+        """Where a search begins, of the same parameters: what `start` says, else the given value. Nothing else rests on it."""
+        stated = {n: line.start for n, line in self._listed.items()}
+        return FrozenMap({n: g if (s := stated[n]) is None else s for n, g in self.given.items()})
+
+    @property
+    def _listed(self) -> dict[str, schema.Candidate]:
+        """The lines of [parameters] that have a value of their own: all but ties."""
+        return {n: line for n, line in self.settings.parameters.items() if line.tie is None}
 
 
 def load_study(path: str | Path, trust: bool = False) -> Study:
@@ -74,7 +83,7 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
     model = with_unknowns(settings, model, where)
     candidates = _candidates(settings, model, where)
     experiments, noise = read_experiments(settings.experiment, model, recordings, where)
-    experiments = with_nuisances(settings, model, experiments, tuple(candidates))
+    experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
     study = Study(
         name=settings.name or file.stem,
         path=file,
@@ -183,9 +192,8 @@ def _candidates(settings: schema.StudyFile, model: AnyModel, where: str) -> Froz
                 raise StudyError(f"'{name}' is an input, not a parameter", where=f"{where}, parameters", hint=hint)
             raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
         own = model.parameters[name]
-        given = {k: v for k in ("start", "min", "max") if (v := getattr(line, k)) is not None}
         try:
-            free = Free.of(name, own, **given)
+            free = free_of(name, line, model)
         except InputError as e:
             raise e.at(place) from None
         if free.min < own.min or free.max > own.max:

@@ -8,6 +8,7 @@ from hvdc_ident.experiment import Experiment, recording_lines
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.stage import stages
 from hvdc_ident.study.study import Study
+from hvdc_ident.study.tables import candidate_lines
 
 
 def summary(study: Study, seed: int = 0) -> dict[str, Any]:
@@ -21,10 +22,7 @@ def summary(study: Study, seed: int = 0) -> dict[str, Any]:
             "inputs": len(model.inputs),
             "outputs": len(model.outputs),
         },
-        "candidates": {
-            n: {"start": f.start, "min": f.min, "max": f.max, "unit": model.parameters[n].unit}
-            for n, f in study.candidates.items()
-        },
+        "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
         "experiments": {e.name: _experiment(e, study) for e in study.experiments},
         "stages": [s.name for s in stages() if s.wanted(study)],
     }
@@ -36,7 +34,8 @@ def summary_text(found: dict[str, Any]) -> str:
     lines = [f"study {found['study']}: good", f"model {found['model']}: {sizes}"]
     for name, c in found["candidates"].items():
         unit = f" {c['unit']}" if c["unit"] else ""
-        lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}")
+        given = f"given {c['given']:g}{unit} ({c['given_by']})"
+        lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}; {given}")
     for name, e in found["experiments"].items():
         event = f"event at {e['event']:g} s" if e["event"] is not None else "no event"
         noise = ", ".join(_noise(o, n) for o, n in e["noise"].items())
@@ -56,6 +55,15 @@ def _noise(output: str, note: dict[str, Any]) -> str:
     if note["source"] == "floor":
         return f"{output} none above {note['std']:.3g} (before the event; the residual of the fit stands in)"
     return f"{output} {note['std']:.3g} ({note['source']})"
+
+
+def _given_by(study: Study, name: str) -> str:
+    """Where a candidate's given value comes from; a value of [model.values] that does not count is named too."""
+    line, stated = study.settings.parameters[name], study.settings.model.values
+    if line.given is not None:
+        unused = f", not {stated[name]:g} of [model.values]" if stated.get(name, line.given) != line.given else ""
+        return f"[parameters]{unused}"
+    return "[model.values]" if name in stated else "the model"
 
 
 def _experiment(e: Experiment, study: Study) -> dict[str, Any]:

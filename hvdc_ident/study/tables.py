@@ -17,9 +17,25 @@ from hvdc_ident.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.assessment import Curve
+    from hvdc_ident.study.study import Study
 
 SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
 SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+
+
+def candidate_lines(study: Study) -> dict[str, dict[str, Any]]:
+    """By candidate its given value, where the search begins, its bounds, where starts are drawn from, its unit."""
+    return {
+        n: {
+            "given": f.given,
+            "start": f.start,
+            "min": f.min,
+            "max": f.max,
+            "searched": f.drawn,
+            "unit": study.model.parameters[n].unit,
+        }
+        for n, f in study.candidates.items()
+    }
 
 
 def rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
@@ -70,15 +86,16 @@ def values_csv(
     return csv_text(["parameter", "value", "unit", "std", "ci95_low", "ci95_high", "held"], rows)
 
 
-def ssv(values: Mapping[str, float], name: str) -> str:
-    """The values as an SSP 1.0 parameter value file (.ssv)."""
+def ssv(values: Mapping[str, float], name: str, note: str = "") -> str:
+    """The values as an SSP 1.0 parameter value file (.ssv). note: its description."""
     rows = "".join(
         f"    <ssv:Parameter name={quoteattr(n)}><ssv:Real value={quoteattr(repr(float(v)))}/></ssv:Parameter>\n"
         for n, v in values.items()
     )
+    about = f" description={quoteattr(' '.join(note.split()))}" if note else ""
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<ssv:ParameterSet xmlns:ssv="{SSV}" xmlns:ssc="{SSC}" version="1.0" name={quoteattr(name)}>\n'
+        f'<ssv:ParameterSet xmlns:ssv="{SSV}" xmlns:ssc="{SSC}" version="1.0" name={quoteattr(name)}{about}>\n'
         f"  <ssv:Parameters>\n{rows}  </ssv:Parameters>\n</ssv:ParameterSet>\n"
     )
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
+from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study import schema
@@ -19,12 +19,18 @@ if TYPE_CHECKING:
 
 
 def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
-    """The model with its ties, and with start and bounds of the parameters that every experiment has for itself.
+    """The model with its ties and its given values.
 
-    Raises StudyError or UnknownNameError for a tie or a bound that does not fit the model.
+    Raises StudyError or UnknownNameError for a tie, or a parameter of each experiment, that does not fit the model.
     """
+    for name, line in settings.parameters.items():
+        if line.given is not None and name in model.parameters:
+            try:
+                model = model.with_values({name: line.given})
+            except InputError as e:
+                raise e.at(f"{where}, parameters.{name}.given") from None
     ties = {n: line.tie for n, line in settings.parameters.items() if line.tie is not None}
-    own = {n: line for n, line in settings.parameters.items() if line.per_experiment}
+    own = [n for n, line in settings.parameters.items() if line.per_experiment]
     for name in (*ties, *own):
         if name not in model.parameters:
             raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
@@ -38,16 +44,6 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
             expected="a model with equations",
             got="an FMU",
         )
-    for name, line in own.items():
-        p = model.parameters[name]
-        start, low, high = (
-            old if new is None else new for new, old in ((line.start, p.value), (line.min, p.min), (line.max, p.max))
-        )
-        try:
-            changed = replace(p, value=start, min=low, max=high)
-        except InputError as e:
-            raise e.at(f"{where}, parameters.{name}") from None
-        model = replace(model, parameters=model.parameters | {name: changed})
     if not ties:
         return model
     expressions = {}
@@ -63,11 +59,16 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
 
 
 def with_nuisances(
-    settings: schema.StudyFile, model: AnyModel, experiments: Sequence[Experiment], candidates: Sequence[str]
+    settings: schema.StudyFile,
+    model: AnyModel,
+    experiments: Sequence[Experiment],
+    candidates: Sequence[str],
+    where: str,
 ) -> tuple[Experiment, ...]:
     """The experiments with the parameters each has for itself: those asked for, and the free starts of states.
 
-    A start that is "free" is unknown: it is estimated in every experiment unless it is a candidate, one for all.
+    A start that is "free" is unknown: it is estimated in every experiment unless it is a candidate, one for all. Raises StudyError
+    where the bounds of one do not hold its start.
     """
     own = [n for n, line in settings.parameters.items() if line.per_experiment]
     if isinstance(model, Model):
@@ -75,7 +76,23 @@ def with_nuisances(
         own += [n for n in free if n not in candidates and n not in own]
     if not own:
         return tuple(experiments)
-    return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own)))) for e in experiments)
+    search = {}
+    for name in (n for n in own if n in settings.parameters):
+        try:
+            found = free_of(name, settings.parameters[name], model)
+        except InputError as e:
+            raise e.at(f"{where}, parameters.{name}") from None
+        search[name] = (found.start, found.min, found.max)
+    return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own))), search=search) for e in experiments)
+
+
+def free_of(name: str, line: schema.Candidate, model: AnyModel) -> Free:
+    """The unknown of a fit that a line of [parameters] describes; what it leaves out is the model's, its given value too.
+
+    Raises StudyError where the bounds do not hold the start.
+    """
+    stated = {k: v for k in ("start", "min", "max") if (v := getattr(line, k)) is not None}
+    return Free.of(name, model.parameters[name], **stated)
 
 
 def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> FrozenMap[Prior]:

@@ -32,7 +32,7 @@ effect = "lag"
 at = ["Ir1", "Ir2"]
 parameters = {T = 0.0016}
 [parameters]
-KPVDC = {start = 21.5, min = 10, max = 40}
+KPVDC = {given = 21.5, start = 30, min = 10, max = 40}
 """
 
 

@@ -35,7 +35,7 @@ def narrow_pass(t, p):
     return p["a"] + p["b"] * t + 1e-6 * p["c"] * t**2, {"a": np.ones_like(t), "b": t, "c": 1e-6 * t**2}
 
 
-def test_a_weak_parameter_is_held_at_another_value_where_its_start_cannot_be_run() -> None:
+def test_a_weak_parameter_is_held_at_another_value_where_its_given_one_cannot_be_run() -> None:
     """At its start, 4, the others cannot be at their optimum, b = 5."""
     y = 1.0 + 5.0 * T + 1e-2 * np.random.default_rng(0).normal(size=T.size)
     free = [Free("a", 0.0, -5.0, 5.0), Free("b", 1.0, 0.1, 20.0), Free("c", 4.0, 0.01, 7.0)]
@@ -45,6 +45,6 @@ def test_a_weak_parameter_is_held_at_another_value_where_its_start_cannot_be_run
     assert report.identifiable == ("a", "b")
     value, why = report.held["c"]
     assert 0.01 <= value < 8.0 / 5.0 and report.parameters["c"].value == value
-    assert "at its start value, 4, the model cannot be run" in why
-    assert "at its start value, 4, the model cannot be run" in report.parameters["c"].reason
+    assert "at its given value, 4, the model cannot be run" in why
+    assert "at its given value, 4, the model cannot be run" in report.parameters["c"].reason
     assert report.parameters["b"].ci95[0] < 5.0 < report.parameters["b"].ci95[1]

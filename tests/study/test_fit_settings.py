@@ -162,7 +162,7 @@ def test_a_frequency_residual_and_a_named_optimiser(folder):
         ((GAIN, GAIN + "\nKIQ = {tie = 'KIQ2'}\nKIQ2 = {tie = 'KIQ'}"), "which is tied itself"),
         ((GAIN, GAIN + "\nKIQ = {tie = 'KIQ2', start = 3}"), "neither start, bounds nor prior"),
         ((GAIN, GAIN + "\nKIQ = {prior = {mean = 30, std = 0}}"), r"parameters.KIQ.prior.std"),
-        ((GAIN, GAIN + "\nKIQ = {start = -3, per-experiment = true}"), "outside its own bounds"),
+        ((GAIN, GAIN + "\nKIQ = {start = -3, per-experiment = true}"), "the start or the bounds of 'KIQ' are wrong"),
         ((OUTPUT, OUTPUT + '\nnuisance = ["Pref3"]'), r"no nuisance 'Pref3'.*did you mean 'Pref2'"),
     ],
 )

@@ -55,11 +55,11 @@ def test_values_effects_and_parameterisation_reach_the_model(tmp_path: Path) -> 
     assert 0.002 in study.model.values.values()
 
 
-def test_stated_values_win_over_starts_in_a_simulation_not_in_a_fit(tmp_path: Path) -> None:
+def test_a_simulation_has_the_given_values_and_a_fit_begins_at_the_starts(tmp_path: Path) -> None:
     head = "[model.values]\nKIP = 31\n[parameters]\nKIP = {start = 25, min = 5, max = 50}\n"
     head += "KPVDC = {start = 20, max = 40}\n"
     study = loaded(tmp_path, head=head)
-    assert dict(study.values) == {"KIP": 31.0, "KPVDC": 20.0}
+    assert dict(study.given) == {"KIP": 31.0, "KPVDC": 24.0}  # the study's own value, and the model's
     assert dict(study.start) == {"KIP": 25.0, "KPVDC": 20.0}
     assert study.candidates["KPVDC"].min == 0.0
 

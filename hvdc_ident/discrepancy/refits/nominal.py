@@ -181,7 +181,7 @@ def _stated(experiment: Experiment, output: str, noise: Noise) -> float | None:
 
 
 def _told_apart(optimum: Optimum) -> tuple[Optimum, dict[str, float]]:
-    """The optimum without the parameters that these data do not tell apart from the others, held at their start where it runs."""
+    """The optimum without the parameters that these data do not tell apart from the others, held at their given values where it runs."""
     k = len(optimum.names)
     dead = [n for n, c in zip(optimum.names, optimum.columns.T, strict=False) if not np.any(c)]
     null = null_directions(optimum.columns)[:, :k]
@@ -189,6 +189,6 @@ def _told_apart(optimum: Optimum) -> tuple[Optimum, dict[str, float]]:
     lost = [n for n in optimum.names if n in dead or (n not in kept and np.any(null[:, optimum.names.index(n)]))]
     if not lost or len(lost) == k:
         return optimum, {}
-    starts = {f.name: f.start for f in optimum.problem.free if f.name in lost}
-    fewer = optimum.held(dict.fromkeys(lost, "not told apart"), starts)
+    given = {f.name: f.given for f in optimum.problem.free if f.name in lost}
+    fewer = optimum.held(dict.fromkeys(lost, "not told apart"), given)
     return fewer, {n: fewer.problem.held[n] for n in lost}

@@ -20,7 +20,7 @@ from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 
 BIASED = 0.4
-"""Share of its start value by which a gain has moved when it may have taken an effect's place."""
+"""Share of its given value by which a gain has moved when it may have taken an effect's place."""
 
 
 def job(
@@ -68,14 +68,14 @@ def _begin(before: Refit, theta: Array, sizes: Array) -> Array:
 
 
 def as_given(refit: Refit) -> Array | None:
-    """The unknowns with the gains at their start values; None where none of them has moved far."""
+    """The unknowns with the gains at their given values, as near as the bounds let; None where none of them has moved far."""
     added_here = {n for p in refit.placed for n in p.names.values()}
     gains = [k for k, f in enumerate(refit.problem.free) if f.name not in added_here]
     theta, far = refit.theta.copy(), False
     for k in gains:
         f = refit.problem.free[k]
-        far = far or abs(theta[k] - f.start) > BIASED * abs(f.start) or f.on_bound(theta[k])
-        theta[k] = f.start
+        far = far or abs(theta[k] - f.given) > BIASED * abs(f.given) or f.on_bound(theta[k])
+        theta[k] = min(max(f.given, f.min), f.max)
     return theta if far else None
 
 

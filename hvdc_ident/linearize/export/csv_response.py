@@ -20,7 +20,12 @@ _ARROW = " from "
 
 def write(model: LinearModel, path: Path) -> Path:
     """The path, written, at frequencies around the poles."""
-    return write_text(path, text(model.bode()))
+    return write_text(path, text(model.bode()) + _note(model))
+
+
+def _note(model: LinearModel) -> str:
+    """Where the response comes from, as comments below it: readers that take names from the first line still do."""
+    return "".join(f"# {' '.join(f'{k}: {v}'.split())}\n" for k, v in model.provenance.items())
 
 
 def text(response: Response) -> str:
@@ -40,7 +45,8 @@ def text(response: Response) -> str:
 def read(path: Path) -> Response:
     """The response of a file that `write` wrote. Raises ModelError."""
     try:
-        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = list(csv.reader(line for line in lines if not line.startswith("#")))
         data = np.array([[float(v) for v in row] for row in rows[1:]])
     except (OSError, ValueError) as e:
         raise ModelError("the frequency response cannot be read", where=str(path), got=str(e)) from None

@@ -16,9 +16,10 @@ SUMMARY = "the transfer functions in LaTeX, zeros and poles with six digits"
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written: one displayed equation for each channel."""
+    """The path, written: where the model comes from as comments, then one displayed equation for each channel."""
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
-    return write_text(path, "\n".join(text(f) for f in functions))
+    head = "".join(f"% {' '.join(f'{k}: {v}'.split())}\n" for k, v in model.provenance.items())
+    return write_text(path, head + "\n".join(text(f) for f in functions))
 
 
 def text(f: TransferFunction, digits: int = 6) -> str:

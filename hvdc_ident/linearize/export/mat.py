@@ -1,8 +1,9 @@
-"""MATLAB .mat version 5: A, B, C, D, E, names, units, x0, u0, y0 as variables of their own."""
+"""MATLAB .mat version 5: A, B, C, D, E, names, units, x0, u0, y0 as variables of their own, provenance as a struct."""
 
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ def write(model: LinearModel, path: Path) -> Path:
         content[f"{kind}_units"] = cells(getattr(model, f"{kind}_units"))
     content |= {k: np.array(getattr(model, k), dtype=float).reshape(-1, 1) for k in ("x0", "u0", "y0")}
     content["name"] = model.name
+    if model.provenance:
+        content["provenance"] = {re.sub(r"\W", "_", k): v for k, v in model.provenance.items()}
     stream = io.BytesIO()
     scipy.io.savemat(stream, content, format="5", oned_as="column")
     return write_bytes(path, stream.getvalue())

@@ -22,7 +22,8 @@ def write(model: LinearModel, path: Path) -> Path:
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     rows = [{**f.to_dict(), "sections": sections(f).tolist()} for f in functions]
     text = "[b2, b1, b0, a2, a1, a0] in falling powers of s; G is their product"
-    return write_text(path, json_text({"schema": 1, "model": model.name, "sections": text, "transfer_functions": rows}))
+    head = {"schema": 1, "model": model.name, "provenance": dict(model.provenance), "sections": text}
+    return write_text(path, json_text({**head, "transfer_functions": rows}))
 
 
 def read(path: Path) -> tuple[TransferFunction, ...]:

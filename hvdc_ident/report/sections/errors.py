@@ -1,4 +1,4 @@
-"""The table of RMSE before and after the fit, by output and experiment."""
+"""The table of RMSE at the given values and after the fit, by output and experiment."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOST = 36
 def _render(results: Results) -> str:
     fit, simulation = results.get("fit"), results.get("simulation")
     after = fit.get("rmse") or {}
-    before = fit.get("rmse_start") or simulation.get("rmse") or {}
+    before = fit.get("rmse_given") or simulation.get("rmse") or {}
     if not before and not after:
         return ""
     roles = {**(simulation.get("experiments") or {}), **(fit.get("experiments") or {})}
@@ -38,7 +38,7 @@ def _render(results: Results) -> str:
                     text(units.get(output, "")),
                 ]
             )
-    header = ["output", "experiment", "role", "RMSE before", "RMSE after", "change", "noise", "unit"]
+    header = ["output", "experiment", "role", "RMSE, given values", "RMSE, fitted", "change", "noise", "unit"]
     failed = [(n, e) for n, e in roles.items() if e.get("status") == "failed"]
     told = "".join(
         f"<p>Experiment <strong>{text(n)}</strong> could not be simulated: {text(e.get('reason', ''))}</p>"

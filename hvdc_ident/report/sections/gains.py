@@ -1,4 +1,4 @@
-"""The table of gains: start, estimate, spread, interval, and why some are held."""
+"""The table of gains: given value, estimate, spread, interval, and why some are held."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def _render(results: Results) -> str:
     if not candidates:
         return ""
     rows = [_row(name, line, fit) for name, line in candidates.items()]
-    header = ["parameter", "start", "fitted", "change", "std", "95 % interval", "bounds", "unit", "note"]
+    header = ["parameter", "given", "fitted", "change", "std", "95 % interval", "bounds", "began at", "unit", "note"]
     held = fit.get("held") or {}
     fixed = [n for n in held if n not in candidates]
     outcome = _outcome(fit)
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
-    return outcome + table(header, rows, words=(0, 7, 8)) + _weights(fit) + rest + _more(fit)
+    return outcome + table(header, rows, words=(0, 8, 9)) + _weights(fit) + rest + _more(fit)
 
 
 STATUS = {
@@ -124,12 +124,13 @@ def _row(name: str, line: dict[str, Any], fit: dict[str, Any]) -> list[str]:
     bounds = f"{_end(line.get('min'), '−∞')} … {_end(line.get('max'), '∞')}"
     return [
         f"<strong>{text(name)}</strong>",
-        number(line.get("start")),
+        number(line.get("given")),
         f"<strong>{number(value)}</strong>",
-        share(value, line.get("start")),
+        share(value, line.get("given")),
         number(estimate.get("std"), 2),
         interval,
         bounds,
+        number(line.get("start")) if line.get("start") != line.get("given") else "",
         text(line.get("unit", "")),
         text("; ".join(notes)),
     ]

@@ -24,20 +24,37 @@ CHECKS = {
 
 
 def _render(results: Results) -> str:
-    data = results.get("linearization")
-    modes = data.get("modes") or []
-    if not modes:
+    """The linear model at the fitted values where there is one, beside the one at the given values."""
+    given = results.get("linearization")
+    if not given.get("modes"):
         return ""
-    point = data.get("operating_point") or {}
+    fitted = given.get("fitted") or {}
+    found = fitted if fitted.get("modes") else None
+    shown = found or given
+    point = shown.get("operating_point") or {}
     return (
-        _point(data, point)
-        + _modes(modes)
+        _which(given, results.get("fit"))
+        + _point(shown, point)
+        + _modes(given["modes"], found)
         + _limits(point)
-        + _bode(data)
-        + _margins(data)
-        + _ports(data)
-        + _others(data)
+        + _bode(given, found)
+        + _margins(shown)
+        + _ports(shown)
+        + _others(shown)
     )
+
+
+def _which(given: dict[str, Any], fit: dict[str, Any]) -> str:
+    """At which values the linear models stand."""
+    fitted, note = given.get("fitted") or {}, str(given.get("fitted_note") or "")
+    if fitted.get("modes"):
+        lines = [f"At the <strong>{text(note)}</strong>, beside the given values."]
+    else:
+        why = fitted.get("message") or note
+        lines = [f"At the <strong>given</strong> values{': ' if why else ''}{text(why)}."]
+    if fit.get("fingerprint") and fit["fingerprint"] != fitted.get("fit"):
+        lines.append("A fit has run since: `hvdc-ident linearize` takes it in.")
+    return f"<p>{' '.join(lines)}</p>"
 
 
 def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
@@ -51,21 +68,38 @@ def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
     )
 
 
-def _modes(modes: list[dict[str, Any]]) -> str:
-    rows = []
-    for m in modes:
-        re, im = (float(v) for v in m["eigenvalue"])
-        if im < 0:
-            continue
-        shares = sorted(m["participation"].items(), key=lambda item: -item[1])[:3]
-        states = ", ".join(f"{n} {v:.2f}" for n, v in shares if v >= 0.05)
-        value = number(re) if im == 0 else f"{number(re)} ± {number(im)}j"
-        name = str(m.get("name", ""))
-        name = "" if name in m["participation"] or all(n in m["participation"] for n in name.split(" + ")) else name
-        row = [value, number(m["frequency_hz"]), number(m["damping"], 3), text(name), text(states)]
-        rows.append([*row, text(m.get("kind", ""))])
-    header = ["eigenvalue, rad/s", "frequency, Hz", "damping", "mode of", "states that take part", "kind"]
-    return table(header, rows, words=(3, 4, 5))
+def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
+    """The modes, one a row; with those at the fitted values each beside the given one that it belongs to."""
+    head = ["eigenvalue, rad/s", "frequency, Hz", "damping"]
+    rest = ["mode of", "states that take part", "kind"]
+    if fitted is None:
+        rows = [[*_numbers(m), *_words(m)] for m in given if m["eigenvalue"][1] >= 0]
+        return table([*head, *rest], rows, words=(3, 4, 5))
+    if len(fitted["modes"]) != len(given):  # an effect that has no size there has no states
+        return "".join(
+            f"<h3>Modes at the {name} values</h3>{_modes(modes, None)}"
+            for name, modes in (("fitted", fitted["modes"]), ("given", given))
+        )
+    pairs = [
+        (g, f) for g, f in zip(given, fitted["modes"], strict=True) if max(g["eigenvalue"][1], f["eigenvalue"][1]) >= 0
+    ]
+    rows = [[*_numbers(g), *_numbers(f), *_words(f)] for g, f in pairs]
+    names = [f"{h}: {which}" for which in ("given", "fitted") for h in head]
+    return table([*names, *rest], rows, words=(6, 7, 8))
+
+
+def _numbers(m: dict[str, Any]) -> list[str]:
+    re, im = (float(v) for v in m["eigenvalue"])
+    value = number(re) if im == 0 else f"{number(re)} ± {number(abs(im))}j"
+    return [value, number(m["frequency_hz"]), number(m["damping"], 3)]
+
+
+def _words(m: dict[str, Any]) -> list[str]:
+    shares = sorted(m["participation"].items(), key=lambda item: -item[1])[:3]
+    states = ", ".join(f"{n} {v:.2f}" for n, v in shares if v >= 0.05)
+    name = str(m.get("name", ""))
+    name = "" if name in m["participation"] or all(n in m["participation"] for n in name.split(" + ")) else name
+    return [text(name), text(states), text(m.get("kind", ""))]
 
 
 def _limits(point: dict[str, Any]) -> str:
@@ -77,36 +111,48 @@ def _limits(point: dict[str, Any]) -> str:
     return f"<p>Active limits: {text(held)}.{' The nearest others:' if rows else ''}</p>{listed}"
 
 
-def _bode(data: dict[str, Any]) -> str:
-    response = data.get("frequency_response")
-    if not response:
+def _bode(given: dict[str, Any], fitted: dict[str, Any] | None) -> str:
+    """Gain and phase of every channel; with a model at the fitted values that one is solid and the given one dashed."""
+    models = [("", given)] if fitted is None else [(", fitted", fitted), (", given", given)]
+    drawn = [(label, found) for label, data in models if (found := data.get("frequency_response"))]
+    if not drawn:
         return ""
-    omega = np.array(response["omega"], dtype=float)
-    values = np.array(response["real"], dtype=float) + 1j * np.array(response["imag"], dtype=float)
     fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
-    gain, phase = fig.subplots(2, 1, sharex=True)
-    k = 0
-    for i, output in enumerate(response["outputs"]):
-        for j, source in enumerate(response["inputs"]):
-            v = values[:, i, j]
-            keep = (omega > 0) & (np.abs(v) > 0)
-            if not keep.any():
-                continue
-            style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": LINES[k % len(LINES)]}
-            hertz = omega[keep] / (2 * np.pi)
-            gain.semilogx(hertz, 20 * np.log10(np.abs(v[keep])), label=f"{source} to {output}", **style)
-            phase.semilogx(hertz, np.degrees(np.unwrap(np.angle(v[keep]))), **style)
-            k += 1
-    if k == 0:
+    axes = fig.subplots(2, 1, sharex=True)
+    count = sum(
+        _curves(axes, response, label, k if len(drawn) > 1 else None) for k, (label, response) in enumerate(drawn)
+    )
+    if count == 0:
         return ""
+    gain, phase = axes
     gain.set_ylabel("gain, dB")
     phase.set_ylabel("phase, degrees")
     phase.set_xlabel("frequency, Hz")
     gain.legend(fontsize="small")
-    for axes in (gain, phase):
-        axes.grid(True, color="#dddddd", linewidth=0.5)
-        axes.yaxis.set_label_coords(-0.08, 0.5)
+    for part in axes:
+        part.grid(True, color="#dddddd", linewidth=0.5)
+        part.yaxis.set_label_coords(-0.08, 0.5)
     return f"<figure>{svg(fig, 'Bode diagram of the linear model')}</figure>"
+
+
+def _curves(axes: Any, response: dict[str, Any], label: str, which: int | None) -> int:
+    """Draw one model's channels, each in a colour of its own, and return how many. which: of several models, their line."""
+    omega = np.array(response["omega"], dtype=float)
+    values = np.array(response["real"], dtype=float) + 1j * np.array(response["imag"], dtype=float)
+    channels = [(i, j) for i in range(len(response["outputs"])) for j in range(len(response["inputs"]))]
+    count = 0
+    for k, (i, j) in enumerate(channels):
+        v = values[:, i, j]
+        keep = (omega > 0) & (np.abs(v) > 0)
+        if not keep.any():
+            continue
+        line = LINES[(k if which is None else which) % len(LINES)]
+        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": line}
+        hertz, name = omega[keep] / (2 * np.pi), f"{response['inputs'][j]} to {response['outputs'][i]}{label}"
+        axes[0].semilogx(hertz, 20 * np.log10(np.abs(v[keep])), label=name, **style)
+        axes[1].semilogx(hertz, np.degrees(np.unwrap(np.angle(v[keep]))), **style)
+        count += 1
+    return count
 
 
 def _hertz(omega: Any) -> str:

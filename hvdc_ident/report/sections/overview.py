@@ -37,11 +37,11 @@ def _estimated(results: Results, fit: dict[str, Any]) -> str:
         return ""
     moved = {}
     for name in fitted:
-        start, value = (fit["candidates"].get(name) or {}).get("start"), (fit.get("values") or {}).get(name)
-        if start and value is not None:
-            moved[name] = (abs(value / start - 1.0), share(value, start), number(value))
+        given, value = (fit["candidates"].get(name) or {}).get("given"), (fit.get("values") or {}).get(name)
+        if given and value is not None:
+            moved[name] = (abs(value / given - 1.0), share(value, given), number(value))
     most = max(moved, key=lambda n: moved[n][0], default=None)
-    how = f"; {text(most)} moves most, by {moved[most][1]} to {moved[most][2]}" if most else ""
+    how = f"; {text(most)} differs most from what was given, by {moved[most][1]}: {moved[most][2]}" if most else ""
     unit = str((fit["candidates"].get(most) or {}).get("unit", "")) if most else ""
     return (
         f"{_count(len(fitted), 'parameter')} estimated: {text(listed(fitted))}{how} {text(unit)}".rstrip() + f"{rest}."
@@ -53,7 +53,7 @@ def _closer(fit: dict[str, Any]) -> str:
     if not ratios:
         return ""
     low, high = number(100 * min(ratios), 3), number(100 * max(ratios), 3)
-    return f"After the fit the RMSE of each signal is {low if low == high else f'{low} to {high}'} % of what it was before."
+    return f"After the fit the RMSE of each signal is {low if low == high else f'{low} to {high}'} % of what it is with the given values."
 
 
 def _adequate(fit: dict[str, Any]) -> str:
@@ -111,7 +111,7 @@ def _count(n: int, word: str) -> str:
 
 def _ratios(fit: dict[str, Any]) -> list[float]:
     """RMSE after over before for each output and experiment that the fit used and that moved at all."""
-    before, found = fit.get("rmse_start") or {}, []
+    before, found = fit.get("rmse_given") or {}, []
     for output, line in (fit.get("rmse") or {}).items():
         for name, after in line.items():
             first = (before.get(output) or {}).get(name)

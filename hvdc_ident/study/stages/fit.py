@@ -54,18 +54,11 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 
 def _context(study: Study, options: Options, report: Mapping[str, Any], result: FitResult) -> dict[str, Any]:
     """What a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
+    from hvdc_ident.study.tables import candidate_lines
+
     return {
         "forced": [n for n in options.force if n in result.fitted and n not in report["identifiable"]],
-        "candidates": {
-            n: {
-                "start": f.start,
-                "min": f.min,
-                "max": f.max,
-                "searched": f.drawn,
-                "unit": study.model.parameters[n].unit,
-            }
-            for n, f in study.candidates.items()
-        },
+        "candidates": candidate_lines(study),
         "units": {o: study.model.outputs[o].unit for o in result.rmse},
         "experiments": {
             e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording}
@@ -88,15 +81,25 @@ def _files(
     units = {n: study.model.parameters[n].unit for n in values}
     follow = [f"# {n} = {d['expression']} = {d['value']!r}" for n, d in data["derived"].items()]
     files = {
-        "fitted-values.toml": result.to_toml_values() + "".join(f"{line}\n" for line in follow),
+        "fitted-values.toml": _head(study, values) + result.to_toml_values() + "".join(f"{line}\n" for line in follow),
         "fitted-values.csv": values_csv(values, units, data["estimates"], result.held),
-        "fitted-values.ssv": ssv(values, study.name),
+        "fitted-values.ssv": ssv(values, study.name, f"fitted values of study '{study.name}' (fit {result.status})"),
     }
     return files | {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
 
 
+def _head(study: Study, values: Mapping[str, float]) -> str:
+    """Comments above the fitted values: what pasting them does, and the given values, which are then no longer the model's."""
+    given = ", ".join(f"{n} {study.candidates[n].given!r}" for n in values)
+    return (
+        f"# Fitted values of study '{' '.join(study.name.split())}'. Given were {given}.\n"
+        "# In [model.values] they become the given values of a study, what its results are compared with, unless [parameters]\n"
+        "# says otherwise: NAME = {given = ...}. `hvdc-ident export --values fitted` needs no pasting.\n"
+    )
+
+
 def told(data: Mapping[str, Any]) -> list[str]:
-    """The status and the verdict on the residuals, then every estimate as it may be stated, then what is held."""
+    """The status and the verdict on the residuals, then every estimate beside its given value, then what is held."""
     lines = [f"{data['status']}: {data['message']}"]
     judged = data.get("adequacy") or {}
     lines += [f"{WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
@@ -104,7 +107,8 @@ def told(data: Mapping[str, Any]) -> list[str]:
     beside = _beside(data)
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
-        lines.append(f"{name} = {e['value']:.6g}{unit}{_interval(e['ci95'], beside)}" + _note(e))
+        given = f" (given {data['candidates'][name]['given']:.6g})"
+        lines.append(f"{name} = {e['value']:.6g}{unit}{given}{_interval(e['ci95'], beside)}" + _note(e))
     held = [n for n in data["candidates"] if n not in data["estimates"]]
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
     return lines + _searched(data)

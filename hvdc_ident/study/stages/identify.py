@@ -20,6 +20,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     from hvdc_ident.identifiability import identifiability, identifiability_by_group
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
+    from hvdc_ident.study.tables import candidate_lines
 
     need_experiments(study, "identify", role="fit")
     need_candidates(study, "identify")
@@ -37,8 +38,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         asked = (study.model, study.experiments, tuple(study.candidates.values()))
         groups = groups_of(study)
         report = identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
-    bounds = {n: {"start": f.start, "min": f.min, "max": f.max} for n, f in study.candidates.items()}
-    return Outcome({**report.to_dict(), "candidates": bounds})
+    return Outcome({**report.to_dict(), "candidates": candidate_lines(study)})
 
 
 def groups_of(study: Study) -> list[Group]:

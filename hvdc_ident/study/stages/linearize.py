@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stage import Options, Outcome, Stage
@@ -10,6 +11,7 @@ from hvdc_ident.study.stage import Options, Outcome, Stage
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
     from hvdc_ident.study.study import Study
+    from hvdc_ident.study.values import ValueSet
 
 CHECKS = {
     "symbolic": "complex step of 1e-30 through the equations, relative to each row's largest entry",
@@ -21,19 +23,46 @@ MOST_DRAWN = 12
 
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
-    """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for."""
+    """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for.
+
+    All of it at the given values, and under `fitted` at the fitted ones where a fit stands in the folder.
+    """
+    from hvdc_ident.errors import HvdcIdentError
+    from hvdc_ident.study.needs import at_given
+    from hvdc_ident.study.values import fitted_values, value_set
+
+    given = value_set(study, "given")
+    with at_given(study):
+        model = linear_model(study, given)
+    data, files = _described(study, model, given, options)
+    found, why = (None, "") if options.folder is None else fitted_values(study, options.folder)
+    if found is None or why:
+        return Outcome({**data, "fitted_note": why}, files)
+    try:
+        other, more = _described(study, linear_model(study, found), found, options, like=data["modes"])
+    except HvdcIdentError as e:  # the given model is the answer all the same
+        other, more = {"values": found.name, "parameters": dict(found.values), "message": f"no linear model: {e}"}, {}
+    files |= {f"fitted.{name}": text for name, text in more.items()}
+    return Outcome({**data, "fitted": {**other, "fit": found.fit}, "fitted_note": found.note}, files)
+
+
+def _described(
+    study: Study, model: LinearModel, chosen: ValueSet, options: Options, like: Sequence[Mapping[str, Any]] = ()
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
     from hvdc_ident.study.linear import analyses, modes_of
 
-    model = linear_model(study)
     point = model.point
     assert point is not None
     options.progress(1, 3, "modes and transfer functions")
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     data = {
+        "values": chosen.name,
+        "parameters": dict(chosen.values),
         **model.to_dict(),
         "operating_point": point.to_dict(),
-        "modes": modes_of(study, model),
+        "modes": _ordered(modes_of(study, model), like),
         "transfer_functions": [f.to_dict() for f in functions],
         "method": model.provenance["method"],
         "jacobian_error": jacobian_error(point.model, point, model.output_names),
@@ -46,29 +75,47 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     data |= more
     for key in ("schema", "kind", "model"):
         data.pop(key, None)
-    return Outcome(data, files)
+    return data, files
 
 
-def linear_model(study: Study) -> LinearModel:
-    """The linear model that a study's [linearize] asks for; without that table between all inputs and outputs."""
+def _ordered(modes: list[dict[str, Any]], like: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The modes, each at the place of the nearest of the others (relative, all together); as they are where counts differ."""
+    import numpy as np
+    from scipy.optimize import linear_sum_assignment
+
+    if len(modes) != len(like) or not modes:
+        return modes
+    own, other = (np.array([complex(*m["eigenvalue"]) for m in some]) for some in (modes, like))
+    size = np.maximum(np.maximum(np.abs(own)[None, :], np.abs(other)[:, None]), np.finfo(float).tiny)
+    return [modes[k] for k in linear_sum_assignment(np.abs(other[:, None] - own[None, :]) / size)[1]]
+
+
+def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
+    """The linear model that a study's [linearize] asks for, at these values; without that table between all inputs and outputs."""
     from hvdc_ident.linearize import linearize
     from hvdc_ident.study.linear import operating_point
 
     asked = study.settings.linearize
-    return linearize(
+    model = linearize(
         study.model,
-        operating_point(study),
+        operating_point(study, chosen.values),
         inputs=asked.inputs if asked else None,
         outputs=asked.outputs if asked else None,
         sensitivities=list(study.candidates),
     )
+    return replace(model, provenance=model.provenance | {"values": chosen.note})
 
 
 def told(data: Mapping[str, Any]) -> list[str]:
-    """The operating point, the modes that oscillate, then margins, ports, comparison and reduction."""
+    """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
     from hvdc_ident.study.linear import lines
 
-    return lines(data)
+    fitted = data.get("fitted") or {}
+    found = ["at the given values:", *lines(data)]
+    if fitted.get("modes"):
+        return [*found, f"at the {data['fitted_note']}:", *lines(fitted)]
+    why = fitted.get("message") or data["fitted_note"]
+    return [*found, f"none at fitted values: {why}"] if why else found
 
 
 STAGE = Stage(
@@ -77,6 +124,7 @@ STAGE = Stage(
     summary="The operating point, linear model, modes and transfer functions.",
     run=run,
     wanted=lambda study: study.settings.linearize is not None,
-    order=20,
+    order=45,
+    uses=("fit",),
     tell=told,
 )

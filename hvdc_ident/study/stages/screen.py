@@ -37,7 +37,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     with workers_of(options) as pool:
         common: dict[str, Any] = {
             "against": asked.against,
-            "values": study.values,
+            "values": study.given,
             "seed": options.seed,
             "executor": pool,
             "progress": options.progress,

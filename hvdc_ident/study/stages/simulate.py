@@ -1,4 +1,4 @@
-"""The stage `simulate`: the model as it is given, against every recording."""
+"""The stage `simulate`: the model at its given values, against every recording."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The RMSE of each output in each experiment, and a CSV of measured and simulated outputs for each experiment."""
-    from hvdc_ident.errors import SimulationError
+    from hvdc_ident.errors import ComputationError
     from hvdc_ident.simulate import simulate
-    from hvdc_ident.study.needs import need_experiments
+    from hvdc_ident.study.needs import at_given, need_experiments
     from hvdc_ident.study.tables import comparison_csv, rmse
 
     need_experiments(study, "simulate")
@@ -25,8 +25,9 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     for done, experiment in enumerate(study.experiments):
         options.progress(done, len(study.experiments), f"experiment '{experiment.name}'")
         try:
-            simulated = simulate(study.model, experiment, study.values).trajectory
-        except SimulationError as e:
+            with at_given(study):
+                simulated = simulate(study.model, experiment, study.given).trajectory
+        except ComputationError as e:
             status[experiment.name] = {"status": "failed", "reason": str(e)}
             for output in experiment.outputs:
                 table.setdefault(output, {})[experiment.name] = None
@@ -37,7 +38,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         files[f"simulation.{experiment.name}.csv"] = comparison_csv(experiment, simulated)
     failed = [name for name, s in status.items() if s["status"] == "failed"]
     data = {
-        "values": {**study.model.values, **study.values},
+        "values": {**study.model.values, **study.given},
         "rmse": table,
         "units": {o: study.model.outputs[o].unit for o in table},
         "experiments": {
@@ -51,7 +52,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 STAGE = Stage(
     name="simulate",
     file="simulation.json",
-    summary="The model as it is given, against every recording.",
+    summary="The model at its given values, against every recording.",
     run=run,
     wanted=lambda study: bool(study.experiments),
     order=10,

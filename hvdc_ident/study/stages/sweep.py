@@ -39,7 +39,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             study.experiments,
             axes_of(tables, options.seed),
             against=study.against or ("base" if against_of(tables) == "base" else "data"),
-            values=study.values,
+            values=study.given,
             want=want,
             linear=(linear.inputs or list(study.model.inputs), linear.outputs or list(study.model.outputs))
             if linear
