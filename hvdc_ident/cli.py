@@ -9,7 +9,7 @@ import functools
 import os
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -101,6 +101,16 @@ def _say(text: str, *, json: bool, quiet: bool) -> None:
         typer.echo(text)
 
 
+def _announcer(*, json: bool, quiet: bool) -> Callable[[Sequence[str]], None]:
+    """Who says what to know before the work begins: on stderr where stdout is asked to hold JSON."""
+
+    def announce(lines: Sequence[str]) -> None:
+        for line in () if quiet else lines:
+            typer.echo(line, err=json)
+
+    return announce
+
+
 def _print_json(value: Any) -> None:
     from hvdc_ident.files import json_pieces
 
@@ -136,7 +146,8 @@ def demo(
 
     with progress(quiet or json) as told:
         study = load_study(write_demo(out, seed=seed, progress=told))
-        done = _run_all(study, out, Options(workers, seed, told, executor=executor))
+        announce = _announcer(json=json, quiet=quiet)
+        done = _run_all(study, out, Options(workers, seed, told, executor=executor, announce=announce))
     _tell_run(study, out, done, json=json, quiet=quiet)
 
 
@@ -163,7 +174,7 @@ def new(
 def check(
     study: StudyFile, seed: Seed = 0, json: Json = False, quiet: Quiet = False, trust: Trust = False, out: Out = None
 ) -> None:
-    """Validate study, model and data; run nothing."""
+    """Validate study, model and data, and compare the levels before each event; run no stage."""
     from hvdc_ident.study.study import load_study
     from hvdc_ident.study.summary import summary, summary_text
 
@@ -195,7 +206,8 @@ def run_(
     loaded = load_study(study, trust)
     folder = out or loaded.folder
     with progress(quiet or json) as told:
-        done = _run_all(loaded, folder, Options(workers, seed, told, executor=executor))
+        announce = _announcer(json=json, quiet=quiet)
+        done = _run_all(loaded, folder, Options(workers, seed, told, executor=executor, announce=announce))
     _tell_run(loaded, folder, done, json=json, quiet=quiet)
 
 
@@ -244,8 +256,9 @@ def _run_one(
 
     loaded = load_study(study, trust)
     folder = out or loaded.folder
+    announce = _announcer(json=json, quiet=quiet)
     with progress(quiet or json) as told:
-        done = run_stage(loaded, stage.name, folder, replace(options, progress=told))
+        done = run_stage(loaded, stage.name, folder, replace(options, progress=told, announce=announce))
     if json:
         _print_json(done.data)
     for line in () if done.failed else stage.tell(done.data):
@@ -313,7 +326,8 @@ def letter(
     loaded = load_study(study, trust)
     folder = out or loaded.folder
     with progress(quiet or json) as told:
-        page, done = write(loaded, folder, Options(workers, seed, told, executor=executor))
+        announce = _announcer(json=json, quiet=quiet)
+        page, done = write(loaded, folder, Options(workers, seed, told, executor=executor, announce=announce))
     if json:
         _print_json({"schema": 1, "file": page.as_posix(), "verdict": done.data.get("verdict")})
     _say(f"letter: {page}", json=json, quiet=quiet)

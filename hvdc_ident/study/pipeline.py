@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from hvdc_ident.errors import ComputationError, HvdcIdentError, LinearizationError, SteadyStateError
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
+from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
 from hvdc_ident.study.store import exclusive, source_hash
 from hvdc_ident.study.study import Study
@@ -40,15 +42,16 @@ def run_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
     wanted = stage(name)
     with exclusive(folder):
         earlier: dict[str, Any] = {}
+        rest = _rest_of(study, options)
         for before in wanted.after:
-            earlier[before] = _kept_or_run(study, stage(before), folder, options).data
-        return _run(study, wanted, folder, options, earlier)
+            earlier[before] = _kept_or_run(study, stage(before), folder, options, rest).data
+        return _run(study, wanted, folder, options, earlier, rest)
 
 
 def have_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
     """The stage's result, run only where the folder does not hold it for the same study, software and seed."""
     with exclusive(folder):
-        return _kept_or_run(study, stage(name), folder, options)
+        return _kept_or_run(study, stage(name), folder, options, _rest_of(study, options))
 
 
 def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
@@ -60,18 +63,19 @@ def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
     """
     done: dict[str, Done] = {}
     refused: dict[str, SteadyStateError | LinearizationError] = {}
+    rest = _rest_of(study, options)
     with exclusive(folder):
         for wanted in (s for s in stages() if s.wanted(study)):
             if any(b in refused or (b in done and done[b].failed) for b in wanted.after):
                 continue
             try:
-                done[wanted.name] = _kept_or_run(study, wanted, folder, options)
+                done[wanted.name] = _kept_or_run(study, wanted, folder, options, rest)
             except (SteadyStateError, LinearizationError) as error:
                 refused[wanted.name] = error
         if refused and all(d.failed for d in done.values()):
             raise next(iter(refused.values()))
         for name, reason in refused.items():
-            done[name] = _written(study, stage(name), folder, options, _failed(reason))
+            done[name] = _written(study, stage(name), folder, options, _failed(reason), rest())
     return [done[s.name] for s in stages() if s.name in done]
 
 
@@ -81,30 +85,51 @@ def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) ->
     write_text(folder / "run.json", json_text({**heading, "stages": rows}))
 
 
-def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options) -> Done:
+Rest = Callable[[], list[dict[str, Any]]]
+
+
+def _rest_of(study: Study, options: Options) -> Rest:
+    """A function that returns the recorded rest against the model's; it is compared, and announced, when first asked for.
+
+    So it is told before the work of the first stage that is not kept, and once.
+    """
+
+    @cache
+    def rest() -> list[dict[str, Any]]:
+        found = rest_levels(study)
+        options.announce(found.lines)
+        return found.to_list()
+
+    return rest
+
+
+def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options, rest: Rest) -> Done:
     kept = _kept(study, wanted, folder, options)
     if kept is not None:
         return Done(wanted, kept, "", fresh=False)
-    earlier = {b: _kept_or_run(study, stage(b), folder, options).data for b in wanted.after}
-    return _run(study, wanted, folder, options, earlier)
+    earlier = {b: _kept_or_run(study, stage(b), folder, options, rest).data for b in wanted.after}
+    return _run(study, wanted, folder, options, earlier, rest)
 
 
-def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any]) -> Done:
+def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any], rest: Rest) -> Done:
+    levels = rest()
     try:
         outcome = wanted.run(study, replace(options, folder=folder), earlier)
     except ComputationError as error:
         outcome = _failed(error)
-    return _written(study, wanted, folder, options, outcome)
+    return _written(study, wanted, folder, options, outcome, levels)
 
 
 def _failed(error: HvdcIdentError) -> Outcome:
     return Outcome({"status": "failed", "message": str(error)}, failed=str(error))
 
 
-def _written(study: Study, wanted: Stage, folder: Path, options: Options, outcome: Outcome) -> Done:
+def _written(
+    study: Study, wanted: Stage, folder: Path, options: Options, outcome: Outcome, levels: list[dict[str, Any]]
+) -> Done:
     heading = heading_of(study, options.seed)
     mark = "" if outcome.failed else _mark(study, wanted, folder, options)
-    about = {"stage": wanted.name, "fingerprint": mark, "files": list(outcome.files)}
+    about = {"stage": wanted.name, "fingerprint": mark, "files": list(outcome.files), "rest_levels": levels}
     taken = {"options": {n: getattr(options, n) for n in wanted.takes}} if wanted.takes else {}
     data = plain({**heading, **about, **taken, **outcome.data})
     for name, text in outcome.files.items():

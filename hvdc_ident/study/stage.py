@@ -27,10 +27,15 @@ def silent(done: int, total: int, text: str) -> None:
     """Nothing: progress that nobody watches."""
 
 
+def unheard(lines: Sequence[str]) -> None:
+    """Drop lines that nobody reads."""
+
+
 @dataclass(frozen=True)
 class Options:
     """How stages run. workers: processes; seed: of every random number; progress: who is told.
 
+    announce: who is told, in lines, what to know before the work begins.
     force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
     None: nothing is kept. executor: where the work is done, "" for this machine.
     """
@@ -41,6 +46,7 @@ class Options:
     force: tuple[str, ...] = ()
     folder: Path | None = None
     executor: str = ""
+    announce: Callable[[Sequence[str]], None] = unheard
 
 
 @dataclass(frozen=True)

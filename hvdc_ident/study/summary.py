@@ -1,4 +1,4 @@
-"""What `check` tells about a study: what it found, without running anything."""
+"""What `check` tells about a study: what it found, and whether recordings and model begin at the same levels."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ from typing import Any
 
 from hvdc_ident.experiment import Experiment, recording_lines
 from hvdc_ident.study.pipeline import heading_of
+from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import stages
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.tables import candidate_lines
 
 
 def summary(study: Study, seed: int = 0) -> dict[str, Any]:
-    """The study in numbers: model, candidates, experiments with rows, event and noise, and the stages it asks for."""
-    model = study.model
+    """The study in numbers: model, candidates, experiments with rows, event and noise, the stages it asks for, and the
+    recorded rest against the model's, for which the model is run."""
+    model, rest = study.model, rest_levels(study)
     return {
         **heading_of(study, seed),
         "sizes": {
@@ -25,6 +27,8 @@ def summary(study: Study, seed: int = 0) -> dict[str, Any]:
         "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
         "experiments": {e.name: _experiment(e, study) for e in study.experiments},
         "stages": [s.name for s in stages() if s.wanted(study)],
+        "rest_levels": rest.to_list(),
+        "rest_lines": [*rest.lines, *rest.remarks],
     }
 
 
@@ -44,6 +48,7 @@ def summary_text(found: dict[str, Any]) -> str:
             f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
         )
         lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
+    lines += found["rest_lines"]
     lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
     return "\n".join(lines)
 

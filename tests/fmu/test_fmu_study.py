@@ -161,3 +161,19 @@ def test_wrong_studies_are_one_message(tmp_path):
     path.write_text(text)
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 2 and "no zip archive" in result.output
+
+
+def test_a_flipped_column_is_told_before_anything_is_fitted(tmp_path):
+    """y rests at 0, so its movement tells; `twice` rests at b = 0.25, and its sign shows there."""
+    path = study(tmp_path, "model-exchange")
+    assert told("check", path)["rest_lines"] == []
+    for name in ("step", "back"):
+        table = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1)
+        table[:, 2:] *= -1.0
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header="time,u,y,twice", comments="", fmt="%.9g")
+    found = told("check", path)["rest_levels"]
+    assert {(line["experiment"], line["output"]) for line in found} == {
+        (e, o) for e in ("step", "back") for o in ("y", "twice")
+    }
+    assert all(line["suggestion"] == "sign" and line["factor"] == -1.0 for line in found)
+    assert all(abs(line["model"] - 0.25) < 1e-6 for line in found if line["output"] == "twice")
