@@ -1,0 +1,234 @@
+"""A recording against runs of the model: level before the event and movement after it, with what noise and candidates
+leave open, and the mismatch that is left once a conversion of unit or sign is undone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.noise import MISFIT, source_of
+from hvdc_ident.fit.nuisance import observe, unknowns
+from hvdc_ident.fit.unknown import Free
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.study.conversions import Conversion
+from hvdc_ident.trajectory import Array
+from hvdc_ident.waveform import noise_floor, pre_event_ar
+
+FINEST = 1e-3
+"""No model's level or movement is expected nearer to the plant's than this share, so a nearer match proves no more."""
+STRONG = 10.0
+"""Odds from which evidence is strong (Jeffreys 1961): what a match has to gain by itself."""
+NONE = Conversion("", 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One recorded output. before, after: (n,) rows of the level and of the movement. noise: std of a single row;
+    deterministic: whether that is not known, so that the misfit stands in for it."""
+
+    experiment: str
+    output: str
+    unit: str
+    values: Array
+    before: NDArray[np.bool_]
+    after: NDArray[np.bool_]
+    noise: float
+    deterministic: bool
+
+    @classmethod
+    def of(cls, e: Experiment, output: str, unit: str, experiments: Sequence[Experiment]) -> Record:
+        assert e.measured is not None
+        values = e.measured[output]
+        there = np.isfinite(values)
+        before = there & (e.time < e.event - 1e-12) if e.event is not None else np.zeros(values.size, dtype=bool)
+        after = there & e.compared & ~before
+        noise = max(e.noise.get(output) or 0.0, noise_floor(values[there]))
+        deterministic = source_of([e], output) == MISFIT
+        return cls(e.name, output, unit, values, before, after if after.any() else there, noise, deterministic)
+
+
+@dataclass(frozen=True)
+class Movement:
+    """The recorded movement as slope times the simulated. error: of the slope, if all that is left of the recorded
+    movement beside noise were the model's fault and lay along it."""
+
+    slope: float
+    error: float
+    misfit: float
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A record against the model. recorded, error: level and standard error, None where there is no level. model: at the
+    given values. levels: of all runs; movements: of all runs in which both move."""
+
+    record: Record
+    recorded: float | None
+    error: float
+    model: float | None
+    noise: float
+    levels: tuple[float, ...]
+    movements: tuple[Movement, ...]
+    size: float
+
+    @classmethod
+    def of(cls, record: Record, simulated: Array) -> Comparison:
+        movement = _movement(record, simulated)
+        misfit = movement.misfit if movement else 0.0
+        noise = max(record.noise, misfit) if record.deterministic else record.noise
+        size = movement.size if movement else 0.0
+        moved = (movement,) if movement else ()
+        if not record.before.any():
+            return cls(record, None, 0.0, None, noise, (), moved, size)
+        gap = (record.values - simulated)[record.before]
+        model = float(simulated[record.before].mean())
+        error = _error_of_mean(gap, noise, record.deterministic)
+        return cls(record, float(record.values[record.before].mean()), error, model, noise, (model,), moved, size)
+
+    def with_run(self, simulated: Array) -> Comparison:
+        """The same with one more run of the model."""
+        movement = _movement(self.record, simulated)
+        level = (float(simulated[self.record.before].mean()),) if self.record.before.any() else ()
+        return replace(
+            self, levels=(*self.levels, *level), movements=(*self.movements, *((movement,) if movement else ()))
+        )
+
+    def differs(self, sure: float) -> bool:
+        """Whether the recorded level lies outside what the model can be, by more than noise and than a row shows."""
+        if self.recorded is None:
+            return False
+        gap = max(min(self.levels) - self.recorded, self.recorded - max(self.levels), 0.0)
+        return gap > max(sure * self.error, self.noise, FINEST * self.size)
+
+    def is_moved_otherwise(self, sure: float) -> bool:
+        """Whether no run of the model moves in the direction and within the size of the record."""
+        return bool(self.movements) and all(abs(m.slope - 1.0) > sure * m.error for m in self.movements)
+
+    def level_mismatch(self, c: Conversion) -> float:
+        """On a logarithmic scale, once the conversion is undone; not below what noise and the finest match leave."""
+        if self.recorded is None:
+            return 1.0
+        undone, error = c.undone(self.recorded), self.error / abs(c.factor)
+        near = min(max(undone, min(self.levels)), max(self.levels))
+        zero = math.hypot(error, self.size) or FINEST * max(abs(undone), abs(near)) or 1.0
+        return max(math.hypot(apart(undone, near, zero), error / math.hypot(zero, near)), FINEST)
+
+    def movement_mismatch(self, c: Conversion) -> float:
+        """The same of the movement; 1 where nothing moves, whatever the conversion."""
+        if not self.movements:
+            return 1.0
+        slopes = [m.slope / c.factor for m in self.movements]
+        near = min(max(1.0, min(slopes)), max(slopes))
+        if near == 1.0:  # between two runs: as well known as the run that follows best
+            share = min(m.error / abs(m.slope) for m in self.movements if m.slope)
+            return min(max(share, FINEST), 1.0)
+        best = int(np.argmin([abs(s - near) for s in slopes]))
+        error = max(self.movements[best].error / abs(c.factor), FINEST)
+        return max(math.hypot(apart(near, 1.0, error), error / math.hypot(1.0, error)), FINEST)
+
+    def is_matched(self, c: Conversion) -> bool:
+        """Whether the conversion, undone, brings the level far nearer; or the movement, and leaves the level within a share
+        of the movement."""
+        level = self.level_mismatch(c)
+        if STRONG * level <= self.level_mismatch(NONE):
+            return True
+        follows = STRONG * self.movement_mismatch(c) <= self.movement_mismatch(NONE)
+        return follows and (self.recorded is None or STRONG * level <= 1.0)
+
+    def log_odds(self, c: Conversion) -> float:
+        """Of the conversion against a model that is off, without priors."""
+        level = math.log(self.level_mismatch(NONE) / self.level_mismatch(c))
+        return level + math.log(self.movement_mismatch(NONE) / self.movement_mismatch(c))
+
+
+def apart(a: float, b: float, zero: float) -> float:
+    """The distance of two values on a scale that is logarithmic above `zero` and passes through 0."""
+    return abs(math.asinh(a / zero) - math.asinh(b / zero))
+
+
+def _movement(record: Record, simulated: Array) -> Movement | None:
+    """None where the record shows nothing but noise, or the model stands still."""
+    base = record.before if record.before.any() else record.after
+    v = record.values[record.after] - record.values[base].mean()
+    w = simulated[record.after] - simulated[base].mean()
+    n, noise = v.size, 0.0 if record.deterministic else record.noise
+    size = float(np.sqrt(w @ w / n))
+    # The mean square of n rows of noise scatters by sqrt(2/n) about its mean; solvers leave 1e-8 of a value.
+    moves = float(v @ v) / n > noise**2 * (1.0 + 5.0 * math.sqrt(2.0 / n)) and float(v @ v) > 0.0
+    if not moves or size <= 1e-6 * float(np.abs(simulated).max()):
+        return None
+    slope = float(v @ w) / float(w @ w)
+    left = v - slope * w
+    misfit = math.sqrt(max(float(left @ left) / n - noise**2, noise**2 * math.sqrt(2.0 / n)))
+    return Movement(slope, math.hypot(misfit, record.noise / math.sqrt(n)) / size, misfit, size)
+
+
+def _error_of_mean(gap: Array, noise: float, deterministic: bool) -> float:
+    """The standard error of the mean of some rows: of coloured noise, with what a drift leaves open, as the larger of the
+    noise told and seen; that of a deterministic record is its misfit, which no mean makes smaller."""
+    n = gap.size
+    rho = pre_event_ar(gap)
+    std = max(noise, float(np.std(gap - gap.mean(), ddof=1)) if n > 2 else 0.0)
+    drift = float(np.polyfit(np.arange(n), gap, 1)[0]) * n if n > 2 else 0.0
+    independent = 1.0 if deterministic else max(n * (1.0 - rho) / (1.0 + rho), 1.0)
+    return math.hypot(std / math.sqrt(independent), drift / math.sqrt(12.0))
+
+
+def run_of(
+    simulator: ModelSimulator,
+    e: Experiment,
+    values: Mapping[str, float] | None = None,
+    nuisance: Mapping[str, float] | None = None,
+) -> Mapping[str, Array] | str:
+    """The outputs at the experiment's rows, or why there are none."""
+    try:
+        return observe(simulator, e, values or {}, nuisance=nuisance, derivatives=False).values
+    except HvdcIdentError as error:
+        return str(error)
+
+
+def freed(
+    simulator: ModelSimulator, e: Experiment, candidates: Sequence[Free], own: Sequence[Comparison]
+) -> list[Comparison]:
+    """The comparisons with the runs at the ends of every candidate's range, and at the corners that move a level most."""
+    found = list(own)
+    ends: dict[str, dict[str, float]] = {}  # level of each output by candidate and end
+    local = unknowns(simulator, e)
+    for free in (*candidates, *local):
+        for share in (0.0, 1.0):
+            run = run_of(simulator, e, *_at(e, {free.name: free.draw(share)}))
+            if isinstance(run, str):
+                continue
+            found = [c.with_run(run[c.record.output]) for c in found]
+            for c in found:
+                if c.levels:
+                    ends.setdefault(c.record.output, {})[f"{free.name} {share:g}"] = c.levels[-1]
+    corners = []
+    for at in ends.values():
+        for pick in (min, max):
+            corner = {}
+            for free in (*candidates, *local):
+                sides = {s: v for s in (0.0, 1.0) if (v := at.get(f"{free.name} {s:g}")) is not None}
+                if len(sides) == 2 and sides[0.0] != sides[1.0]:
+                    corner[free.name] = free.draw(pick(sides, key=lambda s: sides[s]))
+            if len(corner) > 1 and corner not in corners:
+                corners.append(corner)
+    for corner in corners:
+        run = run_of(simulator, e, *_at(e, corner))
+        if not isinstance(run, str):
+            found = [c.with_run(run[c.record.output]) for c in found]
+    return found
+
+
+def _at(e: Experiment, values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
+    """The parameters and the experiment's own nuisances among some unknowns of a fit."""
+    local = f"{e.name}:"
+    parameters = {n: v for n, v in values.items() if not n.startswith(local)}
+    return parameters, {n.removeprefix(local): v for n, v in values.items() if n.startswith(local)}
