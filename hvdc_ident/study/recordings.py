@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,11 +33,17 @@ class NoiseNote:
 
     source: "given"; "estimated", from the rows before the event; "floor": those rows show no noise, and weights come from
     the misfit of the fit; "residual": no rows lie before an event, so that the fit's own residual has to tell, std being
-    the least it may be.
+    the least it may be. by_row: whether rows differ; std is then their root mean square.
     """
 
     std: float
     source: Literal["given", "estimated", "floor", "residual"]
+    by_row: bool = False
+
+
+def noise_line(note: NoiseNote) -> dict[str, Any]:
+    """The note as JSON has it."""
+    return {"std": note.std, "source": note.source, "by_row": note.by_row}
 
 
 @dataclass
@@ -89,7 +95,7 @@ def read_experiments(
             )
         seen.add(table.name.lower())
         _check_names(table, model, place)
-        columns = raw_columns(table.phases, [column for _, column in _channels(table)])
+        columns = raw_columns(table.phases, [*(c for _, c in _channels(table)), *_noise_columns(table).values()])
         wanted.setdefault(table.data, {})[table.name] = list(dict.fromkeys(columns))
     try:
         recordings.load(wanted)
@@ -168,7 +174,13 @@ def _experiment(
     window = _window(table, time, place)
     for o in outputs:
         _check_recorded(o, columns[o], scaled[o], f"{place}, {table.data}")
-    notes = {o: _noise(table.noise.get(o), time, scaled[o], event) for o in outputs}
+    deviations = {
+        o: _deviations(data, c, columns[o], mappings[o], f"{place}, {table.data}")
+        for o, c in _noise_columns(table).items()
+    }
+    stated = {o: n for o, n in table.noise.items() if isinstance(n, float | int)}
+    stated |= {o: float(np.sqrt(np.nanmean(d**2))) for o, d in deviations.items()}
+    notes = {o: _noise(stated.get(o), time, scaled[o], event, by_row=o in deviations) for o in outputs}
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
     origin = replace(
@@ -184,6 +196,9 @@ def _experiment(
         noise=FrozenMap({o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}),
         noise_dof=FrozenMap(
             {o: _noise_dof(time[np.isfinite(scaled[o])], event) for o, n in notes.items() if n.source == "estimated"}
+        ),
+        noise_profile=FrozenMap(
+            {o: _profile(d, notes[o].std) for o, d in deviations.items() if notes[o].source != "floor"}
         ),
         event=event,
         window=window,
@@ -356,7 +371,44 @@ def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, f
     return low, high
 
 
-def _noise(given: float | None, time: Array, values: Array, event: float | None) -> NoiseNote:
+def _noise_columns(table: schema.Experiment) -> dict[str, str]:
+    """By output the column of its standard deviations, where one is named."""
+    return {o: n.column for o, n in table.noise.items() if isinstance(n, schema.NoiseColumn)}
+
+
+def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, float], place: str) -> Array:
+    """(n,) standard deviations in the model's unit, NaN where the output is not recorded.
+
+    Raises StudyError where one is missing or not above 0, or in another unit than the output's column.
+    """
+    unit = data.unit(column)
+    by = conversion(unit, data.unit(of)) if unit and data.unit(of) else (1.0, 0.0)
+    if by is None:
+        raise StudyError(
+            f"the standard deviations in column '{column}' are in another unit than what they belong to",
+            where=place,
+            expected=f"'{data.unit(of)}', as column '{of}'",
+            got=f"'{unit}'",
+        )
+    found = data[column] * by[0] * abs(mapping[0])
+    there = ~np.isnan(data[of])
+    bad = np.flatnonzero(there & ~(found > 0))
+    if bad.size:
+        raise StudyError(
+            f"no standard deviation in column '{column}' at {data.time[bad[0]]:g} s",
+            where=place,
+            expected=f"a number above 0 wherever '{of}' is recorded",
+            got=f"{data[column][bad[0]]:g}",
+        )
+    return np.where(there, found, np.nan)
+
+
+def _profile(deviations: Array, std: float) -> Array:
+    """(n,) standard deviations over the one that stands for all; 1 where nothing is recorded, which nobody looks at."""
+    return np.where(np.isnan(deviations), 1.0, deviations / std)
+
+
+def _noise(given: float | None, time: Array, values: Array, event: float | None, *, by_row: bool = False) -> NoiseNote:
     """The larger of what is given, else estimated before the event, and the floor; where that acts the data show no noise."""
     floor = noise_floor(values)
     if given is None and (event is None or int(np.isfinite(values[time < event]).sum()) < FEWEST_QUIET):
@@ -364,7 +416,7 @@ def _noise(given: float | None, time: Array, values: Array, event: float | None)
     std = given if given is not None else noise_estimate(time, values, event)
     if std <= floor:
         return NoiseNote(floor, "floor")
-    return NoiseNote(std, "given" if given is not None else "estimated")
+    return NoiseNote(std, "given" if given is not None else "estimated", by_row)
 
 
 def _noise_dof(time: Array, event: float | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, StringConstraints, model_validator
@@ -15,6 +16,18 @@ def _column_by_name(value: Any) -> Any:
     if doubled:
         raise ValueError(f"'{doubled[0]}' is listed twice")
     return {v if isinstance(v, str) else _not_text(v): v for v in value}
+
+
+def _known_noise(value: Any) -> Any:
+    """The value, once it is a number or names a column (a union of types could not say which is wrong)."""
+    if isinstance(value, dict):
+        if set(value) != {"column"} or not isinstance(value["column"], str) or not value["column"]:
+            raise ValueError('noise: neither a number nor {column = "name"}')
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f'noise: neither a number nor {{column = "name"}}: {value!r}')
+    elif not (math.isfinite(value) and value >= 0):
+        raise ValueError(f"noise: a finite number of at least 0 is expected, not {value}")
+    return value
 
 
 def _known_interpolation(value: Any) -> Any:
@@ -153,15 +166,24 @@ class Instrument(Table):
     accuracy_class: Positive | None = Field(default=None, alias="class")
 
 
+class NoiseColumn(Table):
+    """One line of an experiment's `noise`, where every row has a standard deviation of its own, in the output's unit."""
+
+    column: Name
+
+
 class Experiment(Table):
-    """[[experiment]]: one recording and what to make of it."""
+    """[[experiment]]: one recording and what to make of it.
+
+    noise: the standard deviation of an output in the model's unit, or the column that holds it in that of the output's.
+    """
 
     name: FileName
     data: Name
     role: Literal["fit", "holdout"] = "fit"
     inputs: Columns = {}
     outputs: Columns
-    noise: dict[Name, NotNegative] = {}
+    noise: dict[Name, Annotated[float | NoiseColumn, BeforeValidator(_known_noise)]] = {}
     event: FiniteFloat | None = None
     window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
     values: dict[Name, FiniteFloat] = {}

@@ -6,6 +6,7 @@ from typing import Any
 
 from hvdc_ident.experiment import Experiment, recording_lines
 from hvdc_ident.study.pipeline import heading_of
+from hvdc_ident.study.recordings import noise_line
 from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import stages
 from hvdc_ident.study.study import Study
@@ -59,7 +60,8 @@ def _noise(output: str, note: dict[str, Any]) -> str:
         return f"{output} from the residual of the fit (not given, and no quiet rows before an event)"
     if note["source"] == "floor":
         return f"{output} none above {note['std']:.3g} (before the event; the residual of the fit stands in)"
-    return f"{output} {note['std']:.3g} ({note['source']})"
+    how = f"{note['source']}, row by row" if note["by_row"] else note["source"]
+    return f"{output} {note['std']:.3g} ({how})"
 
 
 def _given_by(study: Study, name: str) -> str:
@@ -82,5 +84,5 @@ def _experiment(e: Experiment, study: Study) -> dict[str, Any]:
         "inputs": [n for n in e.inputs if n not in e.drive],
         "outputs": list(e.outputs),
         "recording": e.recording,
-        "noise": {o: {"std": n.std, "source": n.source} for o, n in notes.items()},
+        "noise": {o: noise_line(n) for o, n in notes.items()},
     }

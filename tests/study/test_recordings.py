@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import curve_fit
 
 from hvdc_ident import load_study
-from hvdc_ident.errors import StudyError
+from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.fit import FitResult, Problem, fit
 from hvdc_ident.report.page import write_report
 from hvdc_ident.report.results import Results
@@ -193,3 +194,54 @@ def test_a_change_of_the_data_file_behind_a_header_is_a_change_of_the_study(tmp_
     (tmp_path / "d.dat").write_text("".join(lines))
     after = load_study(path).sources
     assert {n for n in after if after[n] != before[n]} == {"d.dat"}
+
+
+def with_deviations() -> np.ndarray:
+    """The record with a column of standard deviations: the noise is five times larger after 0.35 s."""
+    v, w, i = exact(TIME)
+    sd = np.where(TIME < 0.35, 2e-3, 1e-2)
+    return np.column_stack([TIME, v, w + sd * np.random.default_rng(5).standard_normal(TIME.size), i, sd])
+
+
+def test_standard_deviations_of_every_row_weigh_as_scipy_weighs_them(tmp_path: Path) -> None:
+    rows = with_deviations()
+    rows[100:110, 2] = np.nan
+    path = write(tmp_path, rows, header="time,v,w,i,sd", outputs='["w"]', experiment='noise = {w = {column = "sd"}}')
+    study = load_study(path)
+    assert study.noise["d"]["w"].by_row and "(given, row by row)" in told(study)
+    found = fitted(study)
+
+    def curve(time: np.ndarray, J: float) -> np.ndarray:
+        return (0.5 / 0.35) * (1.0 + 0.5 * np.where(time < EVENT, 0.0, 1.0 - np.exp(-0.35 / J * (time - EVENT))))
+
+    there = ~np.isnan(rows[:, 2])
+    value, covariance = curve_fit(
+        curve, TIME[there], rows[there, 2], p0=[0.01], sigma=rows[there, 4], absolute_sigma=True, xtol=1e-12
+    )
+    assert found.estimates["J"].value == pytest.approx(value[0], rel=1e-6)
+    assert found.estimates["J"].std_raw == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-3)
+    assert found.chi2_per_dof == pytest.approx(1.0, abs=0.25)
+    assert found.goodness["outputs"]["w"]["d"]["rmse_per_sigma"] == pytest.approx(1.0, abs=0.12)
+    assert found.goodness["outputs"]["w"]["d"]["in_band"] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "noise", "says"),
+    [
+        ({40: 0.0}, '{column = "sd"}', "no standard deviation in column 'sd' at 0.2 s"),
+        ({40: np.nan}, '{column = "sd"}', "no standard deviation in column 'sd' at 0.2 s"),
+        ({}, '{column = "ds"}', "did you mean 'sd'"),
+        ({}, '{colum = "sd"}', "neither a number nor"),
+        ({}, '"sd"', "neither a number nor"),
+        ({}, "-1", "at least 0"),
+        ({}, "nan", "finite"),
+    ],
+)
+def test_standard_deviations_that_are_none(tmp_path: Path, change: dict[int, float], noise: str, says: str) -> None:
+    rows = with_deviations()
+    for row, value in change.items():
+        rows[row, 4] = value
+    path = write(tmp_path, rows, header="time,v,w,i,sd", outputs='["w"]', experiment=f"noise = {{w = {noise}}}")
+    with pytest.raises(InputError) as caught:
+        load_study(path)
+    assert says in str(caught.value)

@@ -54,6 +54,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 
 def _context(study: Study, options: Options, report: Mapping[str, Any], result: FitResult) -> dict[str, Any]:
     """What a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
+    from hvdc_ident.study.recordings import noise_line
     from hvdc_ident.study.tables import candidate_lines
 
     return {
@@ -64,9 +65,7 @@ def _context(study: Study, options: Options, report: Mapping[str, Any], result: 
             e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording}
             for e in study.experiments
         },
-        "noise": {
-            e: {o: {"std": n.std, "source": n.source} for o, n in notes.items()} for e, notes in study.noise.items()
-        },
+        "noise": {e: {o: noise_line(n) for o, n in notes.items()} for e, notes in study.noise.items()},
         "ties": {n: line.tie for n, line in study.settings.parameters.items() if line.tie is not None},
     }
 
