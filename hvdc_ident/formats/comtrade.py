@@ -222,7 +222,7 @@ def _content(record: _Record) -> Any:
             ignore_warnings=True, use_numpy_arrays=True, use_double_precision=True
         )
         ascii_data = record.header.ft.upper() == "ASCII"
-        reader.read(io.StringIO(record.text), _lines(record.data) if ascii_data else record.data)
+        reader.read(io.StringIO(record.text), _filled(record) if ascii_data else record.data)
         return reader
 
 
@@ -251,6 +251,21 @@ def _counts(text: str) -> tuple[int, int, int] | None:
     lines = text.splitlines()
     match = _COUNTS.fullmatch(lines[1]) if len(lines) > 1 else None
     return (int(match[1]), int(match[2]), int(match[3])) if match else None
+
+
+def _filled(record: _Record) -> str:
+    """The lines of ASCII data with the mark of a missing sample in empty cells, as the editions after 1991 have them too.
+
+    The package knows the mark 99999 there, and the empty cell only in the first edition.
+    """
+    text = _lines(record.data)
+    if str(record.header.rev_year) == "1991" or not re.search(r",\s*(?:,|$)", text, re.MULTILINE):
+        return text
+    last = 2 + record.header.analog_count
+    rows = [line.split(",") for line in text.splitlines()]
+    return "\n".join(
+        ",".join(c if c.strip() or not 2 <= k < last else "99999" for k, c in enumerate(row)) for row in rows
+    )
 
 
 def _lines(data: bytes) -> str:

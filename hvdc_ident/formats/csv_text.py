@@ -134,6 +134,7 @@ def _layout(path: Path) -> _Layout:
         raise _no_header(path, top[0][0])
     number, header = top[first - 1]
     separator = _separator(header, row)
+    _check_columns(path, number, header.split(separator, 4))
     rows = [_header_cells(header, separator, path, number)]
     for above, line in reversed(top[: first - 1]):
         cells = _header_cells(line, separator, path, above)
@@ -270,6 +271,19 @@ def _header_cells(header: str, separator: str | None, path: Path, line: int) -> 
     except (csv.Error, ValueError) as error:
         raise WaveformError("the header cannot be read", where=f"{path}, line {line}", got=str(error)) from None
     return [cell.strip() for cell in cells]
+
+
+def _check_columns(path: Path, line: int, cells: Sequence[str]) -> None:
+    """Refuse a table that lies on its side. cells: the first of the line of names."""
+    beside = [c.strip(' "').replace(",", ".") for c in cells[1:4]]
+    if len(beside) > 1 and all(_NUMBER.fullmatch(c) for c in beside):
+        raise WaveformError(
+            "the signals stand in rows",
+            where=f"{path}, line {line}",
+            expected="one column a signal, under its name",
+            got=f"'{_short(cells[0])}' with numbers beside it",
+            hint="turn the table: in a spreadsheet paste it transposed; in pandas read_csv(..., index_col=0).T",
+        )
 
 
 def _no_header(path: Path, line: int) -> WaveformError:

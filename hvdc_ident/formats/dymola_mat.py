@@ -60,6 +60,16 @@ class _Result:
         return np.asarray(self.table != 0)
 
 
+def starts_as_version_4(top: bytes) -> bool:
+    """Whether the bytes begin as a MATLAB v4 file does: its first matrix's header, with a size that can be."""
+    order = _order(top)
+    if len(top) < _HEADER or order is None:
+        return False
+    kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", top[:_HEADER])
+    known = kind % 1000 // 10 in _TYPES and kind % 10 <= 1
+    return known and imaginary in (0, 1) and 1 < length <= _MAX_NAME and rows >= 0 and columns >= 0
+
+
 def recognises(path: Path) -> bool:
     """Whether the file starts with the `Aclass` matrix every result file starts with."""
     with open(path, "rb") as file:
@@ -126,7 +136,7 @@ def _matrix_bytes(name: str, stored: NDArray[Any], kind: int) -> bytes:
 
 
 def _open(path: Path) -> _Result:
-    matrices = _matrices(path)
+    matrices = matrices_of(path)
     transposed = _is_transposed(matrices, path)
     for needed in ("name", "dataInfo", "data_2"):
         if needed not in matrices:
@@ -220,7 +230,7 @@ def _resampled(result: _Result, number: int, columns: NDArray[np.int64], time: A
     return np.column_stack([np.interp(time, own, found[:, j]) for j in range(columns.size)])
 
 
-def _matrices(path: Path) -> dict[str, _Matrix]:
+def matrices_of(path: Path) -> dict[str, _Matrix]:
     """The matrices of a MATLAB v4 file by name; nothing is read before the file is known to hold it."""
     try:
         data: NDArray[np.uint8] = np.memmap(path, dtype=np.uint8, mode="r")

@@ -1,6 +1,6 @@
 """HDF5 and netCDF files: every data set of numbers is a signal, over the time vector of its group.
 
-A group's time is its data set called time, t or tout; groups without one use that of the group above. Units come from
+A group's time is its data set called time, t or tout, in the unit it says; groups without one use that of the group above. Units come from
 the attribute `units` (netCDF's own word) or `unit`. netCDF 4 is HDF5; netCDF 3 is another format, read by scipy.
 """
 
@@ -16,7 +16,8 @@ from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
-from hvdc_ident.trajectory import Trajectory
+from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.units import seconds_of
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -100,13 +101,14 @@ def _group(group: Any, prefix: str, above: Any, path: Path, depth: int) -> Itera
     clock = above
     if name is not None:
         check_size(1, sets[name].size, path)
-        clock = np.asarray(sets[name], dtype=float).ravel()
+        clock = _in_seconds(np.asarray(sets[name], dtype=float).ravel(), _unit(sets[name]), path)
     columns, units = {}, []
     for other, item in sets.items():
-        if other == name or clock is None or item.ndim not in (1, 2) or item.shape[0] != clock.size:
+        if other == name or clock is None or item.ndim not in (1, 2) or clock.size not in item.shape:
             continue
-        check_size(item.shape[0], item.size // max(1, item.shape[0]), path)
-        values = np.asarray(item, dtype=float).reshape(clock.size, -1)
+        check_size(clock.size, item.size // max(1, clock.size), path)
+        values = np.asarray(item, dtype=float)
+        values = (values if item.shape[0] == clock.size else values.T).reshape(clock.size, -1)
         for i, column in enumerate(values.T):
             columns[prefix + other + (f"({i + 1})" if values.shape[1] > 1 else "")] = column
             units.append(_unit(item))
@@ -115,6 +117,14 @@ def _group(group: Any, prefix: str, above: Any, path: Path, depth: int) -> Itera
     for inner in local:
         if hasattr(group[inner], "keys"):
             yield from _group(group[inner], f"{prefix}{inner}/", clock, path, depth + 1)
+
+
+def _in_seconds(clock: Array, unit: str, path: Path) -> Array:
+    """A time vector in s; netCDF writes its units as `milliseconds since 2026-01-01`."""
+    length = seconds_of(unit.split(" since ")[0])
+    if length is None:
+        raise damaged(path, "the time is in a unit that is none of time", expected="s, ms, us, min, h", got=f"'{unit}'")
+    return clock if length == 1.0 else clock * length
 
 
 def _unit(item: Any) -> str:
@@ -130,7 +140,9 @@ def _netcdf3(path: Path) -> list[Trajectory]:
         name = time_name(list(sets))
         if name is None:
             return []
-        clock = np.array(sets[name].data, dtype=float).ravel()
+        unit = getattr(sets[name], "units", b"")
+        text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+        clock = _in_seconds(np.array(sets[name].data, dtype=float).ravel(), text, path)
         columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
         units = [getattr(sets[k], "units", b"") for k in columns]
     if not columns:

@@ -1,9 +1,10 @@
-"""MATLAB files of version 5 to 7.2, and 7.3 (HDF5), as Simulink and scripts save waveforms.
+"""MATLAB files of version 4, 5 to 7.2, and 7.3 (HDF5), as Simulink and scripts save waveforms.
 
-Three layouts are understood: a vector called time, t or tout with vectors or matrices of as many rows beside it; a
-matrix whose first column is the time; Simulink's "structure with time" (fields `time` and `signals`, each with `values`
-and `label`). Several structures are several rates, joined over the finest. Objects (timeseries, Dataset) are stored in
-a form MathWorks does not publish: they are refused with the way out.
+Three layouts are understood, each either way round: a vector called time, t, tout, Zeit or temps with vectors or
+matrices of as many rows beside it; a matrix whose first column or row is the time, which increases; Simulink's
+"structure with time" (fields `time` and `signals`, each with `values` and `label`). Several structures are several
+rates, joined over the finest. Objects (timeseries, Dataset) are stored in a form MathWorks does not publish: they are
+refused with the way out.
 """
 
 from __future__ import annotations
@@ -19,21 +20,28 @@ from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
 from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
+from hvdc_ident.formats.dymola_mat import matrices_of, starts_as_version_4
+from hvdc_ident.formats.dymola_mat import recognises as is_result_file
 from hvdc_ident.trajectory import Array, Trajectory
 
 NAME = "matlab"
-SUMMARY = "MATLAB and Simulink, versions 5 to 7.3: time vector, time in the first column, or structure with time"
+SUMMARY = "MATLAB and Simulink, versions 4 to 7.3: time vector, time in the first column, or structure with time"
 SUFFIXES = (".mat",)
 
 _V5, _V73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 _ADVICE = "save it as 'Structure with time' or as vectors: t = ts.Time; y = ts.Data; save('x.mat', 't', 'y')"
 _MAX_DEPTH = 4
+_FEWEST = 8
+"""Numbers that increase by chance once in 8! = 40 320 times: with fewer, an increasing row proves no time axis."""
 
 
 def recognises(path: Path) -> bool:
-    """Whether the file starts as MATLAB's versions 5 to 7.3 do."""
+    """Whether the file starts as MATLAB's versions 4 to 7.3 do, and is no result file of Dymola's."""
     with open(path, "rb") as file:
-        return file.read(len(_V5)) in (_V5, _V73)
+        top = file.read(64)
+    if top.startswith((_V5, _V73)):
+        return True
+    return path.suffix.lower() in SUFFIXES and starts_as_version_4(top) and not is_result_file(path)
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -59,11 +67,11 @@ def sample(path: Path) -> None:
 
 def _waveforms(path: Path) -> Trajectory:
     with open(path, "rb") as file:
-        newest = file.read(len(_V73)) == _V73
-    if newest:
+        top = file.read(64)
+    if top.startswith(_V73):
         package("h5py", path)
         return read_apart("matlab", path)
-    return _joined(_version_5(path), path)
+    return _joined(_version_5(path) if top.startswith(_V5) else _version_4(path), path)
 
 
 def waveforms_here(path: Path) -> Trajectory:
@@ -74,8 +82,16 @@ def waveforms_here(path: Path) -> Trajectory:
 def _joined(found: Mapping[str, Any], path: Path) -> Trajectory:
     parts = list(_parts(found, path))
     if not parts:
-        raise damaged(path, "no waveforms", expected="a time vector with signals, or a structure with time")
+        raise _no_time(found, path)
     return joined([_once(part, path) for part in parts], path)
+
+
+def _version_4(path: Path) -> dict[str, Any]:
+    """The variables of a version 4 file: matrices and text."""
+    found = matrices_of(path)
+    if "dataInfo" in found:
+        raise damaged(path, "a result file of Dymola without its class", expected="a matrix 'Aclass' at its start")
+    return {name: np.squeeze(np.asarray(m.values.T, dtype=float)) for name, m in found.items() if not m.is_text}
 
 
 def _version_5(path: Path) -> dict[str, Any]:
@@ -83,9 +99,6 @@ def _version_5(path: Path) -> dict[str, Any]:
         found = variables(path.read_bytes())
     except (Mat5Error, MemoryError, OverflowError, ValueError) as error:
         raise damaged(path, f"MATLAB file cannot be read: {error}") from None
-    opaque = next((name for name, value in found.items() if isinstance(value, Opaque)), None)
-    if opaque is not None and not any(isinstance(v, np.ndarray | dict) for v in found.values()):
-        raise _object(path, opaque)
     return found
 
 
@@ -106,6 +119,8 @@ def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
         return None
     if hasattr(item, "keys"):
         return {k: _from_hdf5(item[k], file, path, depth + 1) for k in item}
+    if "MATLAB_object_decode" in item.attrs:
+        return Opaque("object")
     kind = item.attrs.get("MATLAB_class", b"").decode("ascii", "replace")
     if kind == "char":
         check_size(1, item.size, path)
@@ -133,13 +148,44 @@ def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
         yield _beside(time, arrays, path)
         return
     for name, table in arrays.items():
-        if table.ndim == 2 and table.shape[0] >= 2 and table.shape[1] >= 2:
-            # To File blocks save one row a signal, logged arrays one column a signal: the time is what increases
-            across = _increases(table[0]) and (not _increases(table[:, 0]) or table.shape[1] > table.shape[0])
-            upright = table.T if across else table
-            if _increases(upright[:, 0]):
+        if table.ndim == 2 and min(table.shape) >= 2:
+            upright = _upright(table)
+            if upright is not None:
                 labels = _labels(name, upright.shape[1] - 1)
                 yield Trajectory(upright[:, 0], upright[:, 1:], labels)
+
+
+def _upright(table: Array) -> Array | None:
+    """The matrix with the time in its first column; None where neither its first column nor its first row is one.
+
+    To File blocks save one row a signal, logged arrays one column a signal: the time is what increases. Where both
+    increase, or so few numbers that chance may have it so, the longer one is the time.
+    """
+    down, across = _increases(table[:, 0]), _increases(table[0])
+    if down and across:
+        return table if table.shape[0] >= table.shape[1] else table.T
+    for increases, upright in ((down, table), (across, table.T)):
+        if increases and (upright.shape[0] >= _FEWEST or upright.shape[0] >= upright.shape[1]):
+            return upright
+    return None
+
+
+def _no_time(found: Mapping[str, Any], path: Path) -> WaveformError:
+    """The error for a file without a time, which names the variable that may be it."""
+    arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
+    opaque = next((name for name, value in found.items() if isinstance(value, Opaque)), None)
+    if opaque is not None and not arrays:
+        return _object(path, opaque)
+    shapes = ", ".join(f"{k} {'x'.join(map(str, v.shape)) or '1'}" for k, v in list(arrays.items())[:8])
+    likely = [k for k, v in arrays.items() if v.ndim == 1 and v.size > 1 and _increases(v)]
+    return WaveformError(
+        "no waveforms: nothing in the file is known to be the time",
+        where=str(path),
+        expected="a vector called time or t with signals of as many rows, a matrix whose first column is the time, or a "
+        "structure with time",
+        got=shapes or "no numbers",
+        hint=f"'{likely[0]}' increases all along: if it is the time, save it as 't'" if likely else _ADVICE,
+    )
 
 
 def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
@@ -176,7 +222,16 @@ def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = ""
         if name != time:
             _add(columns, prefix + name, values, clock.size)
     if not columns:
-        raise damaged(path, f"no signal has as many rows as '{time}'", expected=f"{clock.size} rows")
+        shapes = ", ".join(
+            f"{k} {'x'.join(map(str, v.shape)) or '1'}" for k, v in list(arrays.items())[:8] if k != time
+        )
+        raise WaveformError(
+            f"no signal has as many rows as '{prefix}{time}'",
+            where=str(path),
+            expected=f"{clock.size} rows",
+            got=shapes or "nothing else",
+            hint="save signals and their time at the same instants",
+        )
     return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
 
 

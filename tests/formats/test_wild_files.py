@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import scipy.io
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import convert, csv_text, files_of, formats, list_signals, read_waveforms, write_csv
@@ -124,3 +126,88 @@ def test_dates_of_one_record_that_no_order_explains_are_refused(tmp_path: Path) 
     path = put(tmp_path, "Timestamp,a\n13/02/2026 00:00:00,1\n02/14/2026 00:00:01,1\n")
     with pytest.raises(WaveformError, match="line 3"):
         read_waveforms(path)
+
+
+def test_a_table_on_its_side_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(WaveformError, match="the signals stand in rows"):
+        read_waveforms(put(tmp_path, "time;0;0,1;0,2\nu;1;1;2\ny;0,4;0,5;0,6\n"))
+
+
+TIME = np.arange(280) * 0.01
+SIGNALS = np.column_stack([np.cos(TIME), np.sin(3.0 * TIME)])
+"""Neither increases all along."""
+
+LAYOUTS = {
+    "time across, signals down": {"t": TIME[None, :], "y": SIGNALS},
+    "time down, signals across": {"t": TIME[:, None], "y": SIGNALS.T},
+    "both across": {"time": TIME[None, :], "y": SIGNALS.T},
+    "German time": {"Zeit": TIME[None, :], "y": SIGNALS.T},
+    "one matrix down": {"y": np.column_stack([TIME, SIGNALS])},
+    "one matrix across": {"y": np.column_stack([TIME, SIGNALS]).T},
+}
+
+
+@pytest.mark.parametrize("version", ["4", "5", "7.3"])
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_matlab_matrices_either_way_round(tmp_path: Path, layout: dict[str, np.ndarray], version: str) -> None:
+    found = read_waveforms(saved(tmp_path, layout, version))
+    np.testing.assert_array_equal(found.time, TIME)
+    np.testing.assert_array_equal(found.values, SIGNALS)
+    assert found.names == ("y(1)", "y(2)")
+
+
+@pytest.mark.parametrize("version", ["4", "5", "7.3"])
+def test_signals_beside_a_time_of_another_name_are_no_table(tmp_path: Path, version: str) -> None:
+    """Two rows that happen to begin with an increase were once 279 signals of two rows."""
+    path = saved(tmp_path, {"x_axis": TIME[None, :], "y": np.vstack([SIGNALS[:, 1], SIGNALS[:, 0]])}, version)
+    with pytest.raises(WaveformError, match="'x_axis' increases all along: if it is the time, save it as 't'"):
+        read_waveforms(path)
+
+
+def saved(folder: Path, content: dict[str, np.ndarray], version: str) -> Path:
+    """A MATLAB file; version 7.3 as MATLAB lays it out, with its axes the other way round."""
+    path = folder / "x.mat"
+    if version != "7.3":
+        scipy.io.savemat(path, content, format=version)
+        return path
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in content.items():
+            file[name] = np.asarray(values, dtype=float).T
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\2IM")
+    return path
+
+
+def test_hdf5_sets_either_way_round_and_times_in_other_units(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["time"] = 1e3 * TIME
+        file["time"].attrs["units"] = "milliseconds since 2026-11-24"
+        file["y"] = SIGNALS.T
+    found = read_waveforms(tmp_path / "x.h5")
+    np.testing.assert_allclose(found.time, TIME, rtol=1e-15)
+    np.testing.assert_array_equal(found.values, SIGNALS)
+
+
+COMTRADE = (
+    "UW,REC,{}\n2,2A,0D\n1,U,,,kV,0.1,0,0,-32767,32767{}\n2,P,,,MW,1,0,0,-32767,32767{}\n50\n1\n1000,3\n{}\n{}\n{}"
+)
+
+
+@pytest.mark.parametrize("revision", ["1991", "1999", "2013"])
+def test_comtrade_of_three_editions(tmp_path: Path, revision: str) -> None:
+    ratios = "" if revision == "1991" else ",1,1,P"
+    day = (
+        "03/24/20" if revision == "1991" else "24/03/2020"
+    )  # the first edition has the month first and two digits of the year
+    stamps = f"{day},10:00:00.000000", f"{day},10:00:00.001000"
+    tail = {"1991": "ASCII\n", "1999": "ASCII\n1\n", "2013": "ASCII\n1\n0h00,0h00\nB,3\n"}[revision]
+    text = COMTRADE.format(revision, ratios, ratios, *stamps, tail)
+    if revision == "1991":
+        text = text.replace(",1991\n", "\n", 1)
+    (tmp_path / "r.cfg").write_text(text)
+    (tmp_path / "r.dat").write_text("1,0,1100,5\n2,1000,,6\n3,2000,1098,7\n")
+    found = read_waveforms(tmp_path / "r.cfg")
+    np.testing.assert_allclose(found["U"], [110.0, np.nan, 109.8])
+    np.testing.assert_array_equal(found["P"], [5.0, 6.0, 7.0])
+    np.testing.assert_array_equal(found.time, [0.0, 0.001, 0.002])
