@@ -436,6 +436,10 @@ def convert(
     signal: Annotated[
         list[str] | None, typer.Option("--signal", metavar="NAME", help="A signal wanted; default all.")
     ] = None,
+    window: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--window", metavar="FROM TO", help="Only the rows within these times, in s.", show_default=False),
+    ] = None,
     search: Annotated[
         str | None,
         typer.Option(
@@ -455,6 +459,8 @@ def convert(
             where="the command line",
             hint="--to FILE.csv, or --list '' to see the signals",
         )
+    if window is not None and to is None:
+        raise InputError("--window cuts what --to writes", where="the command line", hint="--to FILE.csv beside it")
     if search is not None:
         found = list_signals(data, search)
         if json:
@@ -462,10 +468,23 @@ def convert(
         _say("\n".join(f"{n} [{u}]" if u else n for n, u in found) or "no such signal", json=json, quiet=quiet)
         return
     assert to is not None
-    written = to_csv(data, to, signal)
+    written = to_csv(data, to, signal, window)
+    gaps = {n: k for n in written.names if (k := written.gaps(n))}
+    start, end = float(written.time[0]), float(written.time[-1])
     if json:
-        _print_json({"schema": 1, "file": to.as_posix(), "rows": len(written), "signals": list(written.names)})
-    _say(f"{to}: {len(written)} rows, {len(written.names)} signals", json=json, quiet=quiet)
+        _print_json(
+            {
+                "schema": 1, "file": to.as_posix(), "rows": len(written), "signals": list(written.names),
+                "rows_in_file": written.origin.rows or len(written), "dropped": written.origin.dropped, "time": [start, end],
+                "not_recorded": gaps,
+            }
+        )  # fmt: skip
+    total, left = written.origin.rows, written.origin.dropped
+    rows = f"{len(written)} rows" if len(written) == total else f"{len(written)} of {total} rows"
+    dropped = f" ({left} of the file dropped: a third of one instant, or outside another record)" if left else ""
+    _say(f"{to}: {rows}{dropped}, {start:g} to {end:g} s, {len(written.names)} signals", json=json, quiet=quiet)
+    for name, number in gaps.items():
+        _say(f"{name}: {number} of {len(written)} rows not recorded", json=json, quiet=quiet)
 
 
 @app.command()

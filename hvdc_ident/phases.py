@@ -89,6 +89,13 @@ def quantities(
             raise WaveformError(
                 f"'{name}' needs the currents", expected='current = ["IA", "IB", "IC"] beside the voltages'
             )
+    for name in (*voltage, *(current or ())):
+        if gaps := record.gaps(name):
+            raise WaveformError(
+                f"phase '{name}' is not recorded in {gaps} of {len(record)} rows",
+                expected="a number in every row, for the filter runs over all of them",
+                hint="cut the record at the gap",
+            )
     step = float(np.median(np.diff(record.time)))
     if step * frequency > 0.1:
         raise WaveformError(
@@ -99,7 +106,8 @@ def quantities(
         )
     found = _Quantities(record, voltage, current, frequency, smoothing)
     columns = [found.get(name) for name in wanted]
-    return Trajectory(record.time, np.column_stack(columns), tuple(wanted), tuple(found.unit(n) for n in wanted))
+    units = tuple(found.unit(n) for n in wanted)
+    return Trajectory(record.time, np.column_stack(columns), tuple(wanted), units)
 
 
 class _Quantities:

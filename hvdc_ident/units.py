@@ -8,6 +8,11 @@ import unicodedata
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
 PER_UNIT = ("", "1", "-", "pu", "p.u.", "p.u", "pu.", "perunit", "per-unit", "dimensionless")
 PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "K": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "μ": 1e-6, "n": 1e-9}
 PREFIXED = ("V", "A", "W", "var", "VA", "Hz", "ohm", "H", "F", "s", "S", "Pa", "N", "N.m", "J", "Wh", "VAh", "m", "g",
@@ -74,6 +79,14 @@ def seconds_of(unit: str) -> float | None:
         return 1.0
     known = unit_of(unit)
     return known.size if known is not None and known.kind == "s" else None
+
+
+def scaled(values: Array, scale: float) -> Array:
+    """The values times the scale; by division where the scale is one over a whole number, so that 1400 ms are 1.4 s."""
+    if scale == 1.0:
+        return values
+    whole = 1.0 / scale
+    return values / whole if abs(whole) > 1.0 and whole.is_integer() else values * scale
 
 
 def is_unit(text: str) -> bool:

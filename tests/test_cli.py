@@ -166,6 +166,20 @@ def test_convert_and_list(study: Path, tmp_path: Path) -> None:
     assert call("convert", data).exit_code == 2
 
 
+def test_convert_cuts_by_time_and_counts(tmp_path: Path) -> None:
+    data, out = tmp_path / "x.csv", tmp_path / "y.csv"
+    data.write_text("t [ms],a\n" + "".join(f"{100 * n},{'' if n == 3 else n}\n" for n in range(11)))
+    told = call("convert", data, "--to", out, "--window", "0.2", "0.7")
+    assert "6 of 11 rows, 0.2 to 0.7 s" in told.stdout and "a: 1 of 6 rows not recorded" in told.stdout
+    assert out.read_text().splitlines()[1:3] == ["0.2,2.0", "0.3,"] and out.read_text().endswith("0.7,7.0\n")
+    found = json.loads(call("convert", data, "--to", out, "--window", "0.2", "0.7", "--json").stdout)
+    assert (found["rows"], found["rows_in_file"], found["dropped"], found["not_recorded"]) == (6, 11, 0, {"a": 1})
+    for window in (("5", "6"), ("0.7", "0.2")):
+        refused = call("convert", data, "--to", out, "--window", *window)
+        assert refused.exit_code == 2 and "of the 11 rows from 0 to 1 s" in refused.stderr
+    assert call("convert", data, "--list", "", "--window", "0", "1").exit_code == 2
+
+
 def test_new_writes_a_study_that_passes_check(tmp_path: Path) -> None:
     assert call("new", tmp_path / "n").exit_code == 0
     assert call("check", tmp_path / "n" / "study.toml").exit_code == 0

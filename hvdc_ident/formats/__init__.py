@@ -109,7 +109,7 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     wanted = [signals] if isinstance(signals, str) else None if signals is None else list(signals)
     found = _format_of(file).read(file, wanted)
     _check(found, file)
-    return found
+    return found if found.origin.rows else replace(found, origin=replace(found.origin, rows=len(found)))
 
 
 def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:
@@ -136,11 +136,15 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
 
 
 def convert(
-    source: str | os.PathLike[str], target: str | os.PathLike[str], signals: Iterable[str] | None = None
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    signals: Iterable[str] | None = None,
+    window: tuple[float, float] | None = None,
 ) -> Trajectory:
     """The waveforms of a file of any known format, after they were written to a CSV or Parquet file, by its ending.
 
-    signals: names wanted; None for all. Raises WaveformError where the source cannot be used or the target not written.
+    signals: names wanted; None for all. window: from and to in s, ends included, of what is written; None for all.
+    Times stay what they are. Raises WaveformError where the source cannot be used or the target not written.
     """
     file = Path(target)
     writers = {
@@ -155,12 +159,28 @@ def convert(
     if file.exists() and Path(source).exists() and file.samefile(source):
         raise WaveformError("source and target are the same file", where=str(file), hint="another name")
     found = read_waveforms(source, signals)
+    if window is not None:
+        found = _cut(found, window, str(source))
     if file.suffix.lower() == ".csv":
         write_csv(found, file)
     else:
         with _whole(file) as temporary:
             writers[file.suffix.lower()].write(found, temporary)
     return found
+
+
+def _cut(found: Trajectory, window: tuple[float, float], where: str) -> Trajectory:
+    """The rows within the window. Raises WaveformError where there are fewer than two."""
+    low, high = window
+    inside = (found.time >= low) & (found.time <= high)
+    if int(inside.sum()) < 2:
+        raise WaveformError(
+            f"the window from {low:g} to {high:g} s holds {int(inside.sum())} rows",
+            where=where,
+            expected=f"at least 2 of the {len(found)} rows from {found.time[0]:g} to {found.time[-1]:g} s",
+            hint="the start first, then the end, in s" if high < low else "",
+        )
+    return found.rows(inside)
 
 
 def write_csv(trajectory: Trajectory, path: str | os.PathLike[str], *, units: bool = False) -> None:

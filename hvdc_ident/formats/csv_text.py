@@ -26,7 +26,7 @@ from hvdc_ident.formats import event_rows, once, pick
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
 from hvdc_ident.formats._labels import merged, names_and_units, time_column
 from hvdc_ident.trajectory import Array, Origin, Trajectory
-from hvdc_ident.units import seconds_of
+from hvdc_ident.units import scaled, seconds_of
 
 NAME = "csv"
 SUMMARY = (
@@ -114,7 +114,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
     unit = "date" if layout.absolute else layout.units[layout.time]
     origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "")
-    time = table[:, 0] if layout.scale == 1.0 else table[:, 0] * layout.scale
+    time = scaled(table[:, 0], layout.scale)
     return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
 
 

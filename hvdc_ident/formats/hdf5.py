@@ -17,7 +17,7 @@ from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
 from hvdc_ident.trajectory import Array, Trajectory
-from hvdc_ident.units import seconds_of
+from hvdc_ident.units import scaled, seconds_of
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -124,7 +124,7 @@ def _in_seconds(clock: Array, unit: str, path: Path) -> Array:
     length = seconds_of(unit.split(" since ")[0])
     if length is None:
         raise damaged(path, "the time is in a unit that is none of time", expected="s, ms, us, min, h", got=f"'{unit}'")
-    return clock if length == 1.0 else clock * length
+    return scaled(clock, length)
 
 
 def _unit(item: Any) -> str:

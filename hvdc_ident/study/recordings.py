@@ -17,9 +17,9 @@ from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.study import schema
-from hvdc_ident.study.derived import raw_columns, with_phases
+from hvdc_ident.study.derived import raw_columns, with_derived
 from hvdc_ident.trajectory import Array, Origin, Trajectory
-from hvdc_ident.units import conversion, same_unit, seconds_of
+from hvdc_ident.units import conversion, same_unit, scaled, seconds_of
 from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor
 
 TIME_SHIFT = "time-shift"
@@ -95,7 +95,7 @@ def read_experiments(
             )
         seen.add(table.name.lower())
         _check_names(table, model, place)
-        columns = raw_columns(table.phases, [*(c for _, c in _channels(table)), *_noise_columns(table).values()])
+        columns = raw_columns(table, [*(c for _, c in _channels(table)), *_noise_columns(table).values()])
         wanted.setdefault(table.data, {})[table.name] = list(dict.fromkeys(columns))
     try:
         recordings.load(wanted)
@@ -164,29 +164,31 @@ def _experiment(
     table: schema.Experiment, model: AnyModel, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
-    data = with_phases(table.phases, data, place)
+    data = with_derived(table, data, place)
     time = _time(table, data, place)
     mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
-    scaled = {s: _scaled(data[c], mappings[s]) for s, c in columns.items()}
-    inputs = {s: _input(table, s, columns[s], time, scaled[s], place) for s in (*table.inputs, *table.drive)}
+    mapped = {s: _mapped(data[c], mappings[s]) for s, c in columns.items()}
+    inputs = {s: _input(table, s, columns[s], time, mapped[s], place) for s in (*table.inputs, *table.drive)}
     outputs = tuple(table.outputs)
     event = _event(table, inputs, time, place)
     window = _window(table, time, place)
     for o in outputs:
-        _check_recorded(o, columns[o], scaled[o], f"{place}, {table.data}")
+        _check_recorded(o, columns[o], mapped[o], f"{place}, {table.data}")
     deviations = {
         o: _deviations(data, c, columns[o], mappings[o], f"{place}, {table.data}")
         for o, c in _noise_columns(table).items()
     }
     stated = {o: n for o, n in table.noise.items() if isinstance(n, float | int)}
     stated |= {o: float(np.sqrt(np.nanmean(d**2))) for o, d in deviations.items()}
-    notes = {o: _noise(stated.get(o), time, scaled[o], event, by_row=o in deviations) for o in outputs}
+    notes = {o: _noise(stated.get(o), time, mapped[o], event, by_row=o in deviations) for o in outputs}
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
     origin = replace(
-        data.origin, time_unit=_time_unit(table, data.origin), converted=tuple(line for line in converted if line)
+        data.origin,
+        time_unit=_time_unit(table, data.origin),
+        converted=(*data.origin.converted, *(line for line in converted if line)),
     )
-    measured = Trajectory(time, np.column_stack([scaled[o] for o in outputs]), outputs, units, origin)
+    measured = Trajectory(time, np.column_stack([mapped[o] for o in outputs]), outputs, units, origin)
     experiment = Experiment(
         name=table.name,
         time=time,
@@ -195,7 +197,7 @@ def _experiment(
         measured=measured,
         noise=FrozenMap({o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}),
         noise_dof=FrozenMap(
-            {o: _noise_dof(time[np.isfinite(scaled[o])], event) for o, n in notes.items() if n.source == "estimated"}
+            {o: _noise_dof(time[np.isfinite(mapped[o])], event) for o, n in notes.items() if n.source == "estimated"}
         ),
         noise_profile=FrozenMap(
             {o: _profile(d, notes[o].std) for o, d in deviations.items() if notes[o].source != "floor"}
@@ -237,7 +239,7 @@ def _time(table: schema.Experiment, data: Trajectory, place: str) -> Array:
             expected="s, ms, us, min, h, or a scale above 0",
             got=f"{line.unit or line.scale}",
         )
-    return data.time * scale
+    return scaled(data.time, scale)
 
 
 def _mapping(
@@ -295,10 +297,10 @@ def _conversion_words(
     return f"{signal}: from {line.unit or data.unit(column)} to {_unit(model, signal)}"
 
 
-def _scaled(values: Array, mapping: tuple[float, float]) -> Array:
+def _mapped(values: Array, mapping: tuple[float, float]) -> Array:
     """The values in the model's unit, untouched where nothing is to be done."""
     scale, offset = mapping
-    found = values if scale == 1.0 else values * scale
+    found = scaled(values, scale)
     return found if offset == 0.0 else found + offset
 
 

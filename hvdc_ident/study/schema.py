@@ -18,6 +18,14 @@ def _column_by_name(value: Any) -> Any:
     return {v if isinstance(v, str) else _not_text(v): v for v in value}
 
 
+def _one_or_three(value: Any) -> Any:
+    """The value as a list of one name, or of three."""
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list) or len(names) not in (1, 3) or not all(isinstance(n, str) and n for n in names):
+        raise ValueError(f"one column's name, or a list of three, is expected, not {value!r}")
+    return names
+
+
 def _known_noise(value: Any) -> Any:
     """The value, once it is a number or names a column (a union of types could not say which is wrong)."""
     if isinstance(value, dict):
@@ -158,6 +166,37 @@ class Phases(Table):
     gives: Annotated[dict[Name, Name], Field(min_length=1)]
 
 
+class Phasor(Table):
+    """Magnitude and angle of a quantity: one column each, or three in the order of rotation; unit: deg or rad, of the angles."""
+
+    magnitude: Annotated[list[Name], BeforeValidator(_one_or_three)]
+    angle: Annotated[list[Name], BeforeValidator(_one_or_three)]
+    unit: Literal["deg", "rad"] | None = None
+
+    @model_validator(mode="after")
+    def _as_many(self) -> Phasor:
+        if len(self.magnitude) != len(self.angle):
+            raise ValueError("angle: as many columns as magnitude are needed")
+        return self
+
+
+class Phasors(Table):
+    """One line of an experiment's `phasors`: quantities made of recorded magnitudes and angles (`hvdc_ident.phasors`).
+
+    magnitudes: how they are counted, for powers. window: s, over which the frequency is the angle's mean slope.
+    reference: "start", or the column of angles that angles are counted from; left out: as recorded.
+    gives: the quantity of each new column, to be named in inputs, outputs, drive or columns like a recorded one.
+    """
+
+    voltage: Phasor
+    current: Phasor | None = None
+    frequency: Positive | None = None
+    window: Positive = 0.1
+    magnitudes: Literal["phase-rms", "line-rms", "phase-peak", "pu"] | None = None
+    reference: Name | None = None
+    gives: Annotated[dict[Name, Name], Field(min_length=1)]
+
+
 class Instrument(Table):
     """One line of an experiment's `instrument`: the recording chain of an output."""
 
@@ -192,6 +231,7 @@ class Experiment(Table):
     drive: Columns = {}
     instrument: dict[Name, Instrument] = {}
     phases: list[Phases] = []
+    phasors: list[Phasors] = []
     interpolation: Annotated[
         Interpolation | dict[Name, Interpolation] | None, BeforeValidator(_known_interpolation)
     ] = None
