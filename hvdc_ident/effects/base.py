@@ -92,19 +92,22 @@ class Additions:
     def state(
         self, label: str, derivative: Callable[[sp.Symbol], sp.Expr], rest: sp.Expr | None = None, unit: str = ""
     ) -> sp.Symbol:
-        """The symbol of a new state; `derivative` gets it. rest: what the state equals at rest, where the derivative leaves it open."""
+        """The symbol of a new state; `derivative` gets it. rest: what the state equals at rest, where its search begins."""
         name = fresh(self.model, f"{self._prefix}_{label}")
         x = symbol(name)
         self.model = replace(self.model, states=self.model.states | {name: State(derivative(x), rest=rest, unit=unit)})
         return x
 
     def states(
-        self, labels: Sequence[str], derivatives: Callable[[tuple[sp.Symbol, ...]], Sequence[sp.Expr]]
+        self,
+        labels: Sequence[str],
+        derivatives: Callable[[tuple[sp.Symbol, ...]], Sequence[sp.Expr]],
+        rests: Sequence[sp.Expr],
     ) -> tuple[sp.Symbol, ...]:
-        """The symbols of new states that depend on each other; `derivatives` gets them all."""
+        """The symbols of new states that depend on each other; `derivatives` gets them all. rests: as for `state`, by label."""
         names = [fresh(self.model, f"{self._prefix}_{label}") for label in labels]
         symbols = tuple(symbol(n) for n in names)
-        added = {n: State(d) for n, d in zip(names, derivatives(symbols), strict=True)}
+        added = {n: State(d, rest=r) for n, d, r in zip(names, derivatives(symbols), rests, strict=True)}
         self.model = replace(self.model, states=self.model.states | added)
         return symbols
 

@@ -15,7 +15,7 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     x is what a low pass lets through, 2 zeta v a band pass with gain 1 at wn, the rest of u a high pass.
     """
     wn, zeta = p["wn"], p["zeta"]
-    x, v = add.states(("x", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])))
+    x, v = add.states(("x", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])), rests=(u, sp.S.Zero))
     band = 2 * zeta * v
     return u + p["k"] * (p["low"] * x + band + p["high"] * (u - x - band))
 

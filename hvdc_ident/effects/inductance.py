@@ -10,7 +10,7 @@ from hvdc_ident.frozen import FrozenMap
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """The current: u is what the resistance alone would let through."""
-    return add.state("y", lambda y: p["R"] * (u - y) / p["L"])
+    return add.state("y", lambda y: p["R"] * (u - y) / p["L"], rest=u)
 
 
 EFFECT = Effect(

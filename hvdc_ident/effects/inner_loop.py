@@ -12,7 +12,9 @@ from hvdc_ident.frozen import FrozenMap
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """y of the pair y' = wn (i + 2 zeta (u - y)), i' = wn (u - y): i, the integral's part, is in the unit of y."""
     wn, zeta = p["wn"], p["zeta"]
-    y, _ = add.states(("y", "i"), lambda s: (wn * (s[1] + 2 * zeta * (u - s[0])), wn * (u - s[0])))
+    y, _ = add.states(
+        ("y", "i"), lambda s: (wn * (s[1] + 2 * zeta * (u - s[0])), wn * (u - s[0])), rests=(u, sp.S.Zero)
+    )
     return y
 
 

@@ -10,7 +10,7 @@ from hvdc_ident.frozen import FrozenMap
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """The state that follows u."""
-    return add.state("y", lambda y: (u - y) / p["T"])
+    return add.state("y", lambda y: (u - y) / p["T"], rest=u)
 
 
 EFFECT = Effect(

@@ -10,7 +10,7 @@ from hvdc_ident.frozen import FrozenMap
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """y = x + T1/T2 (u - x) with T2 x' = u - x, which needs no derivative of u."""
-    x = add.state("x", lambda x: (u - x) / p["T2"])
+    x = add.state("x", lambda x: (u - x) / p["T2"], rest=u)
     return x + p["T1"] / p["T2"] * (u - x)
 
 

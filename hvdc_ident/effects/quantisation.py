@@ -43,7 +43,7 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     if not add.circular:
         return rounded
     rounded = add.signal("rounded", rounded)
-    return add.state("y", lambda y: (rounded - y) / FOLLOW)
+    return add.state("y", lambda y: (rounded - y) / FOLLOW, rest=rounded)
 
 
 def _levels(signal: Extent) -> Sequence[float]:

@@ -12,7 +12,7 @@ from hvdc_ident.frozen import FrozenMap
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """y of the pair y' = wn v, v' = wn (u - y - 2 zeta v): v is in the unit of y, so that the states compare."""
     wn, zeta = p["wn"], p["zeta"]
-    y, _ = add.states(("y", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])))
+    y, _ = add.states(("y", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])), rests=(u, sp.S.Zero))
     return y
 
 

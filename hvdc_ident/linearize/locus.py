@@ -13,8 +13,7 @@ from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.jacobian import state_matrix
 from hvdc_ident.linearize.modal import ZERO, eigen
-from hvdc_ident.linearize.newton import newton
-from hvdc_ident.linearize.operating_point import solve
+from hvdc_ident.linearize.operating_point import steady
 from hvdc_ident.linearize.search import Search
 from hvdc_ident.model.definition import Model
 
@@ -101,11 +100,10 @@ def root_locus(
 
 
 class _Along:
-    """The state matrix at a value of the parameter, each search starting from the one before."""
+    """The state matrix at a value of the parameter."""
 
     def __init__(self, model: Model, parameter: str, fixed: dict[str, float]) -> None:
         self.model, self.parameter = model, parameter
-        self.guess: Array | None = None
         own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
         start = {parameter: own.value}
         self._search = Search.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
@@ -120,20 +118,13 @@ class _Along:
         return replace(self._search, **{key: values})
 
     def matrix(self, value: float) -> Array:
-        """A at the value's own operating point, searched from the last one found."""
+        """A alone at the value's own operating point: the steady state that a simulation starts from there."""
         search = self._at(value)
-        if self.guess is not None:
-            with np.errstate(all="ignore"):
-                root = newton(search.equations, self.guess, search.low, search.high)
-            if root.found:
-                self.guess = root.v
-                return state_matrix(self.model, search.system, *search.vectors(root.v))
         try:
-            point = solve(self.model, search)
+            root, _ = steady(self.model, search)
         except SteadyStateError as e:
             raise e.at(f"{self.parameter} = {value:g}") from None
-        self.guess = np.concatenate([point.y, [*point.extras.values()]])
-        return state_matrix(self.model, search.system, point.y, point.w, point.p)
+        return state_matrix(self.model, search.system, *search.vectors(root.v))
 
 
 def at_zero(table: Array) -> Array:

@@ -1,4 +1,7 @@
-"""Scaled damped Newton with bounds, and pseudo-transient continuation, for equations with an exact Jacobian."""
+"""Scaled damped Newton with bounds, and a homotopy, for operating points with something fixed, free or bounded.
+
+A plain steady state is found where simulation finds it, in `hvdc_ident.simulate.steady_state`.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,13 @@ from hvdc_ident.linearize.arrays import Array
 Equations = Callable[[Array], tuple[Array, Array]]
 ACCURACY = 1e-10
 """Largest scaled residual that counts as solved: each equation against the size of its own terms."""
+SHORTEST = 2.0**-10
+"""Of the way of a homotopy: a part that has to be shorter ends it."""
 
 
 @dataclass(frozen=True)
 class Root:
-    """Where the iteration ended. shares: (equations,) scaled residuals; method: "newton" or "pseudo-transient"."""
+    """Where the iteration ended. shares: (equations,) scaled residuals; method: "newton" or "homotopy"."""
 
     v: Array
     residual: Array
@@ -107,38 +112,27 @@ def _step(jac: Array, r: Array, weight: Array, v: Array, low: Array, high: Array
     return step
 
 
-def pseudo_transient(equations: Equations, v: Array, moving: int, low: Array, high: Array) -> Root:
-    """The rest that implicit Euler steps of growing length lead to, polished by Newton's method: read `found`.
+def homotopy(equations: Equations, v: Array, low: Array, high: Array) -> Root:
+    """The root that the way from v leads to on which what the equations are off by at v goes to 0: read `found`.
 
-    moving: the first so many equations are derivatives of the first so many unknowns.
+    For what Newton's method does not reach at once from a known operating point: each part of the way is solved from the
+    one before, and halved where it is not.
     """
-    if v.size == 0:
-        return newton(equations, v, low, high)
-    r, jac = equations(v)
-    if jac.shape[0] != jac.shape[1]:
-        return newton(equations, v, low, high)
-    mass = np.zeros(v.size)
-    mass[:moving] = 1.0
-    h, steps = 1e-4, 0
-    for _ in range(400):
-        steps += 1
-        try:
-            step = np.linalg.solve(np.diag(mass / h) - jac, r)
-        except np.linalg.LinAlgError:
-            h *= 0.3
-            continue
-        trial = np.clip(v + step, low, high)
-        r_new, jac_new = equations(trial)
-        before = float(np.linalg.norm(r / weights(jac, v)))
-        after = float(np.linalg.norm(r_new / weights(jac_new, trial)))
-        if np.isfinite(after) and (after < 1.5 * before or h < 1e-9):
-            v, r, jac = trial, r_new, jac_new
-            h = min(h * max(1.5, before / max(after, 1e-300)), 1e9)
-            if after < 1e-12:
-                break
+    off, _ = equations(v)
+    share, part, steps = 0.0, 0.5, 0
+    while share < 1.0 and part > SHORTEST and np.isfinite(off).all():
+        ahead = min(share + part, 1.0)
+        left = (1.0 - ahead) * off
+
+        def shifted(x: Array, left: Array = left) -> tuple[Array, Array]:
+            r, jac = equations(x)
+            return r - left, jac
+
+        root = newton(shifted, v, low, high, 20)
+        steps += root.iterations
+        if root.found:
+            v, share, part = root.v, ahead, 2.0 * part
         else:
-            h *= 0.2
-            if h < 1e-12:
-                break
+            part *= 0.5
     polished = newton(equations, v, low, high)
-    return Root(polished.v, polished.residual, polished.shares, steps + polished.iterations, "pseudo-transient")
+    return Root(polished.v, polished.residual, polished.shares, steps + polished.iterations, "homotopy")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -12,14 +13,16 @@ from hvdc_ident.errors import SteadyStateError, unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.limits import Limit, limits
-from hvdc_ident.linearize.newton import ACCURACY, Root, newton, pseudo_transient
+from hvdc_ident.linearize.newton import ACCURACY, Root, homotopy, newton, weights
 from hvdc_ident.linearize.search import At, Search
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.notebook import table_html
+from hvdc_ident.simulate.steady_state import equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]
+Branch = Literal["own", "unconnected", "other", "trimmed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +31,10 @@ class OperatingPoint:
 
     extras: values of delays and sampled blocks. residual: the largest scaled residual of the equations that define it.
     limits: every limiter in use with its margin. at: "steady", or "start" where states stand at their given start.
-    method: "newton" or "pseudo-transient"; underdetermined points say "newton, least norm".
+    method: "newton" or "homotopy"; underdetermined points say "newton, least norm".
+    branch: "own", the steady state that a simulation starts from: connected with the one that the model has at its own
+    values; "unconnected", found by a new search where following that one ended at a jump; "other", another one, to which
+    a given guess led; "trimmed" where outputs or states are fixed, something is free, or states stand at their start.
     """
 
     model: AnyModel
@@ -45,6 +51,7 @@ class OperatingPoint:
     at: At = "steady"
     time: float = 0.0
     search: Search | None = field(default=None, repr=False)
+    branch: Branch = "own"
 
     def _repr_html_(self) -> str:
         rows = [(n, v) for part in (self.states, self.inputs, self.outputs) for n, v in part.items()]
@@ -55,6 +62,20 @@ class OperatingPoint:
     def active_limits(self) -> tuple[Limit, ...]:
         """The limiters that hold their signal here."""
         return tuple(x for x in self.limits if x.active)
+
+    @cached_property
+    def stable(self) -> bool | None:
+        """Whether no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
+        from hvdc_ident.linearize.standing import is_stable
+
+        return is_stable(self)
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader has to know of the point: that it is unstable, not the model's own one, or far off; with the other one's place."""
+        from hvdc_ident.linearize.standing import notes
+
+        return notes(self)
 
     @property
     def y(self) -> Array:
@@ -85,12 +106,17 @@ class OperatingPoint:
             "at": self.at,
             "method": self.method,
             "iterations": self.iterations,
+            "branch": self.branch,
+            "stable": self.stable,
+            "notes": list(self.notes),
         }
 
     def __str__(self) -> str:
         lines = [f"{n} = {v:.6g}" for n, v in (*self.states.items(), *self.inputs.items(), *self.outputs.items())]
         held = [x.text for x in self.active_limits] or ["no limit is active"]
-        return "\n".join([f"operating point of '{self.model.name}' ({self.at}, {self.method})", *lines, *held])
+        return "\n".join(
+            [f"operating point of '{self.model.name}' ({self.at}, {self.method})", *lines, *held, *self.notes]
+        )
 
 
 def find_operating_point(
@@ -107,6 +133,8 @@ def find_operating_point(
     time: float = 0.0,
 ) -> OperatingPoint:
     """The operating point at which every derivative is 0 and what is fixed holds.
+
+    With inputs and parameters alone it is the steady state that a simulation starts from.
 
     fixed: values of inputs, parameters, states, unknowns, signals or outputs. free: inputs and parameters to be found.
     inputs: values of inputs. outputs: values that outputs are to have (a trimmed point); where nothing is free the inputs
@@ -144,18 +172,70 @@ def find_operating_point(
 
 def solve(model: Model, search: Search, guess: Mapping[str, float] | None = None) -> OperatingPoint:
     """The point a search leads to; SteadyStateError with the worst equation where it leads to none."""
-    best: Root | None = None
-    starts = search.guesses(guess or {})
+    if search.is_plain and not guess:
+        return point_of(model, search, *steady(model, search))
+    own = _own(model, search)
+    root = _constrained(model, search, guess or {}, own)
+    if not search.is_plain:
+        return point_of(model, search, root, "trimmed")
+    same = own is not None and np.allclose(
+        root.v, own, rtol=1e-6, atol=1e-6 * max(1.0, float(np.abs(own).max(initial=0.0)))
+    )
+    return point_of(model, search, root, "own" if own is None or same else "other")
+
+
+def steady(model: Model, search: Search) -> tuple[Root, Branch]:
+    """The steady state that a simulation of the same inputs and parameters starts from, and its branch."""
+    free = model if search.at == "start" else resting(model)
+    try:
+        at = equilibria(free)
+        found = at.start(free, search.p, search.u, search.time)
+    except SteadyStateError as e:
+        raise SteadyStateError(
+            e.what,
+            where=e.where,
+            expected=e.expected,
+            got=e.got,
+            hint=f"{e.hint}; states that need not rest can be named in `moving`",
+        ) from None
+    v = at.unknowns(found)
     with np.errstate(all="ignore"):
-        for v in starts:
+        r, jac = search.equations(v)
+        shares = np.abs(r) / weights(jac, v)
+    return Root(v, r, shares, 0, "newton"), found.branch
+
+
+def _own(model: Model, search: Search) -> Array | None:
+    """The model's own steady state at the search's inputs and parameters; None where it has none there."""
+    free = model if search.at == "start" else resting(model)
+    at = equilibria(free)
+    try:
+        return at.unknowns(at.start(free, search.p, search.u, search.time))
+    except SteadyStateError:
+        return None
+
+
+def _constrained(model: Model, search: Search, guess: Mapping[str, float], own: Array | None) -> Root:
+    """The root that the guess leads to, else one near the model's own steady state, else near its guesses."""
+    best: Root | None = None
+    starts = search.guesses(guess)
+    near = (
+        None if own is None else search.guesses({**dict(zip(search.variables, own.tolist(), strict=False)), **guess})[0]
+    )
+    with np.errstate(all="ignore"):
+        for v in [*starts[:1], near, *starts[1:]] if guess else [near, *starts]:
+            if v is None:
+                continue
             root = newton(search.equations, v, search.low, search.high)
             if root.found:
-                return point_of(model, search, root)
+                return root
             best = root if best is None or root.shares.max() < best.shares.max() else best
-        for v in starts[:2]:
-            root = pseudo_transient(search.equations, v, search.leading, search.low, search.high)
+        for v in (near, *starts[:1]):
+            if v is None:
+                continue
+            root = homotopy(search.equations, v, search.low, search.high)
             if root.found:
-                return point_of(model, search, root)
+                return root
             best = root if best is None or root.shares.max() < best.shares.max() else best
     assert best is not None
     raise _not_found(model, search, best)
@@ -176,7 +256,7 @@ def _not_found(model: Model, search: Search, root: Root) -> SteadyStateError:
     )
 
 
-def point_of(model: Model, search: Search, root: Root) -> OperatingPoint:
+def point_of(model: Model, search: Search, root: Root, branch: Branch = "own") -> OperatingPoint:
     """The point of a solved search."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
@@ -200,6 +280,7 @@ def point_of(model: Model, search: Search, root: Root) -> OperatingPoint:
         search.at,
         search.time,
         search,
+        branch,
     )
 
 

@@ -87,10 +87,11 @@ class Search:
         )
 
     @property
-    def leading(self) -> int:
-        """How many of the first equations are the derivatives of the states in order."""
-        size = self.system.layout
-        return size.nx if len(self.equation_rows) == size.n + size.ne else 0
+    def is_plain(self) -> bool:
+        """Whether all that is asked for is the steady state at given inputs and parameters."""
+        whole = len(self.equation_rows) == self.system.layout.n + self.system.layout.ne
+        nothing = not (self.freed_u or self.freed_p or self.fixed_places or self.fixed_rows or self.bounded_rows)
+        return whole and nothing and not (np.isfinite(self.low).any() or np.isfinite(self.high).any())
 
     @property
     def variables(self) -> tuple[str, ...]:

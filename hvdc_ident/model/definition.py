@@ -22,8 +22,8 @@ Start: TypeAlias = sp.Expr | Literal["free"] | None
 class State:
     """x' = derivative. start: an expression of parameters, "free" (unknown: becomes the parameter NAME_start) or None: the steady state.
 
-    guess: where the search for the steady state begins; None: several places are tried.
-    rest: what the state equals at rest, for a derivative that is 0 at rest wherever the state is.
+    guess: where the search for the steady state begins; None: at `rest` where that is given, else several places are tried.
+    rest: what the state equals at rest, which a derivative may leave open (0 wherever the state is) or hide (clipped).
     """
 
     derivative: sp.Expr
@@ -89,6 +89,18 @@ class Parameterisation:
 
 
 @dataclass(frozen=True)
+class Origin:
+    """The model that another one was made from, whose steady state the other one's is connected with.
+
+    root: the model as it was given, with its own values. neutral: by rewritten signal or unknown of the other model,
+    what its readers see in the root.
+    """
+
+    root: Model
+    neutral: FrozenMap[sp.Expr] = field(default_factory=FrozenMap)
+
+
+@dataclass(frozen=True)
 class Model:
     """A continuous-time model with limits, delays and sampled parts.
 
@@ -96,6 +108,8 @@ class Model:
     sampled values by name, in any order, as long as no circle is closed but through `algebraic`, `delays` or `sampled`.
     Plain values are accepted where an object with more detail is stored: a number for a Parameter or an Input, an
     expression for a State, Signal, Algebraic or Output.
+
+    origin: what it was made from by `with_values` and `with_effects`; no part of its definition.
 
     Raises ModelError where names clash, are unknown, or signals run in a circle.
     """
@@ -111,6 +125,7 @@ class Model:
     sampled: FrozenMap[Sampled] = field(default_factory=FrozenMap)
     parameterisations: FrozenMap[Parameterisation] = field(default_factory=FrozenMap)
     description: str = ""
+    origin: Origin | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         from hvdc_ident.model.check import check, coerced
@@ -143,7 +158,9 @@ class Model:
                 inputs[name] = replace(inputs[name], value=float(value))
             else:
                 raise unknown_name("parameter or input", name, [*parameters, *inputs], where=f"model '{self.name}'")
-        return replace(self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs))
+        return replace(
+            self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs), origin=self.origin or Origin(self)
+        )
 
     def with_effects(self, effects: Iterable[Any]) -> Model:
         """The model with effects put on its slots, one after the other; an effect at its neutral value changes nothing.

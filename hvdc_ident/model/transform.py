@@ -11,7 +11,7 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Signal
+from hvdc_ident.model.definition import Model, Origin, Signal
 from hvdc_ident.parameters import Input, Parameter
 
 Renaming = Mapping[sp.Symbol, sp.Symbol]
@@ -69,6 +69,7 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
     of an input or a state see `NAME_after_LABEL`. An unknown whose circle the effect opens becomes a signal by itself.
     """
     kind, name = slot(model, name)
+    origin = model.origin or Origin(model)
     if kind == "output":
         model, y = rewrite(model, model.outputs[name].value)
         return replace(model, outputs=model.outputs | {name: replace(model.outputs[name], value=y)})
@@ -79,13 +80,23 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
         fields = substituted(model, {symbol(name): symbol(seen)})
         model = replace(model, **fields | {"signals": fields["signals"] | signals})
         model, y = rewrite(model, symbol(name))
-        return replace(model, signals=model.signals | {seen: Signal(y, unit)})
+        neutral = {n: e.xreplace({symbol(name): symbol(seen)}) for n, e in origin.neutral.items()} | {
+            seen: symbol(name)
+        }
+        return replace(
+            model,
+            signals=model.signals | {seen: Signal(y, unit)},
+            origin=Origin(origin.root, FrozenMap(neutral)),
+        )
     before = fresh(model, f"{name}_before_{label}")
+    # What stood there so far, with the effects that it had, is now what readers of `before` see.
+    moved = {before: origin.neutral[name]} if name in origin.neutral else {}
+    origin = Origin(origin.root, origin.neutral | moved | {name: symbol(before)})
     if kind == "signal":
         old = model.signals[name]
         model = replace(model, signals=_inserted(model.signals, name, before, replace(old)))
         model, y = rewrite(model, symbol(before))
-        return replace(model, signals=model.signals | {name: replace(old, value=y)})
+        return replace(model, signals=model.signals | {name: replace(old, value=y)}, origin=origin)
     unknown = model.algebraic[name]
     model = replace(
         model,
@@ -93,7 +104,32 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
         algebraic=model.algebraic | {name: replace(unknown, equation=symbol(before))},
     )
     model, y = rewrite(model, symbol(before))
-    return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)})
+    return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)}, origin=origin)
+
+
+def blended(model: Model) -> tuple[Model, str]:
+    """The model with a parameter that puts its effects in by and by, and the parameter's name ("" without effects).
+
+    Readers of a slot see u + blend (y - u): at 0 they see what they see in the model of origin, at 1 the model is itself.
+    """
+    if model.origin is None or not model.origin.neutral:
+        return model, ""
+    neutral, name = model.origin.neutral, fresh(model, "blend")
+    share = symbol(name)
+
+    def seen(slot: str, value: sp.Expr) -> sp.Expr:
+        return neutral[slot] + share * (value - neutral[slot]) if slot in neutral else value
+
+    signals = {n: replace(s, value=seen(n, s.value)) for n, s in model.signals.items()}
+    algebraic = {n: replace(a, equation=seen(n, a.equation)) for n, a in model.algebraic.items()}
+    share_of_effects = Parameter(1.0, min=0.0, max=1.0)
+    made = replace(
+        model,
+        parameters=model.parameters | {name: share_of_effects},
+        signals=FrozenMap(signals),
+        algebraic=FrozenMap(algebraic),
+    )
+    return made, name
 
 
 def home(slots: Collection[str], name: str) -> str:
@@ -119,8 +155,14 @@ def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal)
     return FrozenMap(items)
 
 
+def _derived(model: Model) -> Model:
+    """The model, with itself as what it comes from where it does not come from another."""
+    return model if model.origin else replace(model, origin=Origin(model))
+
+
 def driven(model: Model, slots: tuple[str, ...]) -> Model:
     """The model in which the slots are inputs of the same name, to follow a recorded column."""
+    model = _derived(model) if slots else model
     for given in slots:
         kind, name = slot(model, given)
         if kind == "output":
@@ -162,7 +204,7 @@ def parameterised(model: Model, name: str) -> Model:
         {k: v for k, v in model.parameterisations.items() if k != name and not set(v.replaces) & set(chosen.replaces)}
     )
     return replace(
-        model,
+        _derived(model),
         parameters=FrozenMap(parameters),
         signals=FrozenMap({**signals, **model.signals}),
         parameterisations=others,
@@ -194,7 +236,7 @@ def tied(model: Model, ties: Mapping[str, sp.Expr]) -> Model:
     }
     others = {k: v for k, v in model.parameterisations.items() if not set(v.replaces) & set(ties)}
     return replace(
-        model,
+        _derived(model),
         parameters=model.parameters.without(*ties),
         signals=FrozenMap({**signals, **model.signals}),
         parameterisations=FrozenMap(others),

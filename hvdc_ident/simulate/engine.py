@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.result import Simulation, Statistics
 from hvdc_ident.simulate.status import HINTS
 from hvdc_ident.simulate.status import NAMES as STATUS
+from hvdc_ident.simulate.steady_state import Equilibria
 from hvdc_ident.simulate.structure import NAMES, Structure, padded
 from hvdc_ident.trajectory import Array, Trajectory
 
@@ -46,24 +47,10 @@ class Engine:
     def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
         self._integrators = integrators()
         self.structure = Structure(model, sensitivities, outputs)
-        s = self.structure.sizes
         self._code = self.structure.compile()
         self._late: Code | None = None
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
-        self._dims = np.array(
-            [
-                s.nx,
-                s.nz,
-                s.nu,
-                s.nd,
-                s.nq,
-                s.ns,
-                s.no,
-                s.np,
-                s.width,
-            ],
-            dtype=np.int64,
-        )
+        self._equilibria = Equilibria(self.structure, self._address)
         second = self.structure.second
         self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
         self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
@@ -72,63 +59,15 @@ class Engine:
 
     # --- the start ---
 
-    def start(self, p: Array, u: Array, time: float = 0.0, *, search: bool = True) -> tuple[Array, Array]:
-        """The steady state and held values at parameters p, inputs u and a time, as the flat vectors y and w with their rows.
+    def start(
+        self, p: Array, u: Array, time: float = 0.0, *, search: bool = True, model: Model | None = None
+    ) -> tuple[Array, Array]:
+        """The flat vectors y and w of the steady state, with their rows; arguments and errors as in `Equilibria.start`.
 
-        search: whether Newton's method may begin elsewhere than at the guesses, and its fallbacks are tried. Raises
-        SteadyStateError where none is found.
+        model: whose values and origin tell which steady state (default: the model that the engine was made for).
         """
-        s = self.structure.sizes
-        p = np.ascontiguousarray(p, dtype=float)
-        n, extra = s.nx + s.nz, s.nd + s.nq
-        m, worst = np.zeros(max(s.ns, 1)), np.zeros(2)
-        for begin in self._begins(p, u, time):
-            y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + extra * (1 + s.width))
-            y[:n], w[0], w[1 : 1 + s.nu], w[1 + s.nu : 1 + s.nu + extra] = begin[:n], time, u, begin[n:]
-            jac = np.zeros((n + extra, n + extra))
-            given = (self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst)
-            if _status(self._integrators.rest(*given)) == 0:
-                return y, w
-            if not search:
-                raise SteadyStateError(
-                    "no steady state was found at once", where=f"model '{self.structure.model.name}'",
-                    hint="let it be searched for: Tolerance(search=True)",
-                )  # fmt: skip
-        from hvdc_ident.simulate.steady import fallback
-
-        return fallback(self.structure, self._address, p, u, self._guesses[0], time)
-
-    def _begins(self, p: Array, u: Array, time: float) -> Iterator[Array]:
-        """Where the search begins: each guess with its delayed and sampled values at 0, then with those as their sources are there."""
-        extra = self.structure.sizes.nd + self.structure.sizes.nq
-        for guess in self._guesses:
-            yield np.concatenate([guess, np.zeros(extra)])
-            if extra:
-                held = self._held(guess, p, u, time)
-                if held.any() and np.isfinite(held).all():
-                    yield np.concatenate([guess, held])
-
-    def _held(self, guess: Array, p: Array, u: Array, time: float) -> Array:
-        """Delayed and sampled values, as their sources are at a guess."""
-        s = self.structure.sizes
-        held, m = np.zeros(s.nd + s.nq), np.zeros(max(s.ns, 1))
-        for _ in held:  # a source may read another's value
-            w = np.concatenate([[time], u, held])
-            evaluate(self._address[NAMES.index("modes")], guess, w, p, m, m)
-            evaluate(self._address[NAMES.index("src")], guess, w, p, m, held)
-        return held
-
-    @cached_property
-    def _guesses(self) -> list[Array]:
-        """Where the search begins: the model's own guesses, then the unknown ones at 0, at 1 and at seeded random places."""
-        m = self.structure.model
-        given = [s.guess for s in m.states.values()]
-        tail = [m.algebraic[n].start for n in self.structure.unknowns]
-        if all(g is not None for g in given):
-            return [np.array([*given, *tail], dtype=float)]
-        random = np.random.default_rng(0)
-        fills = [np.zeros(len(given)), np.ones(len(given)), *(random.normal(size=(4, len(given))))]
-        return [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]
+        found = self._equilibria.start(model or self.structure.model, p, u, time, search=search)
+        return found.y, found.w
 
     def constants(self, p: Array) -> Array:
         """Delay times, sampling periods and compute times, with their rows over the parameters."""
@@ -170,16 +109,17 @@ class Engine:
         method: Method = "auto",
         scale: Array | None = None,
         first: float | None = None,
+        model: Model | None = None,
     ) -> tuple[Array, Statistics]:
         """Outputs at the times, (n, outputs (1 + width)): values, then rows; and what it cost.
 
-        inputs: one InputSignal an input. first: where the run starts, s (default: the first time).
+        inputs: one InputSignal an input. first: where the run starts, s (default: the first time). model: as in `start`.
         """
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
         p = np.ascontiguousarray(p, dtype=float)
         u, *tables = _tables(tuple(inputs), begin, end)
-        y, w = self.start(p, u, begin, search=tolerance.search)
+        y, w = self.start(p, u, begin, search=tolerance.search, model=model)
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float)
@@ -376,7 +316,7 @@ def simulate(
     tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
     scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities]) if sensitivities else None
     try:
-        out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale)
+        out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale, model=plant)
     except (SimulationError, SteadyStateError) as e:
         raise e.at(f"experiment '{experiment.name}'") from None
     return _simulation(plant, code, experiment, out, statistics, tuple(sensitivities))

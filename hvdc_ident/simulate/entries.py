@@ -50,11 +50,11 @@ def _matrix(a):  # type: ignore[no-untyped-def]
     return table(_data(a), _length(a, 0), _length(a, 1))
 
 
-def rest(address, dims, p, y, w, wd, m, jac, worst):  # type: ignore[no-untyped-def]
+def rest(address, dims, p, y, w, wd, m, jac, worst, rule):  # type: ignore[no-untyped-def]
     """A status of `rest.rest`, and 1; 0 where there was no memory."""
     return 1 + _rest(
         _integers(address), _integers(dims), _numbers(p), _numbers(y), _numbers(w), _numbers(wd), _numbers(m),
-        _matrix(jac), _numbers(worst),
+        _matrix(jac), _numbers(worst), _numbers(rule),
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import llvmlite.binding as llvm
 from hvdc_ident.simulate.objects import compiled, kept, loaded
 from hvdc_ident.simulate.structure import NAMES
 
-ARGUMENTS = {"rest": 9, "room": 1, "integrate": 18}
+ARGUMENTS = {"rest": 10, "room": 1, "integrate": 18}
 MAX_STEPS = 4  # the one argument of `integrate` that is no array
 
 
@@ -31,20 +31,25 @@ class Integrators:
 @cache
 def integrators() -> Integrators:
     """The integrators; from the first call on they stay."""
+    found = {name: entry(name) for name in ARGUMENTS}
+    return Integrators(**{name: call for name, (call, _) in found.items()}, engines=tuple(e for _, e in found.values()))
+
+
+@cache
+def entry(name: str) -> tuple[Callable[..., int], llvm.ExecutionEngine]:
+    """One of the functions of `entries`, to be called from Python, and what holds its code in memory."""
     import numba
 
     from hvdc_ident.simulate.kernel import stamp
 
     _prepare_runtime()
     facts = f"{stamp(NAMES)} {numba.__version__} {platform.python_version()}"
-    functions, engines = {}, []
-    for name, count in ARGUMENTS.items():
-        engine = loaded(kept(f"{name} {facts}", lambda name=name: _made(name)))  # type: ignore[misc]
-        engines.append(engine)
-        kinds = [ctypes.c_int64 if k == MAX_STEPS and name == "integrate" else ctypes.py_object for k in range(count)]
-        prototype = ctypes.PYFUNCTYPE(ctypes.c_int64, *kinds)
-        functions[name] = prototype(engine.get_function_address(_symbol(name)))
-    return Integrators(**functions, engines=tuple(engines))
+    engine = loaded(kept(f"{name} {facts}", lambda: _made(name)))
+    kinds = [
+        ctypes.c_int64 if k == MAX_STEPS and name == "integrate" else ctypes.py_object for k in range(ARGUMENTS[name])
+    ]
+    prototype = ctypes.PYFUNCTYPE(ctypes.c_int64, *kinds)
+    return prototype(engine.get_function_address(_symbol(name))), engine
 
 
 def _symbol(name: str) -> str:

@@ -31,6 +31,16 @@ def lu(a, pivots):  # type: ignore[no-untyped-def]
     return True
 
 
+@kernel()
+def orientation(a, pivots):  # type: ignore[no-untyped-def]
+    """The sign of the determinant, from the factors of `lu`."""
+    sign = 1.0
+    for k in range(a.shape[0]):
+        if (a[k, k] < 0.0) != (pivots[k] != k):
+            sign = -sign
+    return sign
+
+
 @kernel(fastmath={"contract"})
 def solve(a, pivots, b):  # type: ignore[no-untyped-def]
     """Solves in place for b (n,) with the factors of `lu`, which store the diagonal's inverse."""

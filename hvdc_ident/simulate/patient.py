@@ -1,4 +1,5 @@
-"""The ways to a steady state that Newton's method does not find, compiled: steps of least norm, and following the model.
+"""The ways to a steady state that Newton's method does not find, compiled: along a path of values from a known one, steps of
+least norm, and following the model.
 
 What follows it takes one Newton step for each in time, or solves each, which is slower and ends on the edge of a jump too.
 """
@@ -10,11 +11,12 @@ from numba import njit
 
 from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.kernel import kernel, stamp
-from hvdc_ident.simulate.linear import lu, solve
+from hvdc_ident.simulate.linear import lu, orientation, solve
 from hvdc_ident.simulate.rest import REST_JAC, residual
 from hvdc_ident.simulate.structure import ACCURACY, TINY
 
 EPSILON = float(np.finfo(float).eps)
+SHORTEST = 2.0**-16  # of a path: a step that has to be shorter means that the path ends
 
 
 @kernel()
@@ -104,6 +106,76 @@ def stepped(address, inner, nu, nx, y, w, wd, p, m, size, v, h, x):  # type: ign
 
 def _entries(stamp):  # type: ignore[no-untyped-def]
     """What Python calls, for the present state of the kernels' files."""
+
+    @njit(cache=True, error_model="numpy")
+    def trace(address, inner, nu, y, w, p, m, ends_p, ends_w, v, sign):  # type: ignore[no-untyped-def]
+        """Moves v (n,), a rest at the first of two sets of values, along the straight line between them; the share reached.
+
+        ends_p (2, parameters), ends_w (2, 1 + inputs): the values, time first. sign: of the determinant at the start.
+
+        A step counts where undamped Newton corrections at least halve (`rest` says why; across a limit, where the
+        equations have a corner, no such ratio holds), the determinant keeps its sign, which a fold changes, and the way
+        is no longer than the two slopes at its ends allow: a jump to another branch is. Else it is halved.
+        """
+        kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  the stamp is used so that the cache knows of it
+        r, x, delta, extent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        jac, matrix, pivots, modes = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n, np.int64), np.zeros(m.size)
+        share, h = 0.0, 1.0
+        while share < 1.0 and h > SHORTEST:
+            h = min(h, 1.0 - share)
+            ahead = share + h if h < 1.0 - share else 1.0
+            p[:] = ends_p[0] + ahead * (ends_p[1] - ends_p[0])
+            w[: 1 + nu] = ends_w[0] + ahead * (ends_w[1] - ends_w[0])
+            x[:] = v
+            for i in range(n):
+                extent[i] = max(abs(v[i]), TINY)
+            arrived, before, first = False, np.inf, 0.0
+            for k in range(12):
+                modes[:] = m
+                equations(address, y, w, wd, p, m, inner, 1 + nu, x, r, jac)
+                matrix[:] = jac
+                delta[:] = r
+                if not lu(matrix, pivots):
+                    break
+                solve(matrix, pivots, delta)
+                size = 0.0
+                for i in range(n):
+                    part = abs(delta[i]) / extent[i]
+                    if not part <= size:
+                        size = part
+                if not size < 1e12:
+                    break
+                first = size if k == 0 else first
+                if size < 1e-11 or (size < 1e-8 and size > 0.5 * before):
+                    arrived = orientation(matrix, pivots) == sign
+                    break
+                cornered = False
+                for i in range(m.size):
+                    cornered = cornered or modes[i] != m[i]
+                if k > 0 and size > 0.5 * before and not cornered:
+                    break
+                for i in range(n):
+                    x[i] -= delta[i]
+                before = size
+            if arrived:
+                p[:] = ends_p[0] + share * (ends_p[1] - ends_p[0])
+                w[: 1 + nu] = ends_w[0] + share * (ends_w[1] - ends_w[0])
+                residual(address, y, w, wd, p, m, n, inner, 1 + nu, x, delta)
+                solve(matrix, pivots, delta)
+                way, back = 0.0, 0.0
+                for i in range(n):
+                    way = max(way, abs(x[i] - v[i]) / extent[i])
+                    back = max(back, abs(delta[i]) / extent[i])
+                arrived = way <= first + back + 1e-8
+            if arrived:
+                v[:] = x
+                share = ahead
+                h *= 2.0
+            else:
+                h *= 0.5
+        p[:] = ends_p[0] + share * (ends_p[1] - ends_p[0])
+        w[: 1 + nu] = ends_w[0] + share * (ends_w[1] - ends_w[0])
+        return share
 
     @njit(cache=True, error_model="numpy")
     def follow(address, inner, nu, nx, y, w, p, m, size, v):  # type: ignore[no-untyped-def]
@@ -202,7 +274,7 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
                 rounding += abs(jac[i, j]) * abs(v[j])
             shares[i] = 0.0 if abs(r[i]) <= 16.0 * EPSILON * rounding else abs(r[i]) / shares[i]
 
-    return follow, nearest, slide, judge
+    return trace, follow, nearest, slide, judge
 
 
-follow, nearest, slide, judge = _entries(stamp())
+trace, follow, nearest, slide, judge = _entries(stamp())

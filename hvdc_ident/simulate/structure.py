@@ -275,13 +275,16 @@ class Structure:
         return result
 
     def _rest(self) -> list[Function]:
-        """Residual of the steady state over [x, z, delays, sampled], its Jacobian and its derivative by the sensitivity parameters."""
+        """Residual of the steady state over [x, z, delays, sampled], its Jacobian and its derivative by the sensitivity parameters.
+
+        A state with a rest or start runs to it, as others run along their derivatives, where the model is followed.
+        """
         g, s = self.graph, self.sizes
         first = 1 + s.nu
         tail = [g.sub(v, g.leaf("w", first + k)) for k, v in enumerate(self.sources)]
         fixed = [rest if start is None else start for start, rest in zip(self.starts, self.rests, strict=True)]
         head = [
-            d if value is None else g.sub(g.leaf("y", k), value)
+            d if value is None else g.sub(value, g.leaf("y", k))
             for k, (d, value) in enumerate(zip(self.derivatives, fixed, strict=True))
         ]
         residual = [*head, *self.residuals, *tail]
@@ -311,6 +314,21 @@ class Structure:
     def compile(self) -> Code:
         """The machine code that every run needs; keep it as long as its addresses are used."""
         return Code(self.graph, [f for f in self.functions if f.name not in LATE], max(self.sizes.width, 1))
+
+    def compile_rest(self) -> Code:
+        """The machine code of the steady state alone."""
+        g = self.graph
+        rest = self._rest()
+        modes = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
+        return Code(
+            g,
+            [
+                Function("modes", list(enumerate(modes)), live=True),
+                Function("src", list(enumerate(self.sources))),
+                *rest,
+            ],
+            max(self.sizes.width, 1),
+        )
 
     def compile_late(self) -> Code:
         """What only the Rosenbrock method needs: second derivatives and elimination, most of the code of a large model."""

@@ -195,7 +195,7 @@ def test_an_integrator_without_memory_says_so(monkeypatch):
     monkeypatch.setattr(sys, "unraisablehook", lambda failure: said.append(failure.exc_type))
     few, sizes = np.zeros(1), np.array([2**46, 0, 0, 0, 0, 0, 0, 0, 0])
     addresses = np.zeros(len(machine.ARGUMENTS) * 3, dtype=np.int64)
-    given = (addresses, sizes, few, few, few, few, few, np.zeros((1, 1)), np.zeros(2))
+    given = (addresses, sizes, few, few, few, few, few, np.zeros((1, 1)), np.zeros(2), np.zeros(2))
     assert integrators().rest(*given) == 0
     assert said == [MemoryError]
 

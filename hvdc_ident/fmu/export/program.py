@@ -57,7 +57,7 @@ class Program:
         code = engine(m)
         s = code.structure.sizes
         try:
-            y, w = code.start(p, u)
+            y, w = code.start(p, u, model=m)
         except SteadyStateError:
             return self.guesses
         return np.concatenate([y[: s.nx + s.nz], w[1 + s.nu : 1 + s.nu + s.nd + s.nq]])

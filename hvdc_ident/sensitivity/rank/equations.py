@@ -74,7 +74,7 @@ class Source:
         if self._point is None:
             try:
                 n = len(self.structure.states) + len(self.structure.unknowns)
-                self._point = engine(self.model).start(self.p, self.u)[0][:n]
+                self._point = engine(self.model).start(self.p, self.u, model=self.model)[0][:n]
             except SteadyStateError:
                 if "steady" in self.start.values():
                     raise

@@ -1,0 +1,623 @@
+"""The steady state that a model starts from: the one solver for simulation and linearisation.
+
+A model may have several equilibria. Its own one is what the search from its guesses finds at its own values (`search`).
+At other values, and with effects put in, the steady state is the one that is connected with it: found by Newton's method
+where that cannot have left the branch, else followed along the values (`trace`), the effects put in by and by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import SteadyStateError
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.model.transform import blended
+from hvdc_ident.simulate.integrators import entry
+from hvdc_ident.simulate.kept import by_structure
+from hvdc_ident.simulate.machine import Code, evaluate
+from hvdc_ident.simulate.structure import ACCURACY, NAMES, TINY, Structure
+from hvdc_ident.trajectory import Array
+
+Branch = Literal["own", "unconnected"]
+
+CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
+HALVES = 0.5
+"""The most that an undamped Newton correction may keep of the one before: Kantorovich's condition (`rest` says how)."""
+ROOM = 256
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A known steady state: v = [x, z, delayed, sampled values] at parameters p and inputs u.
+
+    sign: of the Jacobian's determinant there, 0 where it is singular.
+    """
+
+    p: Array
+    u: Array
+    v: Array
+    sign: float
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """Flat vectors y and w with their rows over the parameters, as the integrators take them.
+
+    branch: "own" where it is connected with the steady state that the model has at its own values, or that one is not
+    known; "unconnected" where following it ended at a jump and this one was found by a new search.
+    """
+
+    y: Array
+    w: Array
+    branch: Branch = "own"
+
+
+class Equilibria:
+    """The steady states of one model structure; its machine code stays with whoever made it, as long as this is used."""
+
+    def __init__(self, structure: Structure, address: NDArray[np.int64], code: Code | None = None) -> None:
+        self.structure, self._address, self._code = structure, address, code
+        s = structure.sizes
+        self.n, self.extra = s.nx + s.nz, s.nd + s.nq
+        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width], dtype=np.int64)
+        self._rest, _ = entry("rest")
+        self._anchors: dict[tuple[Model, bytes], Anchor | None] = {}
+        self.names = (*structure.states, *structure.unknowns, *structure.model.delays, *structure.model.sampled)
+
+    # --- the steady state at given values ---
+
+    def start(self, model: Model, p: Array, u: Array, time: float = 0.0, *, search: bool = True) -> SteadyState:
+        """The steady state of a model of this structure at parameters p, inputs u and a time.
+
+        search: whether anything but Newton's method from the model's own steady state or guesses may be tried. Raises
+        SteadyStateError where none is found, or where the one that the model has at its own values ends before these.
+        """
+        p = np.ascontiguousarray(p, dtype=float)
+        anchor = self.anchor(model, u)
+        if anchor is None or not anchor.sign:
+            return self.search(p, u, time, None if anchor is None else anchor.v, search=search)
+        found = self._newton(anchor.v, p, u, time, HALVES, anchor.sign)
+        if found is not None:
+            return SteadyState(*found[:2])
+        if not search:
+            raise self._not_at_once()
+        path = self._connected(model, anchor, p, u, time)
+        if path.ends == "arrived":
+            found = self._newton(path.v, p, u, time)
+            if found is not None:
+                return SteadyState(*found[:2])
+        if path.ends == "fold":
+            raise self._lost(path, p, u, time)
+        other = self.search(p, u, time)
+        return SteadyState(other.y, other.w, "unconnected")
+
+    def search(
+        self, p: Array, u: Array, time: float = 0.0, first: Array | None = None, *, search: bool = True
+    ) -> SteadyState:
+        """The steady state that the model's guesses lead to, or one near `first`, wherever the model has others."""
+        p = np.ascontiguousarray(p, dtype=float)
+        limit = self._region.limit
+        begins = self._begins(p, u, time)
+        for begin in begins if first is None else (first, *begins):
+            found = self._newton(begin, p, u, time)
+            if found is not None and (np.abs(found[0][: self.n]) <= limit[: self.n]).all():
+                return SteadyState(*found[:2])
+            if not search:
+                raise self._not_at_once()
+        return self._slowly(p, u, self._filled(self._guesses[0], p, u, time) if first is None else first, time)
+
+    def anchor(self, model: Model, u: Array) -> Anchor | None:
+        """The model's own steady state; None where it has none. u: what inputs rest at that the root of its origin lacks."""
+        root = model.origin.root if model.origin else model
+        own = tuple(model.inputs)
+        foreign = (
+            b""
+            if own == tuple(root.inputs)
+            else np.array([u[k] for k, n in enumerate(own) if n not in root.inputs]).tobytes()
+        )
+        key = (model, foreign)
+        if key not in self._anchors:
+            if len(self._anchors) >= ROOM:
+                self._anchors.clear()
+            self._anchors[key] = self._own(model) if root is model else self._inherited(model, root, u)
+        return self._anchors[key]
+
+    # --- the model's own steady state ---
+
+    def _own(self, model: Model) -> Anchor | None:
+        p, u = _values(model)
+        try:
+            found = self.search(p, u)
+        except SteadyStateError:
+            return None
+        return self._anchored(p, u, self._unknowns(found.y, found.w))
+
+    def _inherited(self, model: Model, root: Model, u: Array) -> Anchor | None:
+        """The root's own steady state, taken over by name, with the model's effects put in and at the model's own values."""
+        known = self._of_root(model, root)
+        if known is None:
+            return None
+        p_own, u_own = _values(model)
+        foreign = [k for k, n in enumerate(model.inputs) if n not in root.inputs]
+        u_own[foreign] = u[foreign]
+        p_root = np.array(
+            [root.parameters[n].value if n in root.parameters else q.value for n, q in model.parameters.items()]
+        )
+        u_root = u_own.copy()
+        for k, n in enumerate(model.inputs):
+            if n in root.inputs:
+                u_root[k] = root.inputs[n].value
+        v = self._filled(np.array([known.get(n, np.nan) for n in self.names]), p_root, u_root, 0.0)
+        begun: Anchor | None = self._anchored(p_root, u_root, v)
+        _, _, shares = self._judged(v, p_root, u_root, 0.0)
+        if not (shares < ACCURACY).all():
+            begun = self._with_effects(model, p_root, u_root, known) if _has_effects(model) else None
+        if begun is None or not begun.sign or (np.array_equal(p_root, p_own) and np.array_equal(u_root, u_own)):
+            return begun
+        found = self._newton(begun.v, p_own, u_own, 0.0, HALVES, begun.sign)
+        if found is not None:
+            return Anchor(p_own, u_own, self._unknowns(found[0], found[1]), found[2])
+        path = self._follow_any(_ways(begun, p_own, u_own, 0.0), begun)
+        return Anchor(p_own, u_own, path.v, begun.sign) if path.ends == "arrived" else begun
+
+    def _of_root(self, model: Model, root: Model) -> dict[str, float] | None:
+        """The root's own steady state by name: states, unknowns and signals."""
+        same = root.structure == self.structure.model.structure
+        at = self if same else equilibria(root)
+        anchor = at.anchor(root, np.array([i.value for i in root.inputs.values()]))
+        return None if anchor is None else dict(zip(at.names, anchor.v.tolist(), strict=True))
+
+    def _with_effects(self, model: Model, p: Array, u: Array, known: dict[str, float]) -> Anchor | None:
+        """The steady state at p and u, the effects put in by and by from the one without them, known by name."""
+        path = self._blend(model, known, (p, u, 0.0), (p, u, 0.0))
+        return self._anchored(p, u, path.v) if path.ends == "arrived" else None
+
+    def _anchored(self, p: Array, u: Array, v: Array) -> Anchor:
+        found = self._newton(v, p, u, 0.0, HALVES)
+        return Anchor(p, u, v, 0.0 if found is None else found[2])
+
+    # --- paths ---
+
+    def _connected(self, model: Model, anchor: Anchor, p: Array, u: Array, time: float) -> Path:
+        """The way from the model's own steady state to the values; where it ends, from the root's, effects put in last."""
+        path = self._follow_any(_ways(anchor, p, u, time), anchor)
+        root = model.origin.root if model.origin else model
+        if path.ends == "arrived" or not _has_effects(model):
+            return path
+        known = self._of_root(model, root)
+        assert known is not None and model.origin is not None
+        p0 = np.array(
+            [root.parameters[n].value if n in root.parameters else p[k] for k, n in enumerate(model.parameters)]
+        )
+        u0 = np.array([root.inputs[n].value if n in root.inputs else u[k] for k, n in enumerate(model.inputs)])
+        other = self._blend(model, known, (p0, u0, 0.0), (p, u, time))
+        return path if other.ends == "no start" else other
+
+    def _blend(self, model: Model, known: dict[str, float], a: _Values, b: _Values) -> Path:
+        """The way from values a without effects to values b without them, then to b with them, or straight."""
+        made, _ = blended(model)
+        at = equilibria(made)
+        p0, p1 = np.append(a[0], 0.0), np.append(b[0], 0.0)
+        v = at._filled(np.array([known.get(n, np.nan) for n in at.names]), p0, a[1], a[2])
+        begun = at._newton(v, p0, a[1], a[2], HALVES)
+        if begun is None:
+            return Path(self._by_name(at, v), 0.0, "no start")
+        begin = (at._unknowns(begun[0], begun[1]), begun[2])
+        full = np.append(b[0], 1.0)
+        first, between, last = (p0, a[1], a[2]), (p1, b[1], b[2]), (full, b[1], b[2])
+        path = at._follow_first(([first, between, last], [first, last]), *begin)
+        return Path(self._by_name(at, path.v), path.share, path.ends, path.at)
+
+    def _by_name(self, at: Equilibria, v: Array) -> Array:
+        place = {n: k for k, n in enumerate(at.names)}
+        return np.array([v[place[n]] for n in self.names])
+
+    def _follow_any(self, ways: tuple[list[_Values], ...], anchor: Anchor) -> Path:
+        return self._follow_first(ways, anchor.v, anchor.sign)
+
+    def _follow_first(self, ways: tuple[list[_Values], ...], v: Array, sign: float) -> Path:
+        """The first of the ways that arrives, else the first."""
+        paths: list[Path] = []
+        for way in ways:
+            path = self._along(way, v, sign)
+            if path.ends == "arrived":
+                return path
+            paths.append(path)
+        return paths[0]
+
+    def _along(self, way: list[_Values], v: Array, sign: float) -> Path:
+        """From v, a steady state at the way's first values with that sign of the determinant, from values to values."""
+        from hvdc_ident.simulate.patient import trace
+
+        s, v, legs = self.structure.sizes, v.copy(), len(way) - 1
+        y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
+        for k, (a, b) in enumerate(pairwise(way)):
+            ends_p, ends_w = np.array([a[0], b[0]]), np.array([[a[2], *a[1]], [b[2], *b[1]]])
+            work = ends_p[0].copy()
+            share = trace(self._address, self.n, s.nu, y, w, work, m, ends_p, ends_w, v, sign)
+            if share < 1.0:
+                at = (work, w[1 : 1 + s.nu].copy(), float(w[0]))
+                turned = self._turns(v, at, ends_p, ends_w)
+                return Path(v, (k + share) / legs, "fold" if turned else "jump", at)
+        return Path(v, 1.0, "arrived")
+
+    def _turns(self, v: Array, at: _Values, ends_p: Array, ends_w: Array) -> bool:
+        """Whether the branch turns back a little beyond v, where `trace` ended: followed by its length instead of by the values.
+
+        Keller's bordered equations: the branch's own direction stays regular at a fold, where the values do not. A jump,
+        behind which there is nothing to follow, is no fold, nor is a place where steady states lie side by side. Within
+        the shortest step h of v the values go d <= h more to the fold; there they fall as c s^2 with the length s, so
+        that v lies at s = 2 t d before it with the slope t = 1 / (2 c s), and 8 t h on they are at least 8 h back.
+        """
+        from hvdc_ident.simulate.patient import SHORTEST
+
+        extent = np.maximum(np.abs(v), TINY)
+        dp, dw = ends_p[1] - ends_p[0], ends_w[1] - ends_w[0]
+
+        def equations(x: Array, beyond: float) -> tuple[Array, Array, Array]:
+            """Residual, and its derivatives by x and by the share of the way."""
+            t = at[2] + beyond * dw[0]
+            before = beyond - SHORTEST
+            r, jac, _ = self._judged(x, at[0] + beyond * dp, at[1] + beyond * dw[1:], t)
+            r_before, _, _ = self._judged(x, at[0] + before * dp, at[1] + before * dw[1:], t - SHORTEST * dw[0])
+            return r, jac, (r - r_before) / SHORTEST
+
+        with np.errstate(all="ignore"):
+            try:
+                _, jac, by_share = equations(v, 0.0)
+                slope = np.asarray(np.linalg.solve(jac, -by_share), dtype=np.float64)
+                length = float(np.linalg.norm(slope / extent))
+                for part in (1.0, 0.5, 0.25):
+                    reached = self._bordered(equations, v, slope, extent, length, 8.0 * part * length * SHORTEST)
+                    if reached is not None:
+                        return reached < -SHORTEST
+            except np.linalg.LinAlgError:
+                return False
+        return False
+
+    @staticmethod
+    def _bordered(
+        equations: Callable[[Array, float], tuple[Array, Array, Array]],
+        v: Array,
+        slope: Array,
+        extent: Array,
+        length: float,
+        ahead: float,
+    ) -> float | None:
+        """The share of the way, counted from v, at a length ahead on the branch; None where it is not found."""
+        x, share = v + slope * ahead / length, ahead / length
+        border = slope / extent**2 / length
+        for _ in range(20):
+            r, jac, by_share = equations(x, share)
+            matrix = np.block([[jac, by_share[:, None]], [border[None, :], np.zeros((1, 1))]])
+            change = np.linalg.solve(matrix, np.append(r, (x - v) @ border - ahead))
+            x, share = x - change[:-1], share - float(change[-1])
+            if not np.isfinite(x).all():
+                return None
+            if np.abs(change[:-1] / extent).max(initial=0.0) < 1e-10:
+                return share
+        return None
+
+    # --- Newton's method ---
+
+    def _newton(
+        self, v: Array, p: Array, u: Array, time: float, contraction: float = np.inf, sign: float = 0.0
+    ) -> tuple[Array, Array, float] | None:
+        """(y, w, sign of the determinant) of the solution that Newton's method finds from v; arguments as in `rest`."""
+        s, n = self.structure.sizes, self.n
+        y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
+        y[:n], w[0], w[1 : 1 + s.nu], w[1 + s.nu : 1 + s.nu + self.extra] = v[:n], time, u, v[n:]
+        rule, worst, m = np.array([contraction, sign]), np.zeros(2), np.zeros(max(s.ns, 1))
+        jac = np.zeros((n + self.extra, n + self.extra))
+        p = np.ascontiguousarray(p, dtype=float)
+        answer = self._rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst, rule)
+        if answer == 0:
+            raise MemoryError
+        return (y, w, float(rule[1])) if answer == 1 else None
+
+    def unknowns(self, found: SteadyState) -> Array:
+        """[x, z, delayed, sampled values] of a steady state, as `names` names them."""
+        return self._unknowns(found.y, found.w)
+
+    def _unknowns(self, y: Array, w: Array) -> Array:
+        first = 1 + self.structure.sizes.nu
+        return np.concatenate([y[: self.n], w[first : first + self.extra]])
+
+    def _judged(self, v: Array, p: Array, u: Array, time: float) -> tuple[Array, Array, Array]:
+        """(residual, Jacobian, scaled residuals) of the rest equations at v."""
+        from hvdc_ident.simulate.patient import judge
+
+        s, n = self.structure.sizes, self.n + self.extra
+        y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
+        w[0], w[1 : 1 + s.nu] = time, u
+        r, jac, shares = np.zeros(n), np.zeros((n, n)), np.zeros(n)
+        p = np.ascontiguousarray(p, dtype=float)
+        judge(self._address, self.n, s.nu, y, w, p, m, self._region.size, v, r, jac, shares)
+        return r, jac, shares
+
+    # --- where a search begins ---
+
+    @cached_property
+    def _guesses(self) -> list[Array]:
+        """The model's own guesses, then the unknown ones at 0, at 1 and at seeded random places; nan where `rest` tells."""
+        m = self.structure.model
+        given = [np.nan if s.guess is None and s.rest is not None else s.guess for s in m.states.values()]
+        tail = [m.algebraic[n].start for n in self.structure.unknowns]
+        if all(g is not None for g in given):
+            return [np.array([*given, *tail], dtype=float)]
+        random = np.random.default_rng(0)
+        fills = [np.zeros(len(given)), np.ones(len(given)), *(random.normal(size=(4, len(given))))]
+        return [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]
+
+    def _begins(self, p: Array, u: Array, time: float) -> Iterator[Array]:
+        """Each guess with its delayed and sampled values as their sources are there, then with those at 0."""
+        for guess in self._guesses:
+            begin = self._filled(guess, p, u, time)
+            yield begin
+            if begin[self.n :].any():
+                yield np.concatenate([begin[: self.n], np.zeros(self.extra)])
+
+    def _filled(self, guess: Array, p: Array, u: Array, time: float) -> Array:
+        """A place with what is not known of it: states as their `rest` is there, unknowns where they begin, delayed and
+        sampled values as their sources are."""
+        s = self.structure
+        nx = s.sizes.nx
+        v = np.zeros(self.n + self.extra)
+        v[: guess.size] = guess
+        model = s.model
+        open_states = [k for k in np.flatnonzero(np.isnan(v[:nx])) if model.states[s.states[k]].rest is not None]
+        held = [self.n + k for k in range(self.extra) if guess.size == self.n or np.isnan(v[self.n + k])]
+        given = [x.guess for x in model.states.values()]
+        fill = (
+            [0.0 if g is None else g for g in given]
+            + [model.algebraic[n].start for n in s.unknowns]
+            + [0.0] * self.extra
+        )
+        unknown = [k for k in np.flatnonzero(np.isnan(v)) if nx <= k < self.n]
+        v = np.where(np.isnan(v), fill, v)
+        m, r, src = np.zeros(max(s.sizes.ns, 1)), np.zeros(v.size), np.zeros(max(self.extra, 1))
+        p = np.ascontiguousarray(p, dtype=float)
+        where = [*open_states, *unknown]
+        with np.errstate(all="ignore"):
+            for _ in (*where, *held):  # one may read another's value
+                before = v.copy()
+                w = np.concatenate([[time], u, v[self.n :]])
+                evaluate(self._address[NAMES.index("modes")], v[: self.n], w, p, m, m)
+                evaluate(self._address[NAMES.index("rest")], v[: self.n], w, p, m, r)
+                for k in where:
+                    v[k] += r[k]  # the equations read "rest - state" and "expression - unknown"
+                if held:
+                    evaluate(self._address[NAMES.index("src")], v[: self.n], w, p, m, src)
+                    v[held] = src[[k - self.n for k in held]]
+                if not np.isfinite(v).all():
+                    v = np.where(np.isfinite(v), v, fill)
+                    break
+                if np.array_equal(v, before):
+                    break
+        return v
+
+    # --- others ---
+
+    def neighbours(self, p: Array, u: Array, time: float, v: Array, along: Array) -> list[Array]:
+        """Other steady states that the model runs to from v, moved a little along a direction (states,) and against it."""
+        from hvdc_ident.simulate.patient import follow, nearest
+
+        s = self.structure.sizes
+        y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
+        w[0], w[1 : 1 + s.nu] = time, u
+        found: list[Array] = []
+        for sign in (1.0, -1.0):
+            x = v.copy()
+            x[: s.nx] += sign * along
+            with np.errstate(all="ignore"):
+                values = (self._address, self.n, s.nu)
+                follow(*values, s.nx, y, w, np.ascontiguousarray(p, dtype=float), m, self._region.size, x)
+                nearest(*values, y, w, np.ascontiguousarray(p, dtype=float), m, self._region.size, x)
+                _, _, shares = self._judged(x, p, u, time)
+            if self._region.is_rest(shares, x) and not _alike(x, v) and not any(_alike(x, k) for k in found):
+                found.append(x)
+        return found
+
+    def far(self, v: Array) -> list[str]:
+        """The states that are out of question, by their guesses."""
+        return [n for n, x, limit in zip(self.structure.states, v, self._region.limit, strict=False) if abs(x) > limit]
+
+    # --- slower means ---
+
+    @cached_property
+    def _region(self) -> _Region:
+        return _Region.of(self.structure, self._guesses[0][: self.n], self.extra)
+
+    def _slowly(self, p: Array, u: Array, begin: Array, time: float) -> SteadyState:
+        """The steady state by steps of least norm, or by following the model; SteadyStateError with the worst equation."""
+        from hvdc_ident.simulate.patient import follow, nearest, slide
+        from hvdc_ident.simulate.rest import REST_P
+
+        s, n = self.structure.sizes, self.n + self.extra
+        y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
+        w[0], w[1 : 1 + s.nu], m = time, u, np.zeros(max(s.ns, 1))
+        values = (y, w, p, m, self._region.size)
+
+        def closest(v: Array) -> None:
+            nearest(self._address, self.n, s.nu, *values, v)
+
+        def followed(v: Array) -> None:
+            follow(self._address, self.n, s.nu, s.nx, *values, v)
+            closest(v)
+
+        def slid(v: Array) -> None:
+            slide(self._address, self.n, s.nu, s.nx, *values, v)
+
+        ends: list[Array] = []
+        ways: tuple[Callable[[Array], None], ...] = (closest, followed, slid)
+        with np.errstate(all="ignore"):
+            # The rest next to the guess comes first; where there are several, following the model may end at a far one.
+            for way in ways:
+                v = begin.copy()
+                way(v)
+                _, jac, shares = self._judged(v, p, u, time)
+                if self._region.is_rest(shares, v):
+                    break
+                ends.append(v)
+            else:
+                r, _, shares = self._judged(ends[1], p, u, time)  # where the model went is what tells most
+                raise self._refused(r, shares, ends[1])
+        first = 1 + s.nu
+        y[: self.n], w[first : first + self.extra] = v[: self.n], v[self.n :]
+        if s.width:
+            rows = np.zeros(n * s.width)
+            evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
+            evaluate(self._address[REST_P], y, w, p, m, rows)
+            slope = np.linalg.lstsq(jac, -rows.reshape(n, s.width), rcond=1e-12)[0]
+            y[self.n :], w[first + self.extra :] = slope[: self.n].ravel(), slope[self.n :].ravel()
+        return SteadyState(y, w)
+
+    # --- what is told where there is none ---
+
+    def _not_at_once(self) -> SteadyStateError:
+        return SteadyStateError(
+            "no steady state was found at once",
+            where=f"model '{self.structure.model.name}'",
+            hint="let it be searched for: Tolerance(search=True)",
+        )
+
+    def _lost(self, path: Path, p: Array, u: Array, time: float) -> SteadyStateError:
+        """The error that says where the model's own steady state ends, and names another one where there is one."""
+        try:
+            other = self.search(p, u, time)
+        except SteadyStateError:
+            offered = "no other steady state was found either"
+        else:
+            offered = f"another steady state exists, at {self.text(self._unknowns(other.y, other.w))}"
+        return SteadyStateError(
+            "the model's own steady state ends on the way to these values",
+            where=f"model '{self.structure.model.name}'",
+            expected="the steady state that the model has at its own values, moved without a jump",
+            got=f"it turns back at {100 * path.share:.3g} % of the way, at {self.text(path.v)}; {offered}",
+            hint="check the values of parameters, inputs and effects; where the other steady state is meant, give the "
+            "states a `guess` there",
+        )
+
+    def text(self, v: Array) -> str:
+        """The states by name and value, for messages; the first six of a larger model."""
+        shown = [f"{n} = {x:.4g}" for n, x in zip(self.structure.states, v, strict=False)]
+        return ", ".join(shown[:6]) + (", ..." if len(shown) > 6 else "")
+
+    def _refused(self, r: Array, shares: Array, v: Array) -> SteadyStateError:
+        """The error that names the state that runs away, or else the worst equation."""
+        worst = int(np.argmax(np.where(np.isfinite(shares), shares, np.inf)))
+        got = f"{self._equation(worst)} left with {r[worst]:.3g} (scaled {shares[worst]:.2g})"
+        far = np.abs(v) / self._region.limit
+        away = int(np.argmax(np.where(np.isfinite(far), far, np.inf))) if v.size else 0
+        if v.size and not far[away] <= 10 * CLOSE:
+            name = self.structure.states[away]
+            guess = self.structure.model.states[name].guess
+            got = f"state '{name}' runs away to {v[away]:.4g} from its guess {guess:g}; {got}"
+        return SteadyStateError(
+            "no steady state was found",
+            where=f"model '{self.structure.model.name}'",
+            expected="every derivative 0, at states near their guesses",
+            got=got,
+            hint="check the input levels and limits, give states a `guess` near the solution, or a `start`",
+        )
+
+    def _equation(self, index: int) -> str:
+        m = self.structure.model
+        names = [f"d({n})/dt" for n in self.structure.states] + [f"unknown '{n}'" for n in self.structure.unknowns]
+        names += [f"delay '{n}'" for n in m.delays] + [f"sampled value '{n}'" for n in m.sampled]
+        return names[index]
+
+
+_Values = tuple[Array, Array, float]
+"""Parameters, inputs, time."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Where a way from values to values ended.
+
+    v: the last steady state on it. share: of the way, up to there. ends: "arrived"; "fold", where the branch turns back; "jump", where it
+    breaks off; "no start", where none is known at its beginning. at: the values there, where it did not arrive.
+    """
+
+    v: Array
+    share: float
+    ends: Literal["arrived", "fold", "jump", "no start"]
+    at: _Values | None = None
+
+
+@dataclass(frozen=True)
+class _Region:
+    """Where a rest is looked for: the sizes of states, unknowns and held values as far as the model's guesses tell them.
+
+    size: what is usual; a residual is judged against it, so that a value that grows without bound, as a dc voltage whose
+    power balance P / Vdc goes to 0, cannot make its own residual small. limit: what is out of question (infinite: not known).
+    """
+
+    size: Array
+    limit: Array
+
+    @classmethod
+    def of(cls, structure: Structure, guess: Array, extra: int) -> _Region:
+        given = [s.guess for s in structure.model.states.values()]
+        sizes = [1 / CLOSE if g is None else max(abs(g), 1.0) for g in given]
+        limits = [abs(g) / CLOSE if g else np.inf for g in given]
+        rest = np.maximum(np.abs(guess[len(given) :]), 1.0)
+        unknown = np.full(rest.size + extra, np.inf)
+        return cls(np.concatenate([sizes, rest, np.full(extra, 1 / CLOSE)]), np.concatenate([limits, unknown]))
+
+    def is_rest(self, shares: Array, v: Array) -> bool:
+        """Whether v solves the equations, by the scaled residuals there, within the limits."""
+        return bool((shares < ACCURACY).all() and (np.abs(v) <= self.limit).all())
+
+
+@lru_cache(maxsize=ROOM)
+def resting(model: Model) -> Model:
+    """The model whose states all begin at rest, whatever start they are given."""
+    if all(s.start is None for s in model.states.values()):
+        return model
+    states = FrozenMap({n: replace(s, start=None) for n, s in model.states.items()})
+    origin = model.origin and replace(model.origin, root=resting(model.origin.root))
+    return replace(model, states=states, origin=origin)
+
+
+def _alike(a: Array, b: Array) -> bool:
+    return bool((np.abs(a - b) <= 1e-6 * (np.abs(a) + np.abs(b) + TINY)).all())
+
+
+def _values(model: Model) -> tuple[Array, Array]:
+    """The model's own values of parameters and inputs."""
+    p = np.array([q.value for q in model.parameters.values()], dtype=float)
+    return p, np.array([i.value for i in model.inputs.values()], dtype=float)
+
+
+def _has_effects(model: Model) -> bool:
+    return model.origin is not None and bool(model.origin.neutral)
+
+
+def _ways(anchor: Anchor, p: Array, u: Array, time: float) -> tuple[list[_Values], ...]:
+    """From the anchor's values to others: straight; inputs first; parameters first. Either may leave where a rest exists."""
+    begin, end = (anchor.p, anchor.u, 0.0), (p, u, time)
+    return [begin, end], [begin, (anchor.p, u, time), end], [begin, (p, anchor.u, time), end]
+
+
+def _made(model: Model) -> Equilibria:
+    structure = Structure(model, (), ())
+    code = structure.compile_rest()
+    return Equilibria(structure, np.array([code.address.get(n, 0) for n in NAMES], dtype=np.int64), code)
+
+
+_equilibria = by_structure(_made, room=ROOM)
+
+
+def equilibria(model: Model) -> Equilibria:
+    """The steady states of a model's structure, kept for later calls."""
+    return _equilibria(model)
