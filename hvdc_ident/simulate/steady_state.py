@@ -77,7 +77,7 @@ class Equilibria:
     def start(self, model: Model, p: Array, u: Array, time: float = 0.0, *, search: bool = True) -> SteadyState:
         """The steady state of a model of this structure at parameters p, inputs u and a time.
 
-        search: whether anything but Newton's method from the model's own steady state or guesses may be tried. Raises
+        search: whether more than Newton's method and the straight way from the model's own steady state may be tried. Raises
         SteadyStateError where none is found, or where the one that the model has at its own values ends before these.
         """
         p = np.ascontiguousarray(p, dtype=float)
@@ -87,13 +87,13 @@ class Equilibria:
         found = self._newton(anchor.v, p, u, time, HALVES, anchor.sign)
         if found is not None:
             return SteadyState(*found[:2])
-        if not search:
-            raise self._not_at_once()
-        path = self._connected(model, anchor, p, u, time)
+        path = self._connected(model, anchor, p, u, time, search)
         if path.ends == "arrived":
             found = self._newton(path.v, p, u, time)
             if found is not None:
                 return SteadyState(*found[:2])
+        if not search:
+            raise self._not_at_once()
         if path.ends == "fold":
             raise self._lost(path, p, u, time)
         other = self.search(p, u, time)
@@ -186,11 +186,15 @@ class Equilibria:
 
     # --- paths ---
 
-    def _connected(self, model: Model, anchor: Anchor, p: Array, u: Array, time: float) -> Path:
-        """The way from the model's own steady state to the values; where it ends, from the root's, effects put in last."""
-        path = self._follow_any(_ways(anchor, p, u, time), anchor)
+    def _connected(self, model: Model, anchor: Anchor, p: Array, u: Array, time: float, search: bool) -> Path:
+        """The way from the model's own steady state to the values; where it ends, from the root's, effects put in last.
+
+        search: whether more ways than the straight one are tried.
+        """
+        ways = _ways(anchor, p, u, time)
+        path = self._follow_any(ways if search else ways[:1], anchor)
         root = model.origin.root if model.origin else model
-        if path.ends == "arrived" or not _has_effects(model):
+        if path.ends == "arrived" or not search or not _has_effects(model):
             return path
         known = self._of_root(model, root)
         assert known is not None and model.origin is not None
