@@ -230,6 +230,8 @@ def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet:
         _print_json(
             {**heading_of(study, seed), "stages": {d.stage.name: d.data for d in done}, "report": "report.html"}
         )
+    for line in dict.fromkeys(line for d in done for line in d.data.get("steady_state", ())):
+        _say(f"steady state, {line}", json=json, quiet=quiet)
     for d in done:
         state = "failed" if d.failed else "done" if d.fresh else "kept from before"
         # A fit that ended on a bound or found two optima is done, but not by that word alone.
@@ -261,6 +263,8 @@ def _run_one(
         done = run_stage(loaded, stage.name, folder, replace(options, progress=told, announce=announce))
     if json:
         _print_json(done.data)
+    for line in done.data.get("steady_state", ()):
+        _say(f"steady state, {line}", json=json, quiet=quiet)
     for line in () if done.failed else stage.tell(done.data):
         _say(line, json=json, quiet=quiet)
     _say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}", json=json, quiet=quiet)

@@ -133,7 +133,18 @@ class Equilibria:
     # --- the model's own steady state ---
 
     def _own(self, model: Model) -> Anchor | None:
+        """What the guesses lead to; where some states have one, of what the search from several places finds the nearest."""
         p, u = _values(model)
+        given = [(k, s.guess) for k, s in enumerate(model.states.values()) if s.guess is not None]
+        if given and len(self._guesses) > 1:
+            places, guesses = [k for k, _ in given], np.array([g for _, g in given])
+            begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))
+            ends = [self._unknowns(found[0], found[1]) for found in begun if found is not None]
+            inside = [v for v in ends if (np.abs(v) <= self._region.limit).all()]
+            if inside:
+                apart = [float(np.linalg.norm((v[places] - guesses) / (1.0 + np.abs(guesses)))) for v in inside]
+                # Ends that rounding alone sets apart are one: the first of them stands for all.
+                return self._anchored(p, u, inside[int(np.argmin(np.round(apart, 6)))])
         try:
             found = self.search(p, u)
         except SteadyStateError:
@@ -573,7 +584,7 @@ class _Region:
     def of(cls, structure: Structure, guess: Array, extra: int) -> _Region:
         given = [s.guess for s in structure.model.states.values()]
         sizes = [1 / CLOSE if g is None else max(abs(g), 1.0) for g in given]
-        limits = [abs(g) / CLOSE if g else np.inf for g in given]
+        limits = [max(abs(g) / CLOSE, 1.0) if g else np.inf for g in given]
         rest = np.maximum(np.abs(guess[len(given) :]), 1.0)
         unknown = np.full(rest.size + extra, np.inf)
         return cls(np.concatenate([sizes, rest, np.full(extra, 1 / CLOSE)]), np.concatenate([limits, unknown]))
@@ -591,6 +602,20 @@ def resting(model: Model) -> Model:
     states = FrozenMap({n: replace(s, start=None) for n, s in model.states.items()})
     origin = model.origin and replace(model.origin, root=resting(model.origin.root))
     return replace(model, states=states, origin=origin)
+
+
+def with_guesses(model: Model) -> Model:
+    """The model with the guesses of all states and the starts of all unknowns at its own steady state.
+
+    Written to a card it keeps its branch, for a card says nothing of where a model comes from. Raises SteadyStateError.
+    """
+    at = equilibria(model)
+    found = dict(zip(at.names, at.unknowns(at.start(model, *_values(model))).tolist(), strict=True))
+    # What rounding leaves of 0 is no guess: it would tell the state's size.
+    place = {n: 0.0 if abs(v) < ACCURACY else v for n, v in found.items()}
+    states = {n: replace(s, guess=place[n]) for n, s in model.states.items()}
+    algebraic = {n: replace(a, start=place[n]) if n in place else a for n, a in model.algebraic.items()}
+    return replace(model, states=FrozenMap(states), algebraic=FrozenMap(algebraic))
 
 
 def _alike(a: Array, b: Array) -> bool:

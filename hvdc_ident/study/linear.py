@@ -276,6 +276,7 @@ def lines(data: Mapping[str, Any]) -> list[str]:
     if right is not None:
         verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
         found.append(f"operating point: {verdict}, rightmost eigenvalue {right:.4g} 1/s")
+    found += [f"operating point: {note}" for note in data["notes"]]
     for m in data["modes"]:
         if m["eigenvalue"][1] > 0:
             shares = sorted(m["participation"], key=lambda n: -m["participation"][n])[:3]

@@ -14,6 +14,7 @@ from hvdc_ident.errors import ComputationError, HvdcIdentError, LinearizationErr
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
+from hvdc_ident.study.steady_notes import steady_notes
 from hvdc_ident.study.store import exclusive, source_hash
 from hvdc_ident.study.study import Study
 
@@ -129,7 +130,13 @@ def _written(
 ) -> Done:
     heading = heading_of(study, options.seed)
     mark = "" if outcome.failed else _mark(study, wanted, folder, options)
-    about = {"stage": wanted.name, "fingerprint": mark, "files": list(outcome.files), "rest_levels": levels}
+    about = {
+        "stage": wanted.name,
+        "fingerprint": mark,
+        "files": list(outcome.files),
+        "rest_levels": levels,
+        "steady_state": steady_notes(study),
+    }
     taken = {"options": {n: getattr(options, n) for n in wanted.takes}} if wanted.takes else {}
     data = plain({**heading, **about, **taken, **outcome.data})
     for name, text in outcome.files.items():

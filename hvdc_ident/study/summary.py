@@ -9,6 +9,7 @@ from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.recordings import noise_line
 from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import stages
+from hvdc_ident.study.steady_notes import steady_notes
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.tables import candidate_lines
 
@@ -27,6 +28,7 @@ def summary(study: Study, seed: int = 0) -> dict[str, Any]:
         },
         "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
         "experiments": {e.name: _experiment(e, study) for e in study.experiments},
+        "steady_state": steady_notes(study),
         "stages": [s.name for s in stages() if s.wanted(study)],
         "rest_levels": rest.to_list(),
         "rest_lines": [*rest.lines, *rest.remarks],
@@ -50,6 +52,7 @@ def summary_text(found: dict[str, Any]) -> str:
         )
         lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
     lines += found["rest_lines"]
+    lines += [f"steady state, {line}" for line in found["steady_state"]]
     lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
     return "\n".join(lines)
 

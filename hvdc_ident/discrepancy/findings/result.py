@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from hvdc_ident.effects import effects
+from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
 
@@ -169,8 +170,15 @@ class Diagnosis:
     def files(self) -> dict[str, str]:
         """The augmented model's card by its file name; empty where nothing was put in, or the model has no card (an FMU)."""
         from hvdc_ident.model import Model, write_card
+        from hvdc_ident.simulate.steady_state import with_guesses
 
-        return {AUGMENTED: write_card(self.augmented)} if isinstance(self.augmented, Model) else {}
+        if not isinstance(self.augmented, Model):
+            return {}
+        try:
+            card = with_guesses(self.augmented)
+        except SteadyStateError:  # at inputs that only its experiments give it
+            card = self.augmented
+        return {AUGMENTED: write_card(card)}
 
     def plot(self) -> Figure:
         """The gap before and after by output, and the best candidates."""

@@ -65,6 +65,7 @@ def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
         f"<p>{len(data['modes'])} modes; the operating point is <strong>{verdict}</strong>, rightmost real part "
         f"{number(right)} 1/s. Largest scaled residual {number(point.get('residual'), 2)}; the Jacobian differs from "
         f"{CHECKS[data.get('method', 'symbolic')]} by {number(data.get('jacobian_error'), 2)}.</p>"
+        + "".join(f"<p>{text(note)}</p>" for note in data.get("notes") or ())
     )
 
 
