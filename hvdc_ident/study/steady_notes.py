@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvdc_ident.errors import SteadyStateError
+from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study.study import Study
@@ -36,5 +36,5 @@ def _notes(model: Model, fixed: dict[str, float]) -> tuple[str, ...]:
     known = {n: v for n, v in fixed.items() if n in model.parameters or n in model.inputs}
     try:
         return find_operating_point(model, known).notes
-    except SteadyStateError as error:
+    except HvdcIdentError as error:  # the stage that needs a steady state ends with it
         return (str(error),)
