@@ -25,7 +25,7 @@ from hvdc_ident.fit.refined import Refined
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.residual_tests import residual_tests
 from hvdc_ident.fit.result import Covariance, Estimate, FitResult, StartOutcome, Status
-from hvdc_ident.fit.starts import DISTINCT, Optimum, distinct, latin_hypercube
+from hvdc_ident.fit.starts import DISTINCT, Optimum, best_first, distinct, latin_hypercube
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
 from hvdc_ident.frozen import FrozenMap
@@ -33,6 +33,8 @@ from hvdc_ident.trajectory import Array
 
 STARTS = 8
 """Runs of a multistart, where nothing else is said."""
+LONGER = 1000
+"""Evaluations more that the lowest run may take which used up its own."""
 SAME = 0.1
 """A run whose cost is higher by less has reached the optimum: no estimate is off by half its standard deviation."""
 SETTLED = 1e-3
@@ -67,8 +69,9 @@ def fit(
     runs = _run_all(first, begins, method, executor, progress)
     if all(r.status == "failed" or r.cost is None for r in runs):
         return _failed(first, begins, runs)
-    usable = [Optimum(r.theta, r.cost) for r in runs if r.cost is not None]
     local = TrustRegion()
+    runs = _continued(first, runs, method)
+    usable = _ends(runs)
     problem, best, rivals = weighted(first, usable, local)
     if has_clocks(problem):
         best = searched(problem, best, local)
@@ -143,6 +146,30 @@ def _run_all(
     return runs
 
 
+def _continued(problem: Problem, runs: Sequence[OptimiserResult], method: Optimiser) -> list[OptimiserResult]:
+    """The runs, with the lowest of those that used up their evaluations gone on: along a narrow valley it takes more.
+
+    An optimiser with options of its own keeps the evaluations it was given.
+    """
+    runs = list(runs)
+    spent = [i for i, r in enumerate(runs) if r.status == "max-evaluations" and r.cost is not None]
+    if not spent or method != TrustRegion():
+        return runs
+    i = min(spent, key=lambda k: runs[k].cost or 0.0)
+    end = TrustRegion(max_evaluations=LONGER).run(problem, runs[i].theta)
+    if end.cost is not None:
+        runs[i] = replace(end, evaluations=runs[i].evaluations + end.evaluations)
+    return runs
+
+
+def _ends(runs: Sequence[OptimiserResult]) -> list[Optimum]:
+    """Where the runs ended, the lowest cost first whatever stopped it; of the others those that may be optima."""
+    reached = [(r.status, Optimum(r.theta, r.cost)) for r in runs if r.cost is not None]
+    first, *rest = best_first([o for _, o in reached])
+    optima = [o for status, o in reached if status in ("converged", "stalled")]
+    return [first, *(o for o in rest if o in optima)]
+
+
 def _in_time(problem: Problem, theta: Array, blocks: Sequence[Block]) -> Sequence[Block]:
     """The blocks as samples in time, which tests of residuals need."""
     return blocks if problem.band is None else problem.blocks(theta, derivatives=False, in_time=True)
@@ -215,7 +242,9 @@ def _status(
     if not again and all(o.status == "flat" for o in there):
         return "not-converged", f"the start with the lowest cost did not move: {there[0].message}"
     if again and promised(problem, best.theta) > SETTLED:
-        return "not-converged", "found again in its final weights, the optimum does not stand: the cost still falls"
+        return "not-converged", (
+            "the cost still falls where the best run used up its evaluations: bounds, a nearer start or more of [fit] starts help"
+        )
     if not again and not _stands(problem, best, there):
         return "not-converged", f"the best run did not reach an optimum: {there[0].message}"
     near = [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]

@@ -24,6 +24,22 @@ class Optimum:
     cost: float
 
 
+TIE = 1e-6
+"""Costs that differ by this share differ by what no number of rows makes a likelihood notice (half of it a row)."""
+
+
+def best_first(ends: Sequence[Optimum]) -> list[Optimum]:
+    """The ends by their cost; the first one stays first where no other is lower by more than rounding.
+
+    So of optima that are one but for the names of their unknowns, as two time constants that may change places, the one
+    next to the given start is told.
+    """
+    ordered = sorted(ends, key=lambda o: o.cost)
+    if ends and ends[0].cost <= (1.0 + TIE) * ordered[0].cost:
+        return [ends[0], *(o for o in ordered if o is not ends[0])]
+    return ordered
+
+
 def latin_hypercube(spread: Sequence[Free], rest: Sequence[Free], count: int, seed: int) -> list[Array]:
     """`count` starts, (p,) each: `spread` over the bounds (even in the logarithm where scaled so), `rest` at their own.
 

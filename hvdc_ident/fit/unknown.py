@@ -83,10 +83,34 @@ class Free:
         return low, high
 
     def draw(self, share: float) -> float:
-        """The value at a share in [0, 1] of where starts are drawn from, even in the scaled unknown."""
+        """The value at a share in [0, 1] of where starts are drawn from, even in the scaled unknown.
+
+        Where a bound is infinite the range is no more than a guess of the size: then even in the logarithm of the distance
+        from the other bound, or from 0, from a hundredth of the typical size on; of two signs the start's own gets three
+        quarters.
+        """
         low, high = self.drawn
-        value = low * (high / low) ** share if self.log else low + share * (high - low)
+        if self.log:
+            value = low * (high / low) ** share
+        elif math.isfinite(self.min) and math.isfinite(self.max):
+            value = low + share * (high - low)
+        elif math.isfinite(self.min):
+            value = self.min + _even_in_log(high - self.min, self.size, share)
+        elif math.isfinite(self.max):
+            value = self.max - _even_in_log(self.max - low, self.size, 1.0 - share)
+        else:
+            below = 0.25 if self.start > 0 else 0.75 if self.start < 0 else 0.5
+            if share < below:
+                value = -_even_in_log(-low, self.size, 1.0 - share / below)
+            else:
+                value = _even_in_log(high, self.size, (share - below) / (1.0 - below))
         return float(min(max(value, self.min), self.max))
+
+
+def _even_in_log(far: float, size: float, share: float) -> float:
+    """The distance at a share in [0, 1] of the way, in the logarithm, from a hundredth of the size to `far`."""
+    near = 0.01 * size
+    return near * (max(far, size) / near) ** share
 
 
 @dataclass(frozen=True, eq=False)

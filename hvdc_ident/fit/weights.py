@@ -12,7 +12,7 @@ from hvdc_ident.errors import SimulationError, unknown_name
 from hvdc_ident.fit.noise import MISFIT, floor_of, source_of
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.starts import Optimum, distinct
+from hvdc_ident.fit.starts import Optimum, best_first, distinct
 from hvdc_ident.fit.whitening import autoregression, before_event
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
@@ -38,26 +38,29 @@ def prepared(problem: Problem, whiten: str) -> Problem:
 def weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tuple[Problem, Optimum, list[Optimum]]:
     """The problem with the misfit's weights where noise is not given, its best optimum and the other candidates.
 
-    One output: the optimum does not depend on its weight. Several: fitted again until the weights stand (1 %).
+    ends: the best first. One output: the optimum does not depend on its weight. Several: fitted again until the weights
+    stand (1 %).
     """
-    ends = sorted(ends, key=lambda o: o.cost)
     open_outputs = [o for o in problem.outputs if source_of(problem.fitted_experiments, o) == MISFIT]
     if not open_outputs:
         return problem, ends[0], list(ends[1:])
     best = ends[0]
-    rivals = distinct(problem, ends)[1:4]
     once = len(problem.outputs) == 1 and problem.loss.linear and not problem.priors
+    rivals: list[Optimum] | None = None
     for _ in range(20):
         weights = misfit_weights(problem, best.theta, open_outputs)
         settled = all(abs(weights[o] / problem.weights.get(o, np.inf) - 1.0) < 0.01 for o in open_outputs)
         problem = problem.with_(weights={**problem.weights, **weights})
+        if rivals is None:  # in the first weights, which are far too large, every end is as good as any other
+            at = [Optimum(e.theta, c) for e in ends if (c := cost_of(problem, e.theta)) is not None]
+            rivals = [r for r in distinct(problem, at) if not np.array_equal(r.theta, best.theta)][:3]
         if once or settled:
             break
         again = method.run(problem, best.theta)
         if again.status == "failed" or again.cost is None:
             break
         best = Optimum(again.theta, again.cost)
-    return _again(problem, best, rivals, method, moved=not once)
+    return _again(problem, best, rivals or [], method)
 
 
 def whitened_by_residuals(
@@ -71,21 +74,22 @@ def whitened_by_residuals(
             own = [(b, b.scaled(b.misfit)) for b in blocks if b.output == output]
             records = [(r - r.mean())[part] for b, r in own for part in b.stretches]
             models[output] = autoregression(records)
-        problem, best, rivals = _again(replace(problem, rho=FrozenMap(models)), best, rivals, method, moved=True)
+        problem, best, rivals = _again(replace(problem, rho=FrozenMap(models)), best, rivals, method)
         problem, best, rivals = weighted(problem, [best, *rivals], method)
     return problem, best, list(rivals)
 
 
 def _again(
-    problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser, *, moved: bool
+    problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser
 ) -> tuple[Problem, Optimum, list[Optimum]]:
-    """The optima with their cost in the problem's weights, best first. moved: whether they have to be found again."""
-    candidates = [best.theta, *(r.theta for r in rivals)]
-    if moved:
-        runs = [method.run(problem, r.theta) for r in (best, *rivals)]
-        candidates = [best.theta, *(m.theta for m in runs if m.status != "failed")]
+    """The optima found again in the problem's weights, best first; of the rivals those that are optima there."""
+    runs = [method.run(problem, r.theta) for r in (best, *rivals)]
+    candidates = [
+        runs[0].theta if runs[0].cost is not None else best.theta,
+        *(m.theta for m in runs[1:] if m.status in ("converged", "stalled")),
+    ]
     at = [Optimum(t, c) for t in candidates if (c := cost_of(problem, t)) is not None]
-    first, *rest = sorted(at, key=lambda o: o.cost)
+    first, *rest = best_first(at)
     return problem, first, rest
 
 

@@ -70,3 +70,62 @@ def test_mgh09_has_an_interval_of_students_t():
     assert estimate.std == pytest.approx(estimate.std_raw, rel=1e-12)
     half = 2.364624251592785 * CERTIFIED_MGH09["b1"][1]  # t of 0.975 with 7 degrees of freedom
     assert estimate.ci95 == pytest.approx((estimate.value - half, estimate.value + half), rel=1e-5)
+
+
+@pytest.mark.parametrize("start", [(500.0, 1e-4), (250.0, 5e-4), (1.0, 0.01)])
+def test_misra1a_without_bounds_does_not_depend_on_the_start(start):
+    simulator = Closed(parameters(b1=start[0], b2=start[1]), {"y": misra1a}, lambda p: p["b2"] < -0.5)
+    free = (Free("b1", start[0]), Free("b2", start[1]))
+    result = fit(Problem(simulator, (recorded("nist", np.array(MISRA_X), y=np.array(MISRA_Y)),), free))
+    certified = {"b1": (2.3894212918e2, 2.7070075241), "b2": (5.5015643181e-4, 7.2668688436e-6)}
+    check(result, certified, 1.2455138894e-1, 14)
+    assert result.adequacy.verdict == "not-judged"
+
+
+MODELS = {
+    "misra1a": (MISRA_X, MISRA_Y, "b1*(1 - exp(-b2*{x}))", ((500.0, 1e-4), (250.0, 5e-4))),
+    "mgh09": (
+        MGH_X,
+        MGH_Y,
+        "b1*({x}**2 + {x}*b2)/({x}**2 + {x}*b3 + b4)",
+        ((25.0, 39.0, 41.5, 39.0), (0.25, 0.39, 0.415, 0.39)),
+    ),
+}
+CERTIFIED = {
+    "misra1a": {"b1": (2.3894212918e2, 2.7070075241), "b2": (5.5015643181e-4, 7.2668688436e-6)},
+    "mgh09": CERTIFIED_MGH09,
+}
+
+
+@pytest.mark.parametrize("x", ["time", "x"])
+@pytest.mark.parametrize("start", [0, 1])
+@pytest.mark.parametrize("name", MODELS)
+def test_as_a_study_without_noise_or_bounds(name, start, x, tmp_path):
+    """The predictor is the time, or an input recorded by rows; the model has no states."""
+    from hvdc_ident.simulate.model_simulator import ModelSimulator
+    from hvdc_ident.study.study import load_study
+
+    xs, ys, formula, starts = MODELS[name]
+    names = [f"b{i + 1}" for i in range(len(starts[start]))]
+    values = "".join(f"{n} = {{value = {v!r}}}\n" for n, v in zip(names, starts[start], strict=True))
+    inputs = "" if x == "time" else f"[inputs]\nx = {{value = {xs[0]!r}}}\n"
+    (tmp_path / "m.toml").write_text(
+        f'schema = 1\nname = "{name}"\n[parameters]\n{values}{inputs}[outputs]\ny = "{formula.format(x=x)}"\n'
+    )
+    rows = zip(*([xs, ys] if x == "time" else [range(len(xs)), xs, ys]), strict=True)
+    head = "time,y" if x == "time" else "time,x,y"
+    (tmp_path / "d.csv").write_text(head + "\n" + "\n".join(",".join(map(repr, r)) for r in rows) + "\n")
+    read = "" if x == "time" else 'inputs = ["x"]\n'
+    (tmp_path / "s.toml").write_text(
+        'schema = 1\n[model]\nsource = "m.toml"\n[parameters]\n'
+        + "".join(f"{n} = {{}}\n" for n in names)
+        + f'[[experiment]]\nname = "nist"\ndata = "d.csv"\n{read}outputs = ["y"]\n'
+    )
+    study = load_study(tmp_path / "s.toml")
+    result = fit(Problem(ModelSimulator(study.model), study.experiments, tuple(study.candidates.values())))
+    assert result.status in ("converged", "two-optima"), result.message  # eleven rows of MGH09 allow a pole between two
+    for n, (value, std) in CERTIFIED[name].items():
+        assert result.estimates[n].value == pytest.approx(value, rel=1e-6)
+        assert result.estimates[n].std_raw == pytest.approx(std, rel=1e-5)
+    assert result.noise_source == {"y": "misfit"}
+    assert {n.source for notes in study.noise.values() for n in notes.values()} == {"residual"}

@@ -198,5 +198,50 @@ def test_a_point_whose_sensitivities_overflow_is_walked_round():
     free = (Free("a", 1.0, 0.1, 10.0), Free("k", 1.0, 0.0, 20.0))
     found = Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
     run = TrustRegion().run(found, np.array([1.0, 1.0]))
-    assert run.status == "failed" and "beyond all bounds" in run.message
+    assert run.status == "failed" and "too large to be squared" in run.message
     assert run.theta[1] <= 1.2
+
+
+def saturating(t, p):
+    """y = b1 (1 - exp(-b2 t)): a full first step from small values lands where b2 shows nothing any more."""
+    e = np.exp(-p["b2"] * t)
+    return p["b1"] * (1 - e), {"b1": 1 - e, "b2": p["b1"] * t * e}
+
+
+@pytest.mark.parametrize("start", [(1.0, 1.0), (0.01, 3.0), (-5.0, 0.2)])
+def test_without_bounds_a_start_far_off_in_size_finds_the_optimum(start):
+    t = np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
+    simulator = Closed(parameters(b1=start[0], b2=start[1]), {"y": saturating}, lambda p: p["b2"] < -30)
+    y = saturating(t, {"b1": 214.0, "b2": 0.55})[0] + np.array([-5.0, 20.0, -20.0, 5.0, 3.0, -3.0])
+    free = (Free("b1", start[0]), Free("b2", start[1]))
+    result = fit(Problem(simulator, (recorded("e", t, y=y),), free))
+    from scipy.optimize import curve_fit
+
+    best, _ = curve_fit(lambda t, a, b: a * (1 - np.exp(-b * t)), t, y, (200.0, 0.5))
+    assert result.status == "converged", result.message
+    assert [result.values["b1"], result.values["b2"]] == pytest.approx(best, rel=1e-5)
+
+
+def test_starts_without_bounds_spread_over_the_sizes():
+    draws = [Free("a", 2.0).draw(s) for s in np.linspace(0, 1, 41)]
+    assert draws == sorted(draws) and min(draws) == pytest.approx(-18.0) and max(draws) == pytest.approx(22.0)
+    sizes = np.abs(draws)
+    assert (np.array(draws) > 0).mean() == pytest.approx(0.75, abs=0.03)
+    assert (sizes < 0.2).sum() > 8 and (sizes > 2.0).sum() > 8
+    assert all(v >= 0 for v in (Free("a", 2.0, 0.0).draw(s) for s in (0.0, 0.5, 1.0)))
+    assert all(v <= 0 for v in (Free("a", -2.0, max=0.0).draw(s) for s in (0.0, 0.5, 1.0)))
+
+
+def test_of_optima_that_differ_by_names_alone_the_one_next_to_the_start_is_told():
+    def pair(t, p):
+        a, b = np.exp(-p["k1"] * t), np.exp(-p["k2"] * t)
+        return a + b, {"k1": -t * a, "k2": -t * b}
+
+    simulator = Closed(parameters(k1=1.0, k2=1.0), {"y": pair})
+    y = pair(T, {"k1": 0.5, "k2": 3.0})[0] + 0.01 * np.random.default_rng(1).standard_normal(T.size)
+    for given in ({"y": 0.01}, {}):
+        for start, first in (((0.4, 4.0), 0.5), ((4.0, 0.4), 3.0)):
+            free = (Free("k1", start[0], 0.01, 50), Free("k2", start[1], 0.01, 50))
+            result = fit(Problem(simulator, (recorded("e", T, given, y=y),), free), starts=12)
+            assert result.status == "two-optima"
+            assert result.values["k1"] == pytest.approx(first, rel=0.1)

@@ -2,7 +2,8 @@
 
 The step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the largest column norms so far
 (Moré 1978), with bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in
-Nielsen (1999), "Damping parameter in Marquardt's method".
+Nielsen (1999), "Damping parameter in Marquardt's method". A step is no longer than the coordinate, or 1, at first, and twice
+as long after each that kept half its promise: without bounds a full first step may land where no output answers any more.
 """
 
 from __future__ import annotations
@@ -21,8 +22,12 @@ NAME = "trust-region"
 SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"
 
 
-PROBES = (-3.0, -2.0, -1.0, 1.0, 2.0, 3.0)
+PROBES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
 """Tiny steps, in units of `probe`, from which the scatter of the cost is told."""
+AS_PROMISED = 0.1
+"""A reduction within this share of the promised one shows no error of the simulation."""
+SMALLEST = 1e-10
+"""A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
 LUCK = 3.0
 """A promised reduction within so many standard deviations of the cost's scatter cannot be told from it: the point stood on
 is the luckiest of some twenty (1.9 below the mean, the expected minimum), and the next has to be lower still."""
@@ -33,8 +38,9 @@ class TrustRegion:
     """Options of the method; all tolerances are relative and without unit.
 
     max_evaluations: simulations of the whole set a run may take. gradient: largest cosine between the residual and a
-    free column at which a point counts as stationary. reduction: smallest relative reduction of the cost worth a step.
-    step: smallest step in scaled coordinates. damping: first lambda. probe: length, in scaled coordinates, of the steps
+    free column at which a point counts as stationary. reduction: smallest relative reduction of the cost worth a step; where
+    the cost still falls just as promised, so that no error of the simulation is in sight, a thousandth of it is.
+    step: smallest step, as a share of each scaled coordinate. damping: first lambda. probe: length, in scaled coordinates, of the steps
     that show how far the cost scatters by the simulation's own error.
     """
 
@@ -77,7 +83,7 @@ class _Walk:
         if not self._move(np.clip(space.scaled(self.theta), low, high), space):
             return "failed", f"the start cannot be simulated: {self.failure}"
         size = _norms(self.jacobian)
-        damping, growth = self.options.damping, 2.0
+        damping, growth, reach = self.options.damping, 2.0, 1.0
         while self.evaluations < self.options.max_evaluations:
             assert self.cost is not None
             if not self.jacobian.any():
@@ -85,18 +91,26 @@ class _Walk:
             if self._stationary(low, high):
                 return "converged", "the gradient is zero"
             size = np.maximum(size, _norms(self.jacobian))
-            p = _step(self.jacobian, self.r, damping, size, low - self.x, high - self.x)
+            far = reach * np.maximum(np.abs(self.x), 1.0)
+            p = _step(
+                self.jacobian, self.r, damping, size, np.maximum(low - self.x, -far), np.minimum(high - self.x, far)
+            )
             predicted = self._predicted(p)
-            if predicted > 0 and np.abs(p).max() > self.options.step:
+            small = bool((np.abs(p) <= self.options.step * np.maximum(np.abs(self.x), SMALLEST)).all())
+            if predicted > 0 and not small:
                 before = self.cost
                 if self._move(self.x + p, space, better_than=before):
                     gain = (before - self.cost) / predicted
                     damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
                     damping = max(damping, 1e-14)
-                    if max(before - self.cost, predicted) <= self.options.reduction * before:
+                    reach *= 2.0 if gain > 0.5 else 1.0
+                    worth = self.options.reduction * (1e-3 if abs(gain - 1.0) < AS_PROMISED else 1.0)
+                    if max(before - self.cost, predicted) <= worth * before:
                         return "converged", "the cost does not fall any more"
                     continue
-            elif np.abs(p).max() <= self.options.step:
+                if not self.failure and predicted <= self.options.reduction * before:
+                    return "converged", "the cost does not fall any more"
+            elif small:
                 return self._standstill(size, low, high)
             damping, growth = damping * growth, min(2.0 * growth, 1e6)
         return "max-evaluations", f"no optimum within {self.options.max_evaluations} evaluations"
@@ -149,24 +163,27 @@ class _Walk:
         return self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
 
     def _scatter(self, p: Array, low: Array, high: Array) -> float:
-        """The standard deviation of the cost over tiny steps along p, less what the linear model says of them.
+        """The standard deviation of what is rough in the cost over tiny even steps along p; 0 where one of them fails.
 
-        A smooth cost has none. Adaptive steps of an integrator make it jump from one parameter value to the next, however
-        close they are (Moré and Wild 2011, "Estimating computational noise", doi 10.1137/100786125).
+        Third differences have nothing left of a smooth cost. Adaptive steps of an integrator make it jump from one parameter
+        value to the next, however close they are (Moré and Wild 2011, "Estimating computational noise",
+        doi 10.1137/100786125).
         """
         space = self.problem.coordinates
         unit = self.options.probe * p / np.abs(p).max()
-        changes = []
+        room = np.where(unit > 0, high - self.x, np.where(unit < 0, self.x - low, np.inf))
+        if not (room > -PROBES[0] * np.abs(unit)).all():
+            unit = np.where(room > -PROBES[0] * np.abs(unit), unit, 0.0)
+        costs = []
         for k in PROBES:
-            x = np.clip(self.x + k * unit, low, high)
             self.evaluations += 1
             try:
-                r, _ = self.problem.residual(space.unscaled(x))
+                r, _ = self.problem.residual(space.unscaled(self.x + k * unit))
             except SimulationError:
-                continue
-            assert self.cost is not None
-            changes.append(0.5 * float(r @ r) - self.cost + self._predicted(x - self.x))
-        return float(np.std(changes)) if len(changes) > 2 else 0.0
+                return 0.0
+            costs.append(0.5 * float(r @ r))
+        rough = np.diff(costs, 3)
+        return float(np.sqrt(np.mean(rough**2) / 20.0))  # 20 = 1 + 9 + 9 + 1, of white noise of 1
 
 
 def _norms(jacobian: Array) -> Array:
