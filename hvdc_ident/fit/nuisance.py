@@ -148,7 +148,10 @@ def observe(
     for output, y in outputs.items():
         if not (np.isfinite(y).all() and (not derivatives or np.isfinite(gradients[output]).all())):
             raise SimulationError(
-                f"output '{output}' or its sensitivity is not finite", where=f"experiment '{experiment.name}'"
+                f"output '{output}' or its sensitivity is not finite",
+                where=f"experiment '{experiment.name}'",
+                hint="a root, power or logarithm whose argument reaches 0 has an infinite slope there: keep it off 0, as "
+                "sqrt(max(x, 1e-6)); or narrower bounds",
             )
     return Observation(outputs, gradients)
 

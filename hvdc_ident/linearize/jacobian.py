@@ -179,7 +179,8 @@ def modes_at(s: System, y: Array, w: Array, p: Array, side: Side) -> Array:
             where=f"model '{s.structure.model.name}'",
             expected=f"{c.expression} clear of {c.level}",
             got=f"a distance of {values[kinks[0]]:.3g}",
-            hint='move an input a little, or ask for side="below" or "above" (one_sided gives both)',
+            hint='move an input a little, or ask for one side of the limit: [linearize] side = "below" or "above" in a '
+            "study, side= in Python (one_sided gives both)",
         )
     modes = modes.copy()
     for k in kinks:

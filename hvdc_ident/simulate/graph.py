@@ -7,6 +7,7 @@ Derivatives of a tree grow with every use of a signal; on the graph each node is
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Container, Iterable, Mapping
 
 import sympy as sp
@@ -370,9 +371,10 @@ class Graph:
             return [(a[0], inverse), (a[1], self.neg(self.mul(n, inverse)))]
         if op == "pow":
             slope = self.mul(a[1], self.power(x, self.sub(a[1], self.one)))
-            return (
-                [(x, slope)] if self.value(a[1]) is not None else [(x, slope), (a[1], self.mul(n, self.call("log", x)))]
-            )
+            if self.value(a[1]) is not None:
+                return [(x, slope)]
+            # x^a log(x) is 0 at x = 0, not 0 times infinity: the least normal number is lost in any x that is not 0.
+            return [(x, slope), (a[1], self.mul(n, self.call("log", self.add(x, self.constant(sys.float_info.min)))))]
         if op in ("sqrt", "sqrt0"):
             # sqrt(max(0, x)) is flat where its argument is cut at 0: the slope there must be 0, not 0 times infinity.
             return [(x, self.mul(self.constant(0.5), self.call("inverse", n)))]

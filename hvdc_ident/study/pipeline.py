@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from hvdc_ident.errors import ComputationError, HvdcIdentError, LinearizationError, SteadyStateError
+from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
@@ -58,12 +58,11 @@ def have_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
 def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
     """Every stage the study asks for, in order, written to the folder; those that stand there unchanged are kept.
 
-    A stage that fails ends the run of those that build on it; the others run. One that finds no steady state or linear
-    model where it needs it fails so, too, unless no other stage has a result: then its error is raised, with nothing
-    written.
+    A stage that fails ends the run of those that build on it; the others run. One that the study does not fit (an
+    InputError) fails so, too, unless no other stage has a result: then the error is raised.
     """
     done: dict[str, Done] = {}
-    refused: dict[str, SteadyStateError | LinearizationError] = {}
+    refused: dict[str, InputError] = {}
     rest = _rest_of(study, options)
     with exclusive(folder):
         for wanted in (s for s in stages() if s.wanted(study)):
@@ -71,7 +70,7 @@ def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
                 continue
             try:
                 done[wanted.name] = _kept_or_run(study, wanted, folder, options, rest)
-            except (SteadyStateError, LinearizationError) as error:
+            except InputError as error:
                 refused[wanted.name] = error
         if refused and all(d.failed for d in done.values()):
             raise next(iter(refused.values()))

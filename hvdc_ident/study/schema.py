@@ -302,6 +302,7 @@ class Port(Table):
 class Linearize(Table):
     """[linearize]: between which inputs and outputs, where, and what is wanted of the linear model.
 
+    side: of a limit that the operating point lies on, which derivative is taken; left out, such a point is refused.
     break_at: signals at which loops are opened for their margins. plant: where plant and controller meet, for the
     coprime factor margin. compare: another model, a shipped one or a path. scale: the size of an input or output that
     counts as 1 in norms, gaps and the reduction. formula: parameters to be shown as symbols in the transfer functions.
@@ -310,6 +311,7 @@ class Linearize(Table):
     inputs: Names | None = None
     outputs: Names | None = None
     at: Literal["steady", "start"] = "steady"
+    side: Literal["refuse", "below", "above"] = "refuse"
     trim: Trim | None = None
     break_at: Annotated[Names, BeforeValidator(_as_list)] | None = None
     plant: Cut | None = None

@@ -217,6 +217,15 @@ def _check_questions(study: Study, where: str) -> None:
         _all_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
         check_linear(study, where)
     for line in s.sweep:
+        tie = s.parameters[line.parameter].tie if line.parameter in s.parameters else None
+        if tie is not None:
+            raise StudyError(
+                f"'{line.parameter}' follows other parameters and cannot be swept",
+                where=f"{where}, sweep",
+                expected="a parameter without a tie",
+                got=f"tie = {tie!r}",
+                hint="sweep one that it follows, or leave the tie out",
+            )
         _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
     if s.sweep:

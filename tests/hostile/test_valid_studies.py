@@ -15,6 +15,7 @@ from hvdc_ident.cli import app
 from hvdc_ident.discrepancy.signatures.response import along
 from hvdc_ident.discrepancy.trials.state import slot_signals
 from hvdc_ident.fit.whitening import autoregression
+from hvdc_ident.simulate import simulate
 from hvdc_ident.study.study import load_study
 
 LAG = """schema = 1
@@ -132,6 +133,26 @@ def test_the_noise_model_of_a_record_shorter_than_its_order_is_that_of_the_recor
         found = autoregression([long, np.array(short)], most)
         assert len(found) == most
         assert found == pytest.approx(autoregression([long, np.array(short + [0.0] * 10)], most), rel=1e-12)
+
+
+def test_a_power_of_a_signal_that_rests_at_0_has_the_sensitivity_of_its_closed_form(tmp_path: Path) -> None:
+    """d/dn u^n = u^n log(u), which is 0 at u = 0."""
+    card = LAG[: LAG.index("[states]")] + '[outputs]\ny = "u**r"\n'
+    u = np.maximum(STEP - 0.5, 0.0)
+    loaded = load_study(study(tmp_path, card, {"time": T, "u": u, "y": ANSWER}, MOVED))
+    run = simulate(loaded.model, loaded.experiments[0], {}, sensitivities=["r"], outputs=["y"])
+    closed = np.where(u > 0, np.sqrt(u) * np.log(np.where(u > 0, u, 1.0)), 0.0)
+    assert run.gradient("y")[:, 0] == pytest.approx(closed, rel=1e-9, abs=1e-12)
+
+
+def test_an_infinite_slope_at_rest_does_not_end_a_diagnosis(tmp_path: Path) -> None:
+    """asin is upright at 1, where this input comes to rest; the gain before it is found all the same."""
+    card = LAG[: LAG.index("[outputs]")] + '[signals]\nangle = "asin(clip(u, -1, 1))"\n[outputs]\ny = "x"\n'
+    text = "[parameters]\nT = {}\n" + MOVED + '[fit]\nstarts = 2\n[diagnose]\neffects = ["offset"]\n'
+    result = ran("diagnose", study(tmp_path, card, {**RECORD, "y": ANSWER + 0.1 + NOISE}, text))
+    assert result.exit_code == 0, result.stderr
+    named = found(tmp_path, "discrepancy.json")["effects"]
+    assert [e["effect"] for e in named] == ["offset"]
 
 
 def test_nothing_is_looked_for_inside_an_instrument(tmp_path: Path) -> None:

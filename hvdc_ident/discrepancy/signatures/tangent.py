@@ -81,7 +81,11 @@ class Tangent:
         self._call = _SIGNATURE(self._code.address["partials"])
 
     def partials(self, time: Array, values: Array, parameters: Array) -> Partials:
-        """The derivatives along a trajectory. time: (K,); values: (K, n) of the variables; parameters: all the model's."""
+        """The derivatives along a trajectory. time: (K,); values: (K, n) of the variables; parameters: all the model's.
+
+        One that is not finite at an instant, as that of sqrt(x) at x = 0, says nothing of a finite disturbance: it is left
+        out, as 0.
+        """
         k, n = time.size, len(self.variables)
         flat = np.zeros((k, self._rows * n))
         for place, constant in self._constants:
@@ -96,7 +100,7 @@ class Tangent:
                 self._call(
                     y[i].ctypes.data, spare, t[i:].ctypes.data, spare, p.ctypes.data, spare, moving[i].ctypes.data
                 )
-            flat[:, self._places] = moving
+            flat[:, self._places] = np.where(np.isfinite(moving), moving, 0.0)
         rows = flat.reshape(k, self._rows, n)
         parts = np.split(rows, np.cumsum([len(self.signals), len(self.states), len(self.outputs), len(self.memory)]), 1)
         return Partials(*parts)

@@ -104,6 +104,7 @@ def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
         operating_point(study, chosen.values),
         inputs=asked.inputs if asked else None,
         outputs=asked.outputs if asked else None,
+        side=asked.side if asked else "refuse",
         sensitivities=list(study.candidates),
     )
     return replace(model, provenance=model.provenance | {"values": chosen.note})
