@@ -23,9 +23,16 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize.gap import gap, ncf_margin, nu_gap
     from hvdc_ident.linearize.loop import loop, plant_and_controller
     from hvdc_ident.linearize.margins import loop_margins, margins
+    from hvdc_ident.linearize.measured import (
+        MeasuredResponse,
+        response_at_tones,
+        response_from_record,
+        simulated_response,
+    )
     from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
     from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
     from hvdc_ident.linearize.reduce import balanced
+    from hvdc_ident.linearize.response_file import read_response
     from hvdc_ident.linearize.symbolic import symbolic_transfer
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
@@ -46,6 +53,7 @@ __all__ = [
     "Input",
     "InputSignal",
     "LinearModel",
+    "MeasuredResponse",
     "Model",
     "OperatingPoint",
     "Parameter",
@@ -76,9 +84,13 @@ __all__ = [
     "plant_and_controller",
     "port_admittance",
     "port_impedance",
+    "read_response",
     "read_waveforms",
+    "response_at_tones",
+    "response_from_record",
     "sensitivities",
     "simulate",
+    "simulated_response",
     "sobol",
     "sweep",
     "symbolic_transfer",
@@ -89,6 +101,7 @@ _HOME = {
     "Input": "parameters",
     "InputSignal": "experiment",
     "LinearModel": "linearize",
+    "MeasuredResponse": "linearize.measured",
     "Model": "model.definition",
     "OperatingPoint": "linearize",
     "Parameter": "parameters",
@@ -118,9 +131,13 @@ _HOME = {
     "plant_and_controller": "linearize.loop",
     "port_admittance": "linearize.port",
     "port_impedance": "linearize.port",
+    "read_response": "linearize.response_file",
     "read_waveforms": "formats",
+    "response_at_tones": "linearize.measured",
+    "response_from_record": "linearize.measured",
     "sensitivities": "sensitivity.local",
     "simulate": "simulate",
+    "simulated_response": "linearize.measured",
     "sobol": "sensitivity.global_screening",
     "sweep": "sensitivity.sweep",
     "symbolic_transfer": "linearize.symbolic",

@@ -108,6 +108,8 @@ class Experiment:
     nuisance: what is unknown about this experiment alone and is estimated with it: "time-shift", or the name of an input
     (its offset), a state (its start) or a parameter (a value of its own). search: of such parameters where
     a fit begins and its bounds, (start, min, max); of one not named they are the model's.
+    domain: "time"; or "frequency", where `time` holds frequencies in Hz and the outputs are real and imaginary parts of
+    measured responses, which a simulator of its own answers (`fit.frequency`).
     """
 
     name: str
@@ -127,6 +129,7 @@ class Experiment:
     starts: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_profile: FrozenMap[Array] = field(default_factory=FrozenMap)
     search: FrozenMap[tuple[float, float, float]] = field(default_factory=FrozenMap)
+    domain: Literal["time", "frequency"] = "time"
 
     def __post_init__(self) -> None:
         time = np.ascontiguousarray(self.time, dtype=float)

@@ -114,6 +114,11 @@ class Problem:
         return tuple(dict.fromkeys(o for e in self.fitted_experiments for o in e.outputs))
 
     @cached_property
+    def outputs_in_time(self) -> tuple[str, ...]:
+        """Those of recordings in time, without parts of measured frequency responses."""
+        return tuple(dict.fromkeys(o for e in self.fitted_experiments if e.domain == "time" for o in e.outputs))
+
+    @cached_property
     def unknowns(self) -> tuple[Free, ...]:
         """The free parameters, then the nuisances of each experiment."""
         return (*self.free, *(u for e in self.fitted_experiments for u in unknowns(self.simulator, e)))
@@ -223,7 +228,9 @@ class Problem:
         return at, np.vstack([b.jacobian[:, : len(loose)] for b in seen])
 
     def _experiment(self, e: Experiment, theta: Array, derivatives: bool, treatment: Treatment) -> tuple[Block, ...]:
-        loose = loose_states(self.simulator, e) if self.unsettled else ()
+        loose = loose_states(self.simulator, e) if self.unsettled and e.domain == "time" else ()
+        if e.domain == "frequency":  # is compared as it is: whitening, guards and bands are of samples in time
+            treatment = Treatment()
         return residual_blocks(
             self.simulator,
             self._begun(e, theta, treatment)[0] if loose else e,

@@ -32,7 +32,7 @@ def prepared(problem: Problem, whiten: str) -> Problem:
         raise unknown_name("way of whitening", whiten, WHITEN)
     if whiten != "pre-event":
         return problem
-    return replace(problem, rho=FrozenMap(before_event(problem.fitted_experiments, problem.outputs)))
+    return replace(problem, rho=FrozenMap(before_event(problem.fitted_experiments, problem.outputs_in_time)))
 
 
 def weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tuple[Problem, Optimum, list[Optimum]]:
@@ -70,7 +70,7 @@ def whitened_by_residuals(
     for _ in range(2):
         blocks = replace(problem, rho=FrozenMap()).blocks(best.theta, derivatives=False, in_time=True)
         models = {}
-        for output in problem.outputs:
+        for output in problem.outputs_in_time:
             own = [(b, b.scaled(b.misfit)) for b in blocks if b.output == output]
             records = [(r - r.mean())[part] for b, r in own for part in b.stretches]
             models[output] = autoregression(records)

@@ -12,6 +12,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.executor import Executor, Progress
+from hvdc_ident.fit.frequency import WithResponses, in_time
 from hvdc_ident.fit.noise import unknown_noise
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.fit.simulator import inputs_of
@@ -62,7 +63,7 @@ def identifiability(
     so_far = Findings(problem, seed, walk or Walk(), progress)
     _check(so_far)
     so_far.tell("structure")
-    structure = structure_of(subject if isinstance(subject, Model) else None, problem, seed)
+    structure = structure_of(_equations(subject), problem, seed)
     narrow.structural(so_far, structure)
     free = tuple(f for f in problem.free if f.name not in so_far.held)
     if free:
@@ -83,6 +84,12 @@ def identifiability(
     return replace(report, notes=(*report.notes, note)) if note else report
 
 
+def _equations(subject: Model | Simulator) -> Model | None:
+    """The model whose equations the structure can be asked of, where there is one."""
+    model = subject.model if isinstance(subject, WithResponses) else subject
+    return model if isinstance(model, Model) else None
+
+
 def _check(so_far: Findings) -> None:
     """Notes that nothing moves, where nothing does. Raises StudyError where nothing was measured."""
     experiments = so_far.problem.fitted_experiments
@@ -92,7 +99,10 @@ def _check(so_far: Findings) -> None:
             raise StudyError(
                 "nothing was measured", where=f"experiment '{e.name}'", expected="finite values in its window"
             )
-    so_far.quiet = all(s.is_constant for e in experiments for s in e.inputs.values())
+    recordings = in_time(experiments)
+    so_far.quiet = len(recordings) == len(experiments) and all(
+        s.is_constant for e in recordings for s in e.inputs.values()
+    )
     if so_far.quiet and any(e.inputs for e in experiments):
         so_far.notes.append("No input moves in any of the experiments: they show a steady state and nothing else.")
 
@@ -201,9 +211,12 @@ def _whole(so_far: Findings, at: Optimum) -> Optimum:
 def _sensitivities(so_far: Findings, whole: Optimum) -> LocalSensitivities | None:
     """The exact sensitivities of a model with equations, at the values found or held, between what moves and what is seen."""
     subject = so_far.problem.simulator
+    subject = subject.simulator if isinstance(subject, WithResponses) else subject
     if not isinstance(subject, ModelSimulator) or not isinstance(subject.model, Model):
         return None
-    experiments = so_far.problem.fitted_experiments
+    experiments = in_time(so_far.problem.fitted_experiments)
+    if not experiments:
+        return None
     moved = [n for n in subject.model.inputs if any(n in e.inputs and not e.inputs[n].is_constant for e in experiments)]
     try:
         return sensitivities(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.frequency import in_time
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.advice import advice
 from hvdc_ident.identifiability.merit import Merit, half_widths, merit
@@ -113,10 +114,13 @@ def recommend(
     values of the optimum. inputs: the model's. units: of the parameters. thresholds: the rise of the cost at the ends of
     a parameter's interval, which widens the predicted intervals too.
     """
-    template = max(whole.problem.fitted_experiments, key=lambda e: float(np.ptp(e.time)))
+    recordings = in_time(whole.problem.fitted_experiments)
+    if not recordings:
+        return None
+    template = max(recordings, key=lambda e: float(np.ptp(e.time)))
     values, of_inputs = {n: i.value for n, i in inputs.items()}, {n: i.unit for n, i in inputs.items()}
     tried = _Trials(whole)
-    singles = list(single_trials(whole.problem.fitted_experiments, values, of_inputs, template))
+    singles = list(single_trials(recordings, values, of_inputs, template))
     ranked = list(tried.ranked(singles))
     ranked += tried.ranked(double_trials(_best_steps(ranked), singles, template))
     if not ranked:
@@ -140,7 +144,7 @@ class _Trials:
     def __init__(self, whole: Optimum) -> None:
         self.whole = whole
         self.base = whole.information.matrix
-        self.recorded = tuple(whole.problem.outputs)
+        self.recorded = whole.problem.outputs_in_time
         self.now = merit(self.base, whole.error)
         self.failed: list[str] = []
 
@@ -166,7 +170,7 @@ class _Trials:
     def _gains(self, trial: Trial) -> dict[str, Array]:
         """The information of each output of the run, in scaled coordinates."""
         problem, names = self.whole.problem, self.whole.names
-        template = max(problem.fitted_experiments, key=lambda e: float(np.ptp(e.time)))
+        template = max(in_time(problem.fitted_experiments), key=lambda e: float(np.ptp(e.time)))
         run = problem.simulator.simulate(trial.experiment(template), problem.values(self.whole.theta), names)
         found = {}
         for output in run.trajectory.names:

@@ -10,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.frequency import in_time
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.local_rank import METHOD, local_rank
@@ -66,10 +67,13 @@ def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure
     if model is None:
         return numbers
     names = tuple(f.name for f in problem.free)
-    outputs = problem.outputs
-    if any(e.drive or e.instrument for e in problem.fitted_experiments):
+    outputs = problem.outputs_in_time
+    recordings = in_time(problem.fitted_experiments)
+    if not recordings:
+        return _by_numbers(numbers, "there are frequency responses only")
+    if any(e.drive or e.instrument for e in recordings):
         return _by_numbers(numbers, "slots are driven by recordings, or outputs seen through instruments")
-    moved = moves(problem.fitted_experiments)
+    moved = moves(recordings)
     result = structural_identifiability(model, names, outputs, inputs=moved, seed=seed, time_limit=SECONDS)
     if result.out_of_reach:
         return _by_numbers(numbers, result.reason)

@@ -1,9 +1,11 @@
-"""Frequency responses that were measured: from recordings with coherence, and on the nonlinear model itself."""
+"""Frequency responses that were measured: as data, from recordings, and on the nonlinear model itself."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
@@ -11,15 +13,193 @@ from hvdc_ident.errors import LinearizationError, WaveformError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.expression.functions import TIME
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
-from hvdc_ident.linearize.frequency import Response
+from hvdc_ident.linearize.frequency import Response, sensitivity
 from hvdc_ident.linearize.jacobian import linearize
-from hvdc_ident.linearize.operating_point import find_operating_point
+from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
+from hvdc_ident.linearize.port import Port, disturbed_model, port_response, port_sensitivity
 from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
 from hvdc_ident.model.transform import rewritten
 
+Kind = Literal["transfer", "impedance", "admittance"]
 
-def from_record(
+
+@dataclass(frozen=True, eq=False)
+class MeasuredResponse:
+    """A frequency response that was measured on the plant, and where a model shows the same.
+
+    channels: (output, input) of each measured channel: of the model, or axes of the port ("d", "q", "dc").
+    omega: (n,) rad/s; values: (n, channels) complex, in the model's units. std: (n, channels) standard deviation of the
+    error's modulus, None where it is not known. dof: independent numbers it was estimated from, infinite where it is exact.
+    port: for an impedance or admittance. fixed: inputs held at the operating point. trim: values of outputs there, which
+    `free` inputs are set for. role: "fit" or "holdout". unit: as it was measured, for people.
+
+    Raises LinearizationError where the parts do not fit.
+    """
+
+    name: str
+    kind: Kind
+    channels: tuple[tuple[str, str], ...]
+    omega: Array
+    values: Array
+    std: Array | None = None
+    dof: float = float("inf")
+    port: Port | None = None
+    fixed: FrozenMap[float] = field(default_factory=FrozenMap)
+    trim: FrozenMap[float] = field(default_factory=FrozenMap)
+    free: tuple[str, ...] = ()
+    role: Literal["fit", "holdout"] = "fit"
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        shape = (self.omega.size, len(self.channels))
+        fits = self.values.shape == shape and (self.std is None or self.std.shape == shape)
+        if not fits or not self.channels or (self.port is None) != (self.kind == "transfer"):
+            raise LinearizationError(
+                "a measured response does not fit together",
+                where=f"response '{self.name}'",
+                expected=f"values and std of shape {shape}, and a port for an impedance or admittance",
+                got=f"{self.values.shape}, kind {self.kind}",
+            )
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each channel: "Vdc1 from Vdcref1", or "d from q"."""
+        return tuple(f"{o} from {i}" for o, i in self.channels)
+
+    def point(self, model: AnyModel, values: Mapping[str, float]) -> OperatingPoint:
+        """Return the operating point it was measured at. Raises SteadyStateError."""
+        fixed = {**values, **self.fixed}
+        return find_operating_point(model, fixed, self.free, outputs=dict(self.trim) or None)
+
+    def of_model(self, model: AnyModel, values: Mapping[str, float], names: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Return (response, derivatives) of a model, (n, channels) and (n, channels, names), at the same frequencies.
+
+        values: of parameters. names: parameters for the derivatives, the operating point's shift included. Raises
+        SteadyStateError or LinearizationError where the model has no linear one there.
+        """
+        if self.port is not None:
+            return self._at_port(model, values, names)
+        outputs, inputs = (list(dict.fromkeys(c[k] for c in self.channels)) for k in (0, 1))
+        linear = linearize(model, self.point(model, values), inputs=inputs, outputs=outputs, sensitivities=tuple(names))
+        slopes = [sensitivity(linear, self.omega, names)[n] for n in names] if names else []
+        places = [(outputs.index(o), inputs.index(i)) for o, i in self.channels]
+        return self._picked(linear.response(self.omega), slopes, places)
+
+    def _at_port(self, model: AnyModel, values: Mapping[str, float], names: Sequence[str]) -> tuple[Array, Array]:
+        assert self.port is not None
+        if not isinstance(model, Model):
+            raise LinearizationError("an impedance needs the model's equations", where=f"model '{model.name}'")
+        disturbed, inputs, outputs = self._disturbed(model)
+        point = self.point(disturbed, values)
+        linear = linearize(disturbed, point, inputs=inputs, outputs=outputs, sensitivities=tuple(names))
+        found = port_response(linear, self.port, self.omega, self.kind).values
+        slopes = np.moveaxis(port_sensitivity(linear, self.port, self.omega, self.kind, names), -1, 0)
+        axes = self.port.axes
+        return self._picked(found, list(slopes), [(axes.index(o), axes.index(i)) for o, i in self.channels])
+
+    def _disturbed(self, model: Model) -> tuple[Model, list[str], list[str]]:
+        """The model with the port's disturbances, made once for a model."""
+        assert self.port is not None
+        known = self._made
+        if known.get("of") is not model:
+            known |= {"of": model, "made": disturbed_model(model, self.port)}
+        made: tuple[Model, list[str], list[str]] = known["made"]
+        return made
+
+    @cached_property
+    def _made(self) -> dict[str, Any]:
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Only the data travel to another process."""
+        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
+
+    def _picked(self, values: Array, slopes: Sequence[Array], places: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
+        picked = np.stack([values[:, i, j] for i, j in places], axis=1)
+        shape = (*picked.shape, 0)
+        derivatives = (
+            np.stack([np.stack([s[:, i, j] for i, j in places], axis=1) for s in slopes], axis=-1)
+            if len(slopes)
+            else np.zeros(shape, dtype=complex)
+        )
+        return picked, derivatives
+
+    def errors(self, model_values: Array) -> list[dict[str, Any]]:
+        """How far a model's response is from the measured one, by channel.
+
+        relative: root mean square of the error over that of the measurement; largest deviations of gain (dB) and phase
+        (degrees) and where; chi2_per_point: mean square of the error in standard deviations, None where none is known.
+        """
+        found = []
+        for k, label in enumerate(self.labels):
+            measured, model = self.values[:, k], model_values[:, k]
+            apart = model - measured
+            with np.errstate(divide="ignore", invalid="ignore"):
+                gain = 20 * np.log10(np.abs(model) / np.abs(measured))
+                phase = np.degrees(np.angle(model * np.conj(measured)))
+            gain, phase = np.where(np.isfinite(gain), gain, 0.0), np.where(np.isfinite(phase), phase, 0.0)
+            size = float(np.sqrt(np.mean(np.abs(measured) ** 2)))
+            first, second = int(np.argmax(np.abs(gain))), int(np.argmax(np.abs(phase)))
+            chi2 = None if self.std is None else float(np.mean(np.abs(apart / self.std[:, k]) ** 2))
+            found.append(
+                {
+                    "channel": label,
+                    "relative": float(np.sqrt(np.mean(np.abs(apart) ** 2))) / size if size > 0 else None,
+                    "gain_db": {"value": float(gain[first]), "omega": float(self.omega[first])},
+                    "phase_deg": {"value": float(phase[second]), "omega": float(self.omega[second])},
+                    "chi2_per_point": chi2,
+                }
+            )
+        return found
+
+
+def response_at_tones(
+    time: Array, u: Array, y: Array, omega: Array, *, input: str = "u", output: str = "y"
+) -> Response:
+    """Return the response at the frequencies at which a record was perturbed, by least squares on both signals.
+
+    time: (n,) s, rows may be uneven. omega: (k,) rad/s. Each signal is a constant, a drift and a sine at each frequency;
+    what is left of it gives the standard deviation, as white noise. Raises WaveformError for too few rows, a frequency
+    that the record is too short for, or one at which the input does not move.
+    """
+    t, u, y = (np.asarray(v, dtype=float) for v in (time, u, y))
+    w = np.atleast_1d(np.asarray(omega, dtype=float))
+    span = float(np.ptp(t)) if t.size else 0.0
+    columns = 2 + 2 * w.size
+    if t.size <= 2 * columns or not (np.isfinite(u).all() and np.isfinite(y).all()):
+        raise WaveformError(
+            "too few rows for these frequencies", expected=f"more than {2 * columns} finite rows", got=f"{t.size}"
+        )
+    apart = np.diff(np.sort(w)).min(initial=w.min())
+    if not (w > 0).all() or span * apart < 2 * np.pi * (1 - 1e-9):
+        raise WaveformError(
+            "the record is too short to tell these frequencies apart",
+            expected=f"at least {2 * np.pi / apart:.4g} s, one period of the smallest distance between them",
+            got=f"{span:.4g} s",
+        )
+    x = (t - t[0]) / span - 0.5
+    basis = np.column_stack([np.ones(t.size), x, *(f(k * t) for k in w for f in (np.cos, np.sin))])
+    solved, *_ = np.linalg.lstsq(basis, np.column_stack([u, y]), rcond=None)
+    phasors = solved[2::2] - 1j * solved[3::2]
+    left = np.column_stack([u, y]) - basis @ solved
+    dof = t.size - columns
+    sigma = np.sqrt((left**2).sum(axis=0) / dof)
+    variance = np.linalg.inv(basis.T @ basis).diagonal()
+    scatter = np.sqrt(variance[2::2] + variance[3::2])[:, None] * sigma  # of the phasors' moduli
+    drive = np.abs(phasors[:, 0])
+    if (drive <= 3.0 * scatter[:, 0]).any() or (drive == 0).any():
+        k = int(np.argmin(drive / np.maximum(scatter[:, 0], 1e-300)))
+        raise WaveformError(f"the input '{input}' does not move at {w[k] / (2 * np.pi):.6g} Hz", hint="leave it out")
+    h = phasors[:, 1] / phasors[:, 0]
+    std = np.sqrt(scatter[:, 1] ** 2 + np.abs(h) ** 2 * scatter[:, 0] ** 2) / drive
+    shape = (-1, 1, 1)
+    return Response(w, h.reshape(shape), (output,), (input,), (("", ""),), std.reshape(shape), source="recording")
+
+
+def response_from_record(
     time: Array, u: Array, y: Array, *, input: str = "u", output: str = "y", segments: int = 8, window: str = "hann"
 ) -> Response:
     """The response from recorded input to recorded output by Welch's averages, with coherence and standard deviation.
@@ -62,19 +242,7 @@ def from_record(
     )  # fmt: skip
 
 
-def from_experiment(experiment: Experiment, input: str, output: str, segments: int = 8) -> Response:
-    """The response between an experiment's input and a measured output, over the recorded rows of its window."""
-    if input not in experiment.inputs:
-        raise unknown_name("input", input, experiment.inputs, where=f"experiment '{experiment.name}'")
-    if experiment.measured is None or output not in experiment.measured.names:
-        raise unknown_name("measured output", output, experiment.outputs, where=f"experiment '{experiment.name}'")
-    rows = experiment.compared & np.isfinite(experiment.measured[output])
-    t = experiment.time[rows]
-    u, y = experiment.inputs[input](t), experiment.measured[output][rows]
-    return from_record(t, u, y, input=input, output=output, segments=segments)
-
-
-def by_simulation(
+def simulated_response(
     model: Model,
     input: str,
     outputs: Sequence[str],

@@ -11,6 +11,7 @@ import sympy as sp
 
 from hvdc_ident.fit import FitResult, Free, Group, Problem, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
+from hvdc_ident.fit.frequency import with_responses
 from hvdc_ident.fit.individual import part_of
 from hvdc_ident.fit.loss import loss
 from hvdc_ident.fit.tolerance import tolerance
@@ -22,6 +23,12 @@ from hvdc_ident.study.unknowns import priors
 if TYPE_CHECKING:
     from hvdc_ident.fit.executor import Executor, Progress
     from hvdc_ident.study.study import Study
+
+
+def problem_of(study: Study) -> Problem:
+    """Return the fit of all candidates to the study's recordings and measured frequency responses."""
+    simulator, experiments = with_responses(study.model, study.experiments, study.responses)
+    return Problem(simulator, experiments, tuple(study.candidates.values()))
 
 
 def asked_of(study: Study) -> Fit:
@@ -110,7 +117,8 @@ def errors_in_windows(study: Study, found: Mapping[str, Mapping[str, Curve]]) ->
     """The errors before, during and after the event, with the tolerance profile the study names."""
     profile = tolerance(asked_of(study).tolerance, study.path.parent)
     units = {n: o.unit for n, o in study.model.outputs.items()}
-    return windowed_errors(found, study.experiments, profile, units)
+    recorded = {e.name: found[e.name] for e in study.experiments if e.name in found}
+    return windowed_errors(recorded, study.experiments, profile, units)
 
 
 def derived(study: Study, result: FitResult) -> dict[str, dict[str, Any]]:

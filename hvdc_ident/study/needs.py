@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hvdc_ident.errors import ComputationError, SteadyStateError, StudyError
+from hvdc_ident.errors import ComputationError, InputError, SteadyStateError, StudyError
 from hvdc_ident.study.study import Study
 
 
-def need_experiments(study: Study, stage: str, role: str | None = None) -> None:
-    """Raises StudyError where the study has no experiment, or none of the role."""
+def need_experiments(study: Study, stage: str, role: str | None = None, *, responses: bool = False) -> None:
+    """Raise StudyError where the study has no experiment, or none of the role.
+
+    responses: whether a measured frequency response does instead.
+    """
+    if responses and any(r.role == role for r in study.responses):
+        return
     if not study.experiments:
         hint = '[[experiment]] with name, data = "file.csv", inputs and outputs'
         raise StudyError(f"{stage} needs an experiment and the study has none", where=study.path.name, hint=hint)
@@ -32,7 +37,10 @@ def need_candidates(study: Study, stage: str) -> None:
 
 
 def need_start(study: Study) -> None:
-    """Raises SteadyStateError where an experiment has no steady state at the start values: the study is then wrong."""
+    """Raise SteadyStateError where an experiment has no steady state at the start values: the study is then wrong.
+
+    LinearizationError where a measured response has no counterpart there.
+    """
     from contextlib import suppress
 
     from hvdc_ident.errors import SimulationError
@@ -41,6 +49,11 @@ def need_start(study: Study) -> None:
     for experiment in study.experiments:
         with suppress(SimulationError):
             simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
+    for response in study.responses:
+        try:
+            response.of_model(study.model, study.start)
+        except InputError as e:
+            raise e.at(f"response '{response.name}'") from None
 
 
 @contextmanager

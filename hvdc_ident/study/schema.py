@@ -322,6 +322,48 @@ class Linearize(Table):
     port: list[Port] = []
 
 
+class Response(Table):
+    """[[response]]: a measured frequency response, from an input to an output, or at a port of [[linearize.port]].
+
+    columns: the file's channel of each measured one (dd, dq, qd, qq at a port of two axes). signals: where data is a record
+    in time, its columns {input, output}; frequencies: of the perturbation there, Hz. scale: model = scale x recorded.
+    noise: standard deviation of the error's modulus, in the model's unit; relative_noise: as a share of the modulus.
+    values, trim: the operating point it was measured at. band: Hz.
+    """
+
+    name: FileName
+    data: Name
+    role: Literal["fit", "holdout"] = "fit"
+    input: Name | None = None
+    output: Name | None = None
+    port: Name | None = None
+    kind: Literal["impedance", "admittance"] = "impedance"
+    columns: dict[Name, Name] = {}
+    signals: dict[Literal["input", "output"], Name] = {}
+    frequencies: Annotated[list[Positive], Field(min_length=1)] | None = None
+    scale: FiniteFloat = 1.0
+    unit: Annotated[str, StringConstraints(max_length=50)] = ""
+    noise: Positive | None = None
+    relative_noise: Positive | None = None
+    band: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
+    values: dict[Name, FiniteFloat] = {}
+    trim: Trim | None = None
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Response:
+        if (self.port is None) == (self.input is None or self.output is None):
+            raise ValueError("give either input and output, or port")
+        if self.port is not None and (self.input or self.output):
+            raise ValueError("give either input and output, or port")
+        if self.noise is not None and self.relative_noise is not None:
+            raise ValueError("give either noise or relative_noise")
+        if self.band is not None and not self.band[0] < self.band[1]:
+            raise ValueError("band: its end is not above its start")
+        if (self.signals or self.frequencies) and set(self.signals) != {"input", "output"}:
+            raise ValueError("signals: a record in time needs the columns of its input and output")
+        return self
+
+
 class Sweep(Table):
     """[[sweep]]: the values of one parameter, listed or spread over a range.
 
@@ -433,6 +475,7 @@ class StudyFile(Table):
     model: Model
     parameters: dict[Name, Candidate] = {}
     experiment: list[Experiment] = []
+    response: list[Response] = []
     linearize: Linearize | None = None
     sweep: list[Sweep] = []
     screening: Screening | None = None

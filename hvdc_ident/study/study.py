@@ -11,12 +11,14 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.measured import MeasuredResponse
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear import check_linear
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
+from hvdc_ident.study.responses import read_responses
 from hvdc_ident.study.unknowns import free_of, with_nuisances, with_unknowns
 
 
@@ -28,6 +30,7 @@ class Study:
     given value, start and bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
     settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study.
     against: the other model that sweeps are compared with, where they are; compared: that of the linear model.
+    responses: the measured frequency responses.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Study:
     sources: FrozenMap[str]
     against: AnyModel | None = None
     compared: AnyModel | None = None
+    responses: tuple[MeasuredResponse, ...] = ()
 
     @property
     def folder(self) -> Path:
@@ -84,6 +88,7 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
     candidates = _candidates(settings, model, where)
     experiments, noise = read_experiments(settings.experiment, model, recordings, where)
     experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
+    responses, response_sources = read_responses(settings, model, file.parent, where)
     study = Study(
         name=settings.name or file.stem,
         path=file,
@@ -93,10 +98,18 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
         noise=noise,
         settings=settings,
         sources=FrozenMap(
-            {where: digest(content), **model_sources, **other_sources, **compared_sources, **recordings.digests}
+            {
+                where: digest(content),
+                **model_sources,
+                **other_sources,
+                **compared_sources,
+                **recordings.digests,
+                **response_sources,
+            }
         ),
         against=other,
         compared=compared,
+        responses=responses,
     )
     _check_questions(study, where)
     return study
@@ -240,7 +253,9 @@ def _check_questions(study: Study, where: str) -> None:
         place = f"{where}, fit.groups number {number}"
         _all_known("candidate", group.parameters, study.candidates, f"{place}.parameters")
         _all_known("measured output", group.outputs, measured, f"{place}.outputs")
-        _all_known("experiment", group.experiments, names, f"{place}.experiments")
+        _all_known(
+            "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
+        )
     if s.fit:
         from hvdc_ident.fit.loss import LOSSES
         from hvdc_ident.fit.optimisers import catalogue, need

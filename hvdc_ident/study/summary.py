@@ -7,6 +7,7 @@ from typing import Any
 from hvdc_ident.experiment import Experiment, recording_lines
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.recordings import noise_line
+from hvdc_ident.study.responses import described
 from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import stages
 from hvdc_ident.study.steady_notes import steady_notes
@@ -29,6 +30,7 @@ def summary(study: Study, seed: int = 0) -> dict[str, Any]:
         "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
         "experiments": {e.name: _experiment(e, study) for e in study.experiments},
         "steady_state": steady_notes(study),
+        "responses": {r.name: described(r) for r in study.responses},
         "stages": [s.name for s in stages() if s.wanted(study)],
         "rest_levels": rest.to_list(),
         "rest_lines": [*rest.lines, *rest.remarks],
@@ -53,6 +55,16 @@ def summary_text(found: dict[str, Any]) -> str:
         lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
     lines += found["rest_lines"]
     lines += [f"steady state, {line}" for line in found["steady_state"]]
+    for name, r in found["responses"].items():
+        low, high = r["band_hz"]
+        noise = (
+            "not given" if r["relative_noise"] is None else f"{100 * r['relative_noise']:.3g} % ({r['noise_source']})"
+        )
+        unit = f" in {r['unit']}" if r["unit"] else ""
+        lines.append(
+            f"response {name} ({r['role']}): {r['kind']}{unit}, {', '.join(r['channels'])}; {r['points']} frequencies, "
+            f"{low:.4g} to {high:.4g} Hz; noise {noise}"
+        )
     lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
     return "\n".join(lines)
 

@@ -18,7 +18,7 @@ from hvdc_ident.linearize.frequency import (
 )
 from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins
-from hvdc_ident.linearize.measured import by_simulation, from_record
+from hvdc_ident.linearize.measured import response_from_record, simulated_response
 from hvdc_ident.linearize.pade import pade, response
 from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
 from hvdc_ident.linearize.symbolic import symbolic_transfer
@@ -256,7 +256,7 @@ def test_an_ill_posed_loop_is_refused():
 
 
 def test_multisine_through_the_nonlinear_model(link):
-    found = by_simulation(link, "Vdcref1", ["Vdc1", "Irorder1"], [5.0, 20.0, 60.0], 1e-5, rtol=1e-10)
+    found = simulated_response(link, "Vdcref1", ["Vdc1", "Irorder1"], [5.0, 20.0, 60.0], 1e-5, rtol=1e-10)
     want = linearize(link, find_operating_point(link), inputs=["Vdcref1"], outputs=["Vdc1", "Irorder1"]).response(
         found.omega
     )
@@ -265,7 +265,7 @@ def test_multisine_through_the_nonlinear_model(link):
 
 def test_multisine_through_a_delay(link):
     plant = link.with_effects(DELAY)
-    found = by_simulation(plant, "Vdcref1", ["Vdc1"], [20.0, 60.0], 1e-5, rtol=1e-9)
+    found = simulated_response(plant, "Vdcref1", ["Vdc1"], [20.0, 60.0], 1e-5, rtol=1e-9)
     want = linearize(plant, inputs=["Vdcref1"], outputs=["Vdc1"]).response(found.omega)
     np.testing.assert_allclose(found.values, want, rtol=2e-3)
 
@@ -277,15 +277,15 @@ def test_response_from_a_recording_with_its_band():
     t = np.arange(20000) * 1e-3
     u = rng.normal(size=t.size)
     y = scipy.signal.lfilter([0.1], [1, -0.9], u) + 0.02 * rng.normal(size=t.size)
-    found = from_record(t, u, y, segments=20)
+    found = response_from_record(t, u, y, segments=20)
     want = 0.1 / (1 - 0.9 * np.exp(-1j * found.omega * 1e-3))
     z = np.abs(found.values[:, 0, 0] - want) / found.std[:, 0, 0]
     assert 0.5 < np.mean(z**2) / 2 < 2.0
     assert 0 <= found.coherence.min() <= found.coherence.max() <= 1
     with pytest.raises(WaveformError, match="never changes"):
-        from_record(t, np.ones_like(t), y)
+        response_from_record(t, np.ones_like(t), y)
     with pytest.raises(WaveformError, match="too few"):
-        from_record(t[:20], u[:20], y[:20])
+        response_from_record(t[:20], u[:20], y[:20])
 
 
 # --- formulas ---

@@ -15,17 +15,16 @@ if TYPE_CHECKING:
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """The estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
-    from hvdc_ident.fit import Problem
     from hvdc_ident.identifiability import gated_fit
     from hvdc_ident.identifiability.gate import gate, gated
     from hvdc_ident.study import fitting
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
-    from hvdc_ident.study.simulator import ModelSimulator
+    from hvdc_ident.study.responses import compared
 
-    need_experiments(study, "fit", role="fit")
+    need_experiments(study, "fit", role="fit", responses=True)
     need_candidates(study, "fit")
-    problem = Problem(ModelSimulator(study.model), study.experiments, tuple(study.candidates.values()))
+    problem = fitting.problem_of(study)
     need_start(study)
     report = earlier["identify"]
     if "parameters" not in report:
@@ -39,7 +38,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             return fitting.fitted(study, asked, seed=options.seed, executor=executor, progress=options.progress)
 
         result = gated_fit(problem, report, fit, force=options.force, whole=fitting.as_reported(study))
-    data = {**result.to_dict(), **_context(study, options, report, result)}
+    data = {**result.to_dict(), **_context(study, problem, options, report, result)}
     if data["adequacy"]:
         data["adequacy"]["next"] = data["adequacy"]["next"].replace("STUDY", study.path.name)
     if result.status == "failed":
@@ -48,11 +47,15 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     curves = fitting.curves_of(through, result)
     data["windowed_errors"] = fitting.errors_in_windows(study, curves)
     data["derived"] = fitting.derived(study, result)
+    if study.responses:
+        data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
     files = _files(study, result, data, curves)
     return Outcome(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
-def _context(study: Study, options: Options, report: Mapping[str, Any], result: FitResult) -> dict[str, Any]:
+def _context(
+    study: Study, problem: Problem, options: Options, report: Mapping[str, Any], result: FitResult
+) -> dict[str, Any]:
     """What a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
     from hvdc_ident.study.recordings import noise_line
     from hvdc_ident.study.tables import candidate_lines
@@ -60,10 +63,10 @@ def _context(study: Study, options: Options, report: Mapping[str, Any], result: 
     return {
         "forced": [n for n in options.force if n in result.fitted and n not in report["identifiable"]],
         "candidates": candidate_lines(study),
-        "units": {o: study.model.outputs[o].unit for o in result.rmse},
+        "units": {o: e.measured.unit(o) for e in problem.experiments if e.measured is not None for o in e.outputs},
         "experiments": {
             e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording}
-            for e in study.experiments
+            for e in problem.experiments
         },
         "noise": {e: {o: noise_line(n) for o, n in notes.items()} for e, notes in study.noise.items()},
         "ties": {n: line.tie for n, line in study.settings.parameters.items() if line.tie is not None},
@@ -103,6 +106,8 @@ def told(data: Mapping[str, Any]) -> list[str]:
     judged = data.get("adequacy") or {}
     lines += [f"{WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
     lines += [f"Next: {judged['next']}"] if judged.get("next") else []
+    from hvdc_ident.study.responses import response_lines
+
     beside = _beside(data)
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
@@ -110,6 +115,7 @@ def told(data: Mapping[str, Any]) -> list[str]:
         lines.append(f"{name} = {e['value']:.6g}{unit}{given}{_interval(e['ci95'], beside)}" + _note(e))
     held = [n for n in data["candidates"] if n not in data["estimates"]]
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
+    lines += response_lines(data.get("responses", ()), "fitted")
     return lines + _searched(data)
 
 

@@ -17,12 +17,13 @@ FEWEST_STARTS = 4
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """A verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
+    from hvdc_ident.fit.frequency import with_responses
     from hvdc_ident.identifiability import identifiability, identifiability_by_group
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
     from hvdc_ident.study.tables import candidate_lines
 
-    need_experiments(study, "identify", role="fit")
+    need_experiments(study, "identify", role="fit", responses=True)
     need_candidates(study, "identify")
     need_start(study)
     starts = max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
@@ -35,7 +36,9 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             "progress": options.progress,
             "pair": (pair[0], pair[1]) if pair else None,
         }
-        asked = (study.model, study.experiments, tuple(study.candidates.values()))
+        simulator, experiments = with_responses(study.model, study.experiments, study.responses)
+        subject = simulator if study.responses else study.model
+        asked = (subject, experiments, tuple(study.candidates.values()))
         groups = groups_of(study)
         report = identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
     return Outcome({**report.to_dict(), "candidates": candidate_lines(study)})

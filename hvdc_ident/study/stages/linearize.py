@@ -52,6 +52,7 @@ def _described(
     """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
     from hvdc_ident.study.linear import analyses, modes_of
+    from hvdc_ident.study.responses import compared
 
     point = model.point
     assert point is not None
@@ -76,6 +77,8 @@ def _described(
     options.progress(2, 3, "norms, margins, ports and comparisons")
     more, files = analyses(study, model)
     data |= more
+    if study.responses:
+        data["responses"] = compared(study, {chosen.name: chosen.values})
     for key in ("schema", "kind", "model"):
         data.pop(key, None)
     return data, files
@@ -113,11 +116,15 @@ def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
 def told(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
     from hvdc_ident.study.linear import lines
+    from hvdc_ident.study.responses import response_lines
+
+    def described(found: Mapping[str, Any], of: str) -> list[str]:
+        return lines(found) + response_lines(found.get("responses", ()), of)
 
     fitted = data.get("fitted") or {}
-    found = ["at the given values:", *lines(data)]
+    found = ["at the given values:", *described(data, "given")]
     if fitted.get("modes"):
-        return [*found, f"at the {data['fitted_note']}:", *lines(fitted)]
+        return [*found, f"at the {data['fitted_note']}:", *described(fitted, "fitted")]
     why = fitted.get("message") or data["fitted_note"]
     return [*found, f"none at fitted values: {why}"] if why else found
 
@@ -127,7 +134,7 @@ STAGE = Stage(
     file="linearization.json",
     summary="The operating point, linear model, modes and transfer functions.",
     run=run,
-    wanted=lambda study: study.settings.linearize is not None,
+    wanted=lambda study: study.settings.linearize is not None or bool(study.responses),
     order=45,
     uses=("fit",),
     tell=told,

@@ -1,0 +1,108 @@
+"""Measured frequency responses beside the model's, given and fitted: Bode diagrams and a table of the errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.report.drawing import figure, svg
+from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.results import Results
+from hvdc_ident.report.section import Section
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+STYLES = {"given": "--", "fitted": "-"}
+
+
+def _render(results: Results) -> str:
+    responses = results.get("fit").get("responses") or results.get("linearization").get("responses") or []
+    return "".join(_response(r) for r in responses)
+
+
+def _response(r: dict[str, Any]) -> str:
+    unit = f" in {text(r['unit'])}" if r.get("unit") else ""
+    held_out = ", held out" if r["role"] == "holdout" else ""
+    low, high = r["band_hz"]
+    head = (
+        f"<h3>{text(r['name'])}</h3><p>{text(r['kind']).capitalize()}{unit}{held_out}: {r['points']} frequencies from "
+        f"{number(low)} to {number(high)} Hz. Dots are measured, the dashed lines are the given values"
+        f"{', the full ones the fitted values' if 'fitted' in r['models'] else ''}.</p>"
+    )
+    reasons = "".join(
+        f"<p>With the {text(n)} values there is no response: {text(m['reason'])}</p>"
+        for n, m in r["models"].items()
+        if "reason" in m
+    )
+    return head + _bode(r) + _errors(r) + reasons
+
+
+def _values(parts: dict[str, Any]) -> NDArray[np.complex128]:
+    return np.asarray(np.array(parts["real"], dtype=float) + 1j * np.array(parts["imag"], dtype=float))
+
+
+def _bode(r: dict[str, Any]) -> str:
+    omega = np.array(r["omega"], dtype=float)
+    fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
+    gain, phase = fig.subplots(2, 1, sharex=True)
+    curves = [("measured", _values(r["measured"]))]
+    curves += [(n, _values(m)) for n, m in r["models"].items() if "reason" not in m]
+    for k, channel in enumerate(r["channels"]):
+        for name, values in curves:
+            v = values[:, k]
+            keep = (omega > 0) & (np.abs(v) > 0)
+            if not keep.any():
+                continue
+            style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)]}
+            if name == "measured":
+                style |= {"linestyle": "none", "marker": ".", "markersize": 4}
+            else:
+                style |= {"linestyle": STYLES.get(name, "-."), "linewidth": 1.2}
+            label = f"{channel}, {name}" if k == 0 or name == "measured" else None
+            hertz = omega[keep] / (2 * np.pi)
+            gain.semilogx(hertz, 20 * np.log10(np.abs(v[keep])), label=label, **style)
+            phase.semilogx(hertz, np.degrees(np.unwrap(np.angle(v[keep]))), **style)
+    gain.set_ylabel("gain, dB")
+    phase.set_ylabel("phase, degrees")
+    phase.set_xlabel("frequency, Hz")
+    gain.legend(fontsize="small")
+    for axes in (gain, phase):
+        axes.grid(True, color="#dddddd", linewidth=0.5)
+        axes.yaxis.set_label_coords(-0.08, 0.5)
+    return f"<figure>{svg(fig, 'Bode diagram of the measured response ' + r['name'])}</figure>"
+
+
+def _errors(r: dict[str, Any]) -> str:
+    rows = []
+    for name, m in r["models"].items():
+        for e in m.get("errors", ()):
+            share = "–" if e["relative"] is None else number(100 * e["relative"], 3)
+            chi2 = e["chi2_per_point"]
+            gain, phase = e["gain_db"], e["phase_deg"]
+            rows.append(
+                [
+                    text(e["channel"]),
+                    text(name),
+                    share,
+                    number(gain["value"], 3),
+                    number(gain["omega"] / (2 * np.pi)),
+                    number(phase["value"], 3),
+                    number(phase["omega"] / (2 * np.pi)),
+                    number(np.sqrt(chi2), 3) if chi2 is not None else "",
+                ]
+            )
+    header = [
+        "channel",
+        "values",
+        "error, %",
+        "gain off by, dB",
+        "at, Hz",
+        "phase off by, degrees",
+        "at, Hz",
+        "error / noise",
+    ]
+    return table(header, rows, words=(0, 1)) if rows else ""
+
+
+SECTION = Section(order=26, title="Measured frequency responses", render=_render)
