@@ -12,6 +12,7 @@ from typing import Any
 
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
+from hvdc_ident.study.plausibility import violations
 from hvdc_ident.study.rest_levels import rest_levels
 from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
 from hvdc_ident.study.steady_notes import steady_notes
@@ -128,6 +129,11 @@ def _written(
     study: Study, wanted: Stage, folder: Path, options: Options, outcome: Outcome, levels: list[dict[str, Any]]
 ) -> Done:
     heading = heading_of(study, options.seed)
+    wrong = [] if outcome.failed else violations(wanted.name, plain(outcome.data))
+    if wrong:
+        outcome = replace(
+            outcome, failed=f"what it found is not plausible, and is kept but no result: {'; '.join(wrong)}"
+        )
     mark = "" if outcome.failed else _mark(study, wanted, folder, options)
     about = {
         "stage": wanted.name,
@@ -137,7 +143,8 @@ def _written(
         "steady_state": steady_notes(study),
     }
     taken = {"options": {n: getattr(options, n) for n in wanted.takes}} if wanted.takes else {}
-    data = plain({**heading, **about, **taken, **outcome.data})
+    implausible = {"implausible": wrong} if wrong else {}
+    data = plain({**heading, **about, **taken, **outcome.data, **implausible})
     for name, text in outcome.files.items():
         write_text(folder / name, text)
     write_text(folder / wanted.file, json_pieces(data))
