@@ -14,6 +14,9 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.unknown import Coordinates, Free
 from hvdc_ident.trajectory import Array
 
+LONGEST = 10.0
+"""A step changes a logarithm by at most this: no parabola holds over four decades, and on a plateau its minimum lies anywhere."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
@@ -91,6 +94,7 @@ def descend(
     """
     space = Coordinates(objective.unknowns)
     low, high = space.bounds
+    longest = np.where(space.log, LONGEST, np.inf)
     x = np.clip(space.scaled(np.asarray(theta, dtype=float)), low, high)
     x[fixed] = space.scaled(np.asarray(theta, dtype=float))[fixed]
     theta = space.unscaled(x)
@@ -99,7 +103,8 @@ def descend(
     while used < max_evaluations and rejected < 12:
         slope = space.slope(theta)
         g, h = here.gradient * slope, here.curvature * np.outer(slope, slope)
-        p = bounded_step(g, h, damping, np.where(fixed, 0.0, low - x), np.where(fixed, 0.0, high - x))
+        back, forth = np.maximum(low - x, -longest), np.minimum(high - x, longest)
+        p = bounded_step(g, h, damping, np.where(fixed, 0.0, back), np.where(fixed, 0.0, forth))
         predicted = -float(g @ p + 0.5 * p @ h @ p)
         if predicted <= enough:
             break

@@ -7,15 +7,17 @@ that descents can be run anywhere, and kept one by one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.objective import Reached
+from hvdc_ident.fit.objective import LONGEST, Reached
 from hvdc_ident.fit.unknown import Coordinates, Free
 from hvdc_ident.trajectory import Array
 
@@ -23,6 +25,9 @@ TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
 ONE_SIDED = 1.353
 """The same for the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+
+BEYOND = 10.0
+"""Without bounds a walk goes on to so many times where a parabola would cross: the typical size is often a guess."""
 
 SideStatus = Literal["closed", "open-at-bound", "not-found"]
 Physical = Mapping[str, tuple[bool, bool]]
@@ -48,7 +53,8 @@ class Walk:
     """How profiles are walked.
 
     tolerance: of the rise at a crossing, as a share of the threshold. points: at most so many a side. steps: of the
-    range between the bounds a step takes at most 1/steps. reach: without bounds, at most so many typical sizes.
+    range between the bounds a step takes at most 1/steps. reach: without bounds, at most so many typical sizes (of a
+    logarithm: so many times the value).
     """
 
     tolerance: float = 1e-3
@@ -101,7 +107,10 @@ class Walker:
         self.fixed = np.arange(len(self.unknowns)) == self.i
         self.x0 = self.space.scaled(self.best.theta)
         self.on_bound = bool(self.x0[self.i] <= self.low[self.i] or self.x0[self.i] >= self.high[self.i])
+        self.reach = math.log(self.walk.reach) if self.unknowns[self.i].log else self.walk.reach
         self.rise = self.threshold * (ONE_SIDED / TWO_SIDED if self.on_bound else 1.0)
+        if not self.unknowns[self.i].log and math.isfinite(self._parabola):
+            self.reach = max(self.reach, BEYOND * self._parabola)
 
     def steps(self) -> Steps[Side]:
         """How the side ended, once every descent asked for was answered; `points` is then what was walked, in order.
@@ -115,7 +124,7 @@ class Walker:
             return Side("open-at-bound", None, "the optimum lies on this bound")
         step, failures = self._first_step(), 0
         goal = np.sqrt(2.0 * self.rise)
-        while len(points) < self.walk.points and abs(x - self.x0[self.i]) < self.walk.reach:
+        while len(points) < self.walk.points and abs(x - self.x0[self.i]) < self.reach:
             ahead = x + direction * min(step, self._largest())
             ahead = float(np.clip(ahead, self.low[self.i], self.high[self.i]))
             try:
@@ -146,17 +155,21 @@ class Walker:
 
     def _first_step(self) -> float:
         """Half the way to where a parabola would cross, in scaled coordinates."""
+        return float(min(0.5 * self._parabola, self._largest(), 10.0))
+
+    @cached_property
+    def _parabola(self) -> float:
+        """How far off a parabola would cross, in scaled coordinates; infinite where it does not rise."""
         slope = self.space.slope(self.best.theta)
         h = self.best.at.curvature * np.outer(slope, slope)
         others = ~self.fixed
         part = h[np.ix_(others, others)]
         bent = h[self.i, self.i] - h[self.i, others] @ np.linalg.lstsq(part, h[others, self.i], rcond=1e-12)[0]
-        parabola = np.sqrt(2.0 * self.rise / bent) if bent > 1e-14 * max(h[self.i, self.i], 1e-300) else np.inf
-        return float(min(0.5 * parabola, self._largest(), 10.0))
+        return float(np.sqrt(2.0 * self.rise / bent)) if bent > 1e-14 * max(h[self.i, self.i], 1e-300) else math.inf
 
     def _largest(self) -> float:
         width = self.high[self.i] - self.low[self.i]
-        return float(width / self.walk.steps) if np.isfinite(width) else np.inf
+        return float(width / self.walk.steps) if np.isfinite(width) else self.reach
 
     def _point(self, near: Reached, value: float) -> Steps[Reached]:
         """The minimum over the others with this one at `value` (scaled), begun on the tangent from a point nearby."""
@@ -168,7 +181,9 @@ class Walker:
         ahead[self.i] = value
         if others.any():
             bend = np.linalg.lstsq(h[np.ix_(others, others)], h[others, self.i], rcond=1e-10)[0]
-            ahead[others] = np.clip(x[others] - bend * (value - x[self.i]), self.low[others], self.high[others])
+            longest = np.where(self.space.log[others], LONGEST, np.inf)
+            moved = np.clip(-bend * (value - x[self.i]), -longest, longest)
+            ahead[others] = np.clip(x[others] + moved, self.low[others], self.high[others])
         enough = 0.1 * self.walk.tolerance * self.rise
         try:
             found = yield Descent(self.space.unscaled(ahead), self.fixed, enough)

@@ -14,6 +14,8 @@ from hvdc_ident.trajectory import Array
 
 LOG_FROM = 10.0
 """From this ratio of bounds on, a positive unknown is scaled by its logarithm."""
+LARGEST_LOG = 345.0
+"""The logarithm of 1e150, whose square is still a float: where no bound keeps a logarithm, this does."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ class Coordinates:
 
     def unscaled(self, x: Array) -> Array:
         """Theta of x, (p,), inside the bounds to the last digit."""
-        theta = np.where(self.log, np.exp(np.where(self.log, x, 0.0)), x * self.span)
+        theta = np.where(self.log, np.exp(np.where(self.log, np.minimum(x, LARGEST_LOG), 0.0)), x * self.span)
         low, high = self._limits
         x_low, x_high = self.bounds
         with np.errstate(invalid="ignore"):

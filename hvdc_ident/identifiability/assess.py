@@ -148,7 +148,7 @@ def _assembled(
         value = held[n][0] if n in held else verdict.value
         if last is not None and not np.isfinite(value):
             value = last.value(n)
-        scale = abs(value) if so_far.free[n].min > 0 else so_far.free[n].span
+        scale = verdicts.scale_of(so_far.free[n], value)[0]
         norm = whole.information.norms[n]
         verdict = replace(verdict.noted(so_far.remark), value=value, scale=scale, sensitivity_norm=norm)
         so_far.found[n] = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict

@@ -95,11 +95,21 @@ def _room(free: Free, value: float) -> float:
     return 0.5 * (value * math.log(free.max / free.min) if free.log else free.max - free.min)
 
 
-def rise_at_ends(optimum: Optimum, i: int, free: Free) -> float | None:
+def range_of(free: Free, value: float, reach: float) -> tuple[float, float]:
+    """The range that a verdict speaks of: the bounds; where there is none, as far from the value as profiles are walked.
+
+    reach: in typical sizes, or times the value, as in `Walk`.
+    """
+    low = free.min if math.isfinite(free.min) else value - reach * free.size
+    high = free.max if math.isfinite(free.max) else value * reach if free.log else value + reach * free.size
+    return low, high
+
+
+def rise_at_ends(optimum: Optimum, i: int, ends: tuple[float, float]) -> float | None:
     """How much the cost rises at the worse end of the range, the others re-fitted; None where an end cannot be run."""
     fixed = np.arange(optimum.theta.size) == i
     rises = []
-    for end in free.drawn:
+    for end in ends:
         theta = optimum.theta.copy()
         theta[i] = end
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,6 +19,7 @@ from hvdc_ident.identifiability.evidence import (
     joint_limits,
     partner,
     physical_bounds,
+    range_of,
     rise_at_ends,
     spreads,
     thresholds,
@@ -58,17 +60,24 @@ def structural(so_far: Findings, structure: Structure) -> None:
 
 
 def insensitive(so_far: Findings, optimum: Optimum) -> Optimum | None:
-    """The optimum without the parameters whose whole range changes nothing, confirmed by refits at both ends."""
+    """The optimum without the parameters whose whole range changes nothing, confirmed by refits at both ends.
+
+    Where there are no bounds any effect shows somewhere: only one without derivative is judged here, the others by profile.
+    """
     matrix, names = optimum.information.matrix, optimum.names
     out: dict[str, str] = {}
     for i, n in enumerate(names):
         limit, free = so_far.thresholds[n], so_far.free[n]
-        if rise_over_range(matrix[i, i] / optimum.slope[i] ** 2, free.span) >= limit:
+        ends = range_of(free, optimum.value(n), so_far.walk.reach)
+        unbounded = not math.isfinite(free.max - free.min)
+        if (unbounded and matrix[i, i] > 0) or rise_over_range(
+            matrix[i, i] / optimum.slope[i] ** 2, ends[1] - ends[0]
+        ) >= limit:
             continue
-        rise = rise_at_ends(optimum, i, free)
+        rise = rise_at_ends(optimum, i, ends)
         if rise is None or rise >= limit:
             continue
-        so_far.judge(verdicts.insensitive(free, rise, limit, so_far.units[n], _still(so_far, n)))
+        so_far.judge(verdicts.insensitive(free, ends, rise, limit, so_far.units[n], _still(so_far, n)))
         out[n] = so_far.found[n].reason
     return so_far.without(optimum, out)
 

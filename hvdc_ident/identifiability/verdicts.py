@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import log10
 from typing import Literal
 
 from hvdc_ident.fit.bootstrap import Bootstrap
@@ -94,9 +94,11 @@ def structural(
     return Verdict(name, "structurally-unidentifiable", text, float("nan"), unit, conditional_on=tuple(conditional_on))
 
 
-def insensitive(free: Free, rise: float, threshold: float, unit: str, also: str = "") -> Verdict:
+def insensitive(
+    free: Free, ends: tuple[float, float], rise: float, threshold: float, unit: str, also: str = ""
+) -> Verdict:
     """Its whole range moves the outputs by less than noise may. rise: of the cost at the worse end. also: a remark."""
-    span = f"Anywhere between {free.min:.4g} and {_with_unit(free.max, unit)}"
+    span = f"Anywhere between {ends[0]:.4g} and {_with_unit(ends[1], unit)}"
     told = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
     return Verdict(free.name, "insensitive", f"{span} {told}{why}. {also}".rstrip(), free.given, unit)
@@ -154,12 +156,17 @@ def closed(
     low, high = profile.ci95
     assert low is not None and high is not None
     half = 0.5 * (high - low)
-    share, of = (half / abs(profile.value), "of its value") if free.min > 0 else (half / free.span, "of its range")
+    scale, of = scale_of(free, profile.value)
+    share = half / scale if scale > 0 else math.inf
     judged = Verdict(profile.name, "weak", "", profile.value, unit, (low, high), profile=profile)
     judged = replace(judged, collinearity=collinearity, partner=partner)
     span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
     if share > WIDE or collinearity > COLLINEAR:
-        told = f"It is known only to lie in {span}, ±{100 * share:.3g} % {of}"
+        told = f"It is known only to lie in {span}"
+        if share <= 1.0 or math.isfinite(free.max - free.min) or free.min > 0:
+            told += f", ±{100 * share:.3g} % {of}"
+        else:
+            told += ", either side of its own value; it has no bounds, and its card no scale, to compare that with"
         if collinearity > COLLINEAR:
             told += f", and {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
         return replace(judged, reason=f"{told}.")
@@ -168,6 +175,19 @@ def closed(
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
     relative = std / abs(profile.value) if profile.value else None
     return replace(judged, verdict="identifiable", reason=f"{text}.", std=std, relative_std=relative)
+
+
+def scale_of(free: Free, value: float) -> tuple[float, str]:
+    """What a width is compared with, in the parameter's unit, and what that is in words.
+
+    The value where it is positive by its bounds, else the range; without bounds the value too, or the card's typical size
+    where that is more. Never the start, which is the user's guess and would make the verdict one.
+    """
+    if free.min > 0:
+        return abs(value), "of its value"
+    if math.isfinite(free.max - free.min):
+        return free.max - free.min, "of its range"
+    return (free.scale, "of its typical size") if free.scale > abs(value) else (abs(value), "of its value")
 
 
 def local(judged: Verdict, others: Sequence[float], rise: float) -> Verdict:
@@ -191,7 +211,7 @@ def _digits(value: float, half: float) -> str:
     """The value with as many digits as its half-width has meaning for."""
     if half <= 0 or not value:
         return f"{value:.6g}"
-    return f"{value:.{max(2, min(12, int(log10(abs(value) / half)) + 3))}g}"
+    return f"{value:.{max(2, min(12, int(math.log10(abs(value) / half)) + 3))}g}"
 
 
 def _with_unit(value: float, unit: str) -> str:
