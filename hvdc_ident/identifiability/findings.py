@@ -56,7 +56,8 @@ class Findings:
     def without(self, optimum: Optimum, out: Mapping[str, str]) -> Optimum | None:
         """The optimum with those held at their given values, with their reasons; None where nothing is left.
 
-        Where the model cannot be run so, they are held at their values at the optimum, and their reasons say it.
+        Where the model cannot be run so, or the records exclude it (the cost rises beyond a threshold, the others re-fitted),
+        they are held at their values at the optimum, and their reasons say it: the others would answer for a wrong value.
         """
         if not out:
             return optimum
@@ -64,11 +65,14 @@ class Findings:
         if len(out) == len(optimum.names):
             return None
         fewer = optimum.held(out, {n: self.free[n].given for n in out})
+        why = "the model cannot be run"
+        if fewer.cost - optimum.cost > min(self.thresholds[n] for n in out):
+            fewer = optimum.held(out, {n: optimum.value(n) for n in out})
+            why = "the records cannot be met"
         for n in out:
-            value = fewer.problem.held[n]
+            value, unit = fewer.problem.held[n], f" {self.units[n]}" if self.units[n] else ""
             if value != self.free[n].given:
-                unit = f" {self.units[n]}" if self.units[n] else ""
-                remark = f"It is held at {value:.4g}{unit}: at its given value, {self.free[n].given:.4g}, the model cannot be run."
+                remark = f"It is held at {value:.4g}{unit}: at its given value, {self.free[n].given:.4g}{unit}, {why}."
                 self.held_at[n] = value
                 self.held[n] = f"{self.held[n]} {remark}"
                 self.found[n] = self.found[n].noted(remark)

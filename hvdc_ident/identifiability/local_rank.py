@@ -14,12 +14,15 @@ import numpy as np
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import sensitivity_error
+from hvdc_ident.fit.starts import latin_hypercube
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, held_of
 from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR, null_directions
 from hvdc_ident.trajectory import Array
 
 METHOD = "numerical, local"
 POINTS = 5
+WIDE = 8
+"""Of so many points one lies in each eighth of every parameter's range."""
 INSIDE = (0.2, 0.8)
 """Share of the bounds that the points are drawn from: at a bound a parameter may do nothing that does else."""
 
@@ -41,19 +44,21 @@ class LocalRank:
     moving: tuple[str, ...] = ()
 
 
-def local_rank(problem: Problem, seed: int = 0) -> LocalRank:
+def local_rank(problem: Problem, seed: int = 0, *, wide: bool = False) -> LocalRank:
     """The rank of the whitened sensitivities of the problem's experiments, at the start and five random points in the bounds.
 
-    Points that cannot be simulated are passed over; the random ones are counted in the note.
+    wide: whether to look for other regimes too, at a Latin hypercube of points up to the bounds. Points that cannot be
+    simulated are passed over; those of the five are counted in the note.
     """
     names = tuple(f.name for f in problem.free)
     error = sensitivity_error(problem.simulator)
     stacked, failures = [], []
-    for k, theta in enumerate([problem.start, *_points(problem, seed)]):
+    others = latin_hypercube(problem.unknowns, (), WIDE, seed) if wide else []
+    for k, theta in enumerate([*_points(problem, seed), problem.start, *others]):
         try:
             _, jacobian = problem.residual(theta)
         except SimulationError as e:
-            failures += [e.what] if k else []
+            failures += [e.what] if k < POINTS else []
             continue
         stacked.append(jacobian * _slope(problem, theta))
     note = _note(failures, error)

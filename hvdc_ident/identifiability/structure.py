@@ -79,9 +79,12 @@ def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure
         return _by_numbers(numbers, result.reason)
     if result.status != "decided":
         return _undecided(numbers, result.reason)
+    switched = _behind_switches(model, outputs) if result.combinations else set()
+    if switched:
+        numbers = numerical_structure(problem, seed, wide=True)
     alone = [c.members[0] for c in result.combinations if len(c.members) == 1]
     hidden = _hidden(model, [n for n in alone if n not in numbers.moving], names, outputs, seed)
-    hidden -= _behind_switches(model, outputs)
+    hidden -= switched
     together, told = _confirmed([c for c in result.combinations if len(c.members) > 1], numbers)
     kept = {*identifiable_subset(result), *alone, *told}
     note = ""
@@ -174,9 +177,12 @@ def _undecided(numbers: Structure, why: str) -> Structure:
     return replace(numbers, status="not decided", note=note)
 
 
-def numerical_structure(problem: Problem, seed: int = 0) -> Structure:
-    """The structure from the rank of the sensitivities at random points, for anything that can be simulated: local."""
-    found = local_rank(problem, seed)
+def numerical_structure(problem: Problem, seed: int = 0, *, wide: bool = False) -> Structure:
+    """The structure from the rank of the sensitivities at random points, for anything that can be simulated: local.
+
+    wide: whether to look for other regimes too, up to the bounds.
+    """
+    found = local_rank(problem, seed, wide=wide)
     names = tuple(f.name for f in problem.free)
     if not found.points:
         return Structure("not decided", METHOD, names, note="no random point could be simulated")

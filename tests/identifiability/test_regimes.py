@@ -83,3 +83,12 @@ def test_a_level_that_no_record_reaches_is_left_to_the_data(high) -> None:
     assert report.parameters["top"].verdict == "insensitive"
     assert "However good" not in report.parameters["top"].reason
     assert report.structure.unidentifiable == ()
+
+
+def test_a_regime_far_from_the_start_counts() -> None:
+    """The limiter acts for the largest fifth of k alone, where the record lies; elsewhere only g*k shows."""
+    model = behind_an_integrator("stage", "g*clip(k*u, -8, 8)", k=0.2, g=1.0)
+    data = record(0.3 * np.clip(3.2 * U, -8, 8), rate=RATE)
+    report = judged(model, data, k=(0.2, 0.1, 4.0), g=(4.0, 0.25, 4.0))
+    assert {n: v.verdict for n, v in report.parameters.items()} == {"k": "identifiable", "g": "identifiable"}
+    assert report.parameters["k"].value == pytest.approx(3.2, rel=5e-3)

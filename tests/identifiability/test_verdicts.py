@@ -94,7 +94,18 @@ def test_practically_unidentifiable_where_the_profile_stays_open() -> None:
     report = identifiability(plant, [measured(plant, {"a": 2, "k": 60}, 0.02, t=t)], free, starts=3)
     k = report.parameters["k"]
     assert k.verdict == "practically-unidentifiable" and "from above" in k.reason and k.ci95[1] is None
-    assert report.identifiable == ("a",) and report.held["k"][0] == 10.0
+    assert report.identifiable == ("a",) and not report.misspecification.flag
+    assert k.ci95[0] > 10.0, "its start is excluded: held there, a would answer for it"
+    assert report.held["k"][0] > k.ci95[0] and "at its given value, 10, the records cannot be met" in k.reason
+
+
+def test_practically_unidentifiable_from_a_start_that_the_data_admit_is_held_there() -> None:
+    plant = closed(saturating, a=1.0, k=20.0)
+    t = np.linspace(0.2, 1.0, 41)
+    free = [Free("a", 1, 0.1, 10), Free("k", 250, 1, 1000)]
+    report = identifiability(plant, [measured(plant, {"a": 2, "k": 60}, 0.02, t=t)], free, starts=3)
+    assert report.parameters["k"].verdict == "practically-unidentifiable"
+    assert report.identifiable == ("a",) and report.held["k"][0] == 250.0
 
 
 def test_weak_is_fitted_but_has_no_std() -> None:
