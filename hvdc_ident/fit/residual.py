@@ -230,7 +230,7 @@ def residual_blocks(
             both[:, 1:] = per_deviation(slopes, weight, record.profile)
             if not np.abs(both).max(initial=0.0) < LARGEST:
                 raise SimulationError(
-                    f"output '{output}' or its sensitivity is too large to be squared",
+                    f"output '{output}' or its sensitivity grows beyond all bounds",
                     where=f"experiment '{experiment.name}'",
                     expected=f"below {LARGEST:g} standard deviations",
                 )
