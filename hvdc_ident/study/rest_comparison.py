@@ -155,6 +155,8 @@ def apart(a: float, b: float, zero: float) -> float:
 
 def _movement(record: Record, simulated: Array) -> Movement | None:
     """None where the record shows nothing but noise, or the model stands still."""
+    if not record.after.any():
+        return None
     base = record.before if record.before.any() else record.after
     v = record.values[record.after] - record.values[base].mean()
     w = simulated[record.after] - simulated[base].mean()

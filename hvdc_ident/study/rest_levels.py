@@ -118,7 +118,7 @@ def compare_rest(model: AnyModel, experiments: Sequence[Experiment], candidates:
     remarks: list[str] = []
     failures: list[str] = []
     comparisons: list[Comparison] = []
-    for e in (e for e in experiments if e.measured is not None):
+    for e in (e for e in experiments if e.outputs):
         records = [Record.of(e, o, model.outputs[o].unit, experiments) for o in e.outputs]
         levels |= {(e.name, r.output): _recorded(r) for r in records}
         if not records[0].before.any():

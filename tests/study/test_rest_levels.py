@@ -178,6 +178,15 @@ def test_a_record_without_rows_before_its_event_says_so(tmp_path: Path) -> None:
     assert "its event is not known" in free.remarks[0]
 
 
+def test_rows_that_are_not_recorded_are_left_out(tmp_path: Path) -> None:
+    e = record(-1.0)
+    assert e.measured is not None
+    y = np.where(np.arange(TIME.size) % 3 == 0, np.nan, e.measured["y"])
+    assert "sign?" in only(compare_rest(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES))
+    nothing = e.with_(measured=trajectory(TIME, {"y": np.full(TIME.size, np.nan)}))
+    assert compare_rest(card(tmp_path), [nothing], CANDIDATES).lines == []
+
+
 def test_a_model_without_a_rest_is_reported_with_its_reason(tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text(
         'schema = 1\nname = "m"\n[inputs]\nu = {value = 1.0}\n'
