@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -230,15 +230,7 @@ def _check_questions(study: Study, where: str) -> None:
         _all_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
         check_linear(study, where)
     for line in s.sweep:
-        tie = s.parameters[line.parameter].tie if line.parameter in s.parameters else None
-        if tie is not None:
-            raise StudyError(
-                f"'{line.parameter}' follows other parameters and cannot be swept",
-                where=f"{where}, sweep",
-                expected="a parameter without a tie",
-                got=f"tie = {tie!r}",
-                hint="sweep one that it follows, or leave the tie out",
-            )
+        _free_line(line.parameter, s.parameters, f"{where}, sweep", own=True)
         _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
     if s.sweep:
@@ -246,12 +238,12 @@ def _check_questions(study: Study, where: str) -> None:
 
         axes_of(s.sweep, 0, f"{where}, sweep")
     if s.screening:
-        _all_known("candidate", s.screening.parameters, study.candidates, f"{where}, screening.parameters")
+        _all_candidates(s.screening.parameters, study, f"{where}, screening.parameters")
     if s.identifiability:
-        _all_known("candidate", s.identifiability.pair, study.candidates, f"{where}, identifiability.pair")
+        _all_candidates(s.identifiability.pair, study, f"{where}, identifiability.pair")
     for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
         place = f"{where}, fit.groups number {number}"
-        _all_known("candidate", group.parameters, study.candidates, f"{place}.parameters")
+        _all_candidates(group.parameters, study, f"{place}.parameters")
         _all_known("measured output", group.outputs, measured, f"{place}.outputs")
         _all_known(
             "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
@@ -291,6 +283,29 @@ def _check_sweep(line: schema.Sweep, model: AnyModel, where: str) -> None:
                 expected=f"values in [{own.min:g}, {own.max:g}]",
                 got=f"{value:g}",
             )
+
+
+def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> None:
+    """Raise where a name is no candidate, with the reason where it stands in [parameters] all the same."""
+    for name in names or ():
+        _free_line(name, study.settings.parameters, where)
+        _all_known("candidate", [name], study.candidates, where)
+
+
+def _free_line(name: str, lines: Mapping[str, schema.Candidate], where: str, *, own: bool = False) -> None:
+    """Raise StudyError for a parameter that follows others by its tie or, unless `own`, has a value in each experiment."""
+    line = lines.get(name)
+    if line is not None and line.tie is not None:
+        what, why = "follows other parameters", f"tie = {line.tie!r}"
+        hint = "name one that it follows, or leave the tie out"
+    elif line is not None and line.per_experiment and not own:
+        what, why = "has a value in each experiment", "per-experiment = true"
+        hint = "leave that out for one value in all experiments"
+    else:
+        return
+    raise StudyError(
+        f"'{name}' {what}", where=where, expected="a parameter with one value of its own", got=why, hint=hint
+    )
 
 
 def _all_known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str) -> None:

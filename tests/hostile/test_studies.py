@@ -113,6 +113,17 @@ CASES = {
     "name that leaves the folder": Case(("files are named after it",), _replace('"d"', '"../d"')),
     "unknown optimiser": Case(("optimiser 'trust'", "trust-region"), _append('[fit]\noptimiser = "trust"\n')),
     "individual without groups": Case(("groups",), _append('[fit]\nmode = "individual"\n')),
+    "a tied parameter swept": Case(
+        ("'KIQ' follows other parameters", "tie = 'KIP'", "sweep"),
+        lambda s: s.replace("[[exp", 'KIQ = {tie = "KIP"}\n[[exp') + '[[sweep]]\nparameter = "KIQ"\nvalues = [3.0]\n',
+    ),
+    "a group of what each experiment has for itself": Case(
+        ("'KPP' has a value in each experiment", "per-experiment = true", "fit.groups number 1"),
+        lambda s: (
+            s.replace("[[exp", "KPP = {start = 1.5, per-experiment = true}\n[[exp")
+            + '[fit]\nmode = "individual"\ngroups = [{parameters = ["KPP"]}]\n'
+        ),
+    ),
     "not toml": Case(("TOML", "line"), _append("\n[[[")),
     "toml nested for ever": Case(("TOML",), _append("x = " + "[" * 5000)),
     "study not text": Case(("UTF-8",), lambda s: s.encode() + b"\xff\xfe\x00"),
