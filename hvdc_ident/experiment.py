@@ -191,7 +191,9 @@ def recording_lines(recording: Mapping[str, Any]) -> list[str]:
     if recording["time_column"]:
         lines.append(f"the time is column '{recording['time_column']}'")
     unit = recording["time_unit"]
-    if unit and unit not in ("s", "date"):
+    if not unit:
+        lines.append("the file does not say the unit of its time: taken as s")
+    elif unit not in ("s", "date"):
         lines.append(f"time in {unit}, converted to s")
     elif unit == "date":
         lines.append("dates, counted in s from the first row")

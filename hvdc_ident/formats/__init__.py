@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.errors import InputError, WaveformError, unknown_name
 from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.units import scaled
 
 __all__ = [
     "MAX_BYTES",
@@ -46,6 +47,9 @@ FORMULA_START = re.compile(r"'*[=+\-@\t\r]")
 """A text a spreadsheet would run as a formula, with any apostrophes already put before it."""
 
 _WRITTEN_AT_ONCE = 20_000  # rows
+LONGEST = 1e8
+"""Seconds beyond which a time is a date, counted since 1970."""
+_YEAR_2100 = 4.1e9  # s since 1970
 
 
 class Format(Protocol):
@@ -109,7 +113,22 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     wanted = [signals] if isinstance(signals, str) else None if signals is None else list(signals)
     found = _format_of(file).read(file, wanted)
     _check(found, file)
-    return found if found.origin.rows else replace(found, origin=replace(found.origin, rows=len(found)))
+    found = found if found.origin.rows else replace(found, origin=replace(found.origin, rows=len(found)))
+    return _from_first_row(found)
+
+
+def _from_first_row(found: Trajectory) -> Trajectory:
+    """The waveforms with a time since 1970 counted from the first row; others as they are.
+
+    Three years are no record's own clock. Where the file states no unit it is the largest of s, ms, us and ns that puts
+    the first row before 2100.
+    """
+    first = float(found.time[0])
+    if first < LONGEST:
+        return found
+    scale = 1.0 if found.origin.time_unit else next((s for s in (1.0, 1e-3, 1e-6) if first * s < _YEAR_2100), 1e-9)
+    time = scaled(found.time - first, scale)
+    return replace(found, time=time, origin=replace(found.origin, time_unit="date"))
 
 
 def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:

@@ -23,7 +23,7 @@ import numpy as np
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
 from hvdc_ident.formats._columns import check_size, damaged, own_names, package
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "comtrade"
 SUMMARY = "COMTRADE 1991, 1999 and 2013 of recorders and relays, ASCII, binary, float32, or all in one .cff"
@@ -90,7 +90,8 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         for i in wanted
     ]
     values = np.column_stack([np.asarray(c, dtype=float) for c in columns]) if columns else np.empty((rows, 0))
-    return Trajectory(time, values, tuple(record.names[i] for i in wanted), tuple(record.units[i] for i in wanted))
+    names, units = tuple(record.names[i] for i in wanted), tuple(record.units[i] for i in wanted)
+    return Trajectory(time, values, names, units, Origin(time_unit="s"))
 
 
 def files(path: Path) -> list[Path]:

@@ -15,14 +15,14 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import event_rows, once, pick
+from hvdc_ident.formats import LONGEST, event_rows, once, pick
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
 from hvdc_ident.formats._labels import merged, names_and_units, time_column
 from hvdc_ident.trajectory import Array, Origin, Trajectory
@@ -43,6 +43,7 @@ _MISSING = {
     "1.#ind", "-1.#ind", "--", "---",
 }  # fmt: skip
 """What stands, in lower case, in cells of what was not recorded: as pandas reads it, and Excel's words."""
+_QUOTED_COMMA = re.compile(r'(?:^|,)\s*"[^",]*,[^"]*"\s*(?:,|$)')
 _EMPTY = ' \t,;"\r\n'
 _DIRECTIVE = re.compile(r'"?sep=."?', re.IGNORECASE)
 _TOP = 40  # lines within which the numbers begin
@@ -114,7 +115,10 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
     unit = "date" if layout.absolute else layout.units[layout.time]
     origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "")
-    time = scaled(table[:, 0], layout.scale)
+    time, first = table[:, 0], table[0, 0] * layout.scale
+    if unit and first >= LONGEST:  # since 1970: taken off before the unit is, for a double has no digits to lose there
+        time, origin = time - time[0], replace(origin, time_unit="date")
+    time = scaled(time, layout.scale)
     return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
 
 
@@ -348,6 +352,8 @@ def _rows(layout: _Layout) -> Iterator[str]:
             if void:
                 raise ValueError("a row of nothing but separators")
             if '"' in line:
+                if separator == "," and _QUOTED_COMMA.search(line):
+                    raise ValueError("decimal commas in quotes")
                 line = line.replace('"', "")
             if layout.trailing:
                 line = line.rstrip(" \r\n")
@@ -386,9 +392,10 @@ def _careful(layout: _Layout, columns: list[int]) -> Array:
                 dated = f"{cells[layout.date]} {cell}" if layout.date >= 0 else cell
                 row.append(_clock_time(clock, dated, layout, number))
                 continue
-            if layout.separator != ",":
+            if layout.separator != "," or "," in cell:
                 comma_line, point_line = comma_line or number * ("," in cell), point_line or number * ("." in cell)
-                cell = cell.replace(",", ".", 1)
+                if "," in cell and "." not in cell:
+                    cell = cell.replace(",", ".", 1)
             row.append(_number(cell, layout, number, i))
         if comma_line and point_line:
             raise WaveformError(
@@ -416,6 +423,8 @@ def _clock_time(clock: Clock, cell: str, layout: _Layout, line: int) -> float:
 
 def _cells(line: str, layout: _Layout) -> list[str]:
     cells = line.split(layout.separator)
+    if layout.separator == "," and _QUOTED_COMMA.search(line):
+        (cells,) = csv.reader([line], skipinitialspace=True)
     if layout.trailing and len(cells) == len(layout.labels) + 1 and not cells[-1].strip():
         cells.pop()
     return [cell.strip().strip('"').strip() for cell in cells]
@@ -446,7 +455,9 @@ def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
         where=f"{layout.path}, line {line}, {layout.column(column)}",
         expected="a finite number" + ("" if column == layout.time else ", or an empty cell where nothing was recorded"),
         got=f"'{_short(cell)}'",
-        hint="take out the row, or the column if it is not needed",
+        hint="write numbers without separators of thousands"
+        if "," in cell and "." in cell
+        else "take out the row, or the column if it is not needed",
     )
 
 

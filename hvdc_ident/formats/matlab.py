@@ -193,15 +193,14 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
     time = structure.get("time")
     listed = structure.get("signals")
     if not _numeric(time):
-        numeric = {k: np.asarray(v, dtype=float) for k, v in structure.items() if _numeric(v)}
-        other = time_name(list(numeric))
+        numeric = _flat(structure)
+        other = time_name([k for k in numeric if "." not in k])
         if other is not None:
             yield _beside(other, numeric, path, prefix=f"{name}.")
         return
     clock = np.atleast_1d(np.asarray(time, dtype=float))
     if listed is None:
-        numeric = {k: np.asarray(v, dtype=float) for k, v in structure.items() if _numeric(v)}
-        yield _beside("time", numeric, path, prefix=f"{name}.")
+        yield _beside("time", _flat(structure), path, prefix=f"{name}.")
         return
     columns: dict[str, Array] = {}
     for i, signal in enumerate(_list(listed)):
@@ -212,6 +211,17 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         _add(columns, shown, np.asarray(signal["values"], dtype=float), clock.size)
     if columns:
         yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+
+
+def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, Array]:
+    """The arrays of numbers in a structure and the structures inside it, those under `inner.name`."""
+    found: dict[str, Array] = {}
+    for key, value in structure.items():
+        if _numeric(value):
+            found[prefix + key] = np.asarray(value, dtype=float)
+        elif isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{key}.")
+    return found
 
 
 def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = "") -> Trajectory:

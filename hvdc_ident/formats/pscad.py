@@ -22,7 +22,7 @@ from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "pscad"
 SUMMARY = "PSCAD output: the .inf, with its numbered .out files beside it"
-SUFFIXES = (".inf",)
+SUFFIXES = (".inf", ".out")
 
 _PER_FILE = 10
 _MAX_HEADER = 32 * 1024**2  # bytes
@@ -39,16 +39,16 @@ class _Channel:
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is an .inf with a channel line."""
-    if path.suffix.lower() not in SUFFIXES:
+    """Whether it is an .inf with a channel line, or an .out of such a run."""
+    if path.suffix.lower() not in SUFFIXES or not _inf(path).is_file():
         return False
-    with open(path, "rb") as file:
+    with open(_inf(path), "rb") as file:
         return _CHANNEL.search(file.read(65536).decode("latin-1")) is not None
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
-    """Name and unit of every channel; a name that stands twice carries its group, then a number."""
-    return [(c.name, c.unit) for c in _channels(path)]
+    """Name and unit of every channel of the run; a name that stands twice carries its group, then a number."""
+    return [(c.name, c.unit) for c in _channels(_inf(path))]
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
@@ -57,6 +57,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     Only the files with wanted channels are opened. An instant with more than two rows keeps its first and last.
     Raises WaveformError for a file that is missing, cut off, or has another time than the first.
     """
+    path = _inf(path)
     channels = _channels(path)
     wanted = [channels[i] for i in pick(path, signals, [c.name for c in channels])]
     tables: dict[int, Array] = {}
@@ -80,10 +81,21 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 
 
 def files(path: Path) -> list[Path]:
-    """The .out files of the channels that are there."""
+    """The .inf, and the .out files of the channels that are there."""
+    path = _inf(path)
     numbers = sorted({(c.number - 1) // _PER_FILE + 1 for c in _channels(path)})
     found = (_there(path, number) for number in numbers)
-    return [file for file in found if file is not None]
+    return [path, *(file for file in found if file is not None)]
+
+
+def _inf(path: Path) -> Path:
+    """The .inf of a run, from itself or one of its .out files: `run_01.out`, `run.out`."""
+    if path.suffix.lower() != ".out":
+        return path
+    stem = re.sub(r"_\d{2,}$", "", path.stem)
+    return next(
+        (p for end in (".inf", ".INF") if (p := path.with_name(stem + end)).is_file()), path.with_name(f"{stem}.inf")
+    )
 
 
 def sample(path: Path) -> None:
@@ -101,6 +113,13 @@ def sample(path: Path) -> None:
 
 
 def _channels(path: Path) -> list[_Channel]:
+    if not path.is_file():
+        raise WaveformError(
+            "the list of channels is missing",
+            where=str(path),
+            expected="the .inf that PSCAD writes beside the .out files of a run",
+            hint="copy it too; an .out of PSS/E is another format: export it as CSV",
+        )
     if path.stat().st_size > _MAX_HEADER:
         raise damaged(path, "the list of channels is too long", expected=f"at most {_MAX_HEADER >> 20} MiB")
     found = {}

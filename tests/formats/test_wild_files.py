@@ -33,6 +33,15 @@ STYLES = {
     "dates in a column of their own": (
         "Datum;Uhrzeit;U [kV];P [MW]\n30.11.2026;23:59:59,75;1,5;-2\n01.12.2026;00:00:00,25;0,001;4\n", "utf-8",
     ),
+    "decimal commas in quotes": ('"Zeit [s]","U [kV]","P [MW]"\n"0","1,5","-2"\n"0,5","0,001","4"\n', "cp1252"),
+    "oscilloscope": (
+        "Model,DPO4054\nSample Interval,0.5\n\nTIME [s],U [kV],P [MW]\n0.0,1.5,-2\n5.0e-01,1e-3,4\n", "utf-8",
+    ),
+    "seconds since 1970": ("timestamp,U [kV],P [MW]\n1732440000.25,1.5,-2\n1732440000.75,1e-3,4\n", "utf-8"),
+    "milliseconds since 1970": ("timestamp,U [kV],P [MW]\n1732440000250,1.5,-2\n1732440000750,1e-3,4\n", "utf-8"),
+    "microseconds since 1970": (
+        "timestamp [us],U [kV],P [MW]\n1732440000250000,1.5,-2\n1732440000750000,1e-3,4\n", "utf-8",
+    ),
     "blanks at the end": ("time[s], U[kV], P[MW],\n0, 1.5, -2,\n0.5, 1e-3, 4,\n\n", "utf-8"),
 }  # fmt: skip
 
@@ -211,3 +220,29 @@ def test_comtrade_of_three_editions(tmp_path: Path, revision: str) -> None:
     np.testing.assert_allclose(found["U"], [110.0, np.nan, 109.8])
     np.testing.assert_array_equal(found["P"], [5.0, 6.0, 7.0])
     np.testing.assert_array_equal(found.time, [0.0, 0.001, 0.002])
+
+
+def test_times_since_1970_count_from_the_first_row(tmp_path: Path) -> None:
+    found = read_waveforms(put(tmp_path, "timestamp,a\n1732440000.00,1\n1732440000.02,1\n"))
+    assert found.time[0] == 0.0 and found.time[1] == pytest.approx(
+        0.02, abs=2.0**-22
+    )  # half the spacing of doubles there
+    assert found.origin.time_unit == "date"
+    plain = read_waveforms(put(tmp_path, "time,a\n50000,1\n50001,1\n"))  # half a day: a clock of its own
+    assert plain.time.tolist() == [50000.0, 50001.0] and plain.origin.time_unit == ""
+
+
+def test_an_out_file_finds_its_run(tmp_path: Path) -> None:
+    formats()["pscad"].sample(tmp_path / "run.inf")
+    whole, part = read_waveforms(tmp_path / "run.inf"), read_waveforms(tmp_path / "run_01.out")
+    assert part.names == whole.names and np.array_equal(part.values, whole.values)
+    assert {f.name for f in files_of(tmp_path / "run_02.out")} == {"run.inf", "run_01.out", "run_02.out"}
+    (tmp_path / "run.inf").unlink()
+    with pytest.raises(WaveformError, match="the list of channels is missing"):
+        read_waveforms(tmp_path / "run_01.out")
+
+
+def test_structures_inside_a_structure(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "x.mat", {"log": {"t": TIME, "grid": {"U": SIGNALS[:, 0], "P": SIGNALS[:, 1]}}})
+    found = read_waveforms(tmp_path / "x.mat")
+    assert found.names == ("log.grid.U", "log.grid.P") and np.array_equal(found.values, SIGNALS)
