@@ -290,6 +290,8 @@ class Equilibria:
                 _, jac, by_share = equations(v, 0.0)
                 slope = np.asarray(np.linalg.solve(jac, -by_share), dtype=np.float64)
                 length = float(np.linalg.norm(slope / extent))
+                if length == 0.0:  # what the way does not move does not turn on it: a jump ended it
+                    return False
                 for part in (1.0, 0.5, 0.25):
                     reached = self._bordered(equations, v, slope, extent, length, 8.0 * part * length * SHORTEST)
                     if reached is not None:

@@ -18,6 +18,8 @@ from plants import Plant, Seeded, recorded
 
 NUMBERS = (16, 36)
 """Studies that go through every command within a few seconds."""
+ONCE = ((64, "identify"),)
+"""Studies of which one command had ended in a traceback: a rest that no value moves, beside a jump."""
 QUICK = ("check", "simulate", "export .toml", "export .mo", "export .ssv")
 
 
@@ -41,6 +43,12 @@ def test_every_command_ends_well_or_with_a_reason(number: int, tmp_path: Path) -
     assert [(e.command, e.bug) for e in ends if e.bug] == []
     assert ends[0].code == 0, ends[0].said
     assert generated.spoilt_results(study) == []
+
+
+@pytest.mark.parametrize(("number", "command"), ONCE)
+def test_what_had_ended_in_a_traceback_does_not(number: int, command: str, tmp_path: Path) -> None:
+    end = generated.run(generated.write_study(Seeded(np.random.default_rng([37, number])), tmp_path), command)
+    assert (end.code, end.bug) == (0, ""), end.said
 
 
 @settings(max_examples=8, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
