@@ -46,12 +46,12 @@ def fit_individually(
     """The fits of the groups, one after the other, as one result.
 
     While one group is fitted the other free parameters are held: at their estimate if their turn has been, else at
-    their start. Every estimate is conditional on those. The status is the worst of the groups'; cost, RMSE and tests
-    are those of the whole problem with all estimates put in. A group that fails leaves its parameters at their start.
+    their given value. Every estimate is conditional on those. The status is the worst of the groups'; cost, RMSE and tests
+    are those of the whole problem with all estimates put in. A group that fails leaves its parameters there.
     Raises StudyError or UnknownNameError for groups that do not fit the problem.
     """
     _check(problem, groups)
-    current = {f.name: f.start for f in problem.free}
+    current = {f.name: f.given for f in problem.free}
     results = []
     for group in groups:
         result = fit(

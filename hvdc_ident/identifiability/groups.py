@@ -33,7 +33,7 @@ def identifiability_by_group(
     """What each group's outputs and experiments tell about its parameters while the others are held, as one report.
 
     The groups follow each other as in the fit: a later one holds what the earlier ones found, and those to come at their
-    start. Every verdict is its group's; the others' values are taken as known in it, and a note says so. Other arguments
+    given value. Every verdict is its group's; the others' values are taken as known in it, and a note says so. Other arguments
     as in `identifiability`. Raises StudyError where a candidate stands in no group, or in two.
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
@@ -43,7 +43,7 @@ def identifiability_by_group(
     if sorted(listed) != sorted(names):
         expected, got = ", ".join(names), ", ".join(listed)
         raise StudyError("groups must hold every candidate once", where="fit groups", expected=expected, got=got)
-    current = {f.name: f.start for f in problem.free}
+    current = {f.name: f.given for f in problem.free}
     reports = []
     for group in groups:
         part = part_of(problem, group, current)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from hvdc_ident.effects import effects
@@ -168,7 +168,10 @@ class Diagnosis:
 
     @property
     def files(self) -> dict[str, str]:
-        """The augmented model's card by its file name; empty where nothing was put in, or the model has no card (an FMU)."""
+        """The augmented model's card by its file name; empty where nothing was put in, or the model has no card (an FMU).
+
+        Its description says that the values are the fitted ones, and which were given.
+        """
         from hvdc_ident.model import Model, write_card
         from hvdc_ident.simulate.steady_state import with_guesses
 
@@ -178,7 +181,10 @@ class Diagnosis:
             card = with_guesses(self.augmented)
         except SteadyStateError:  # at inputs that only its experiments give it
             card = self.augmented
-        return {AUGMENTED: write_card(card)}
+        given = ", ".join(f"{n} {v:.6g}" for n, v in self.parameters_before.items())
+        about = (self.augmented.description or self.augmented.name).rstrip(". ")
+        about += f"; fitted values, with what was added to the model; given were {given}"
+        return {AUGMENTED: write_card(replace(card, description=about))}
 
     def plot(self) -> Figure:
         """The gap before and after by output, and the best candidates."""

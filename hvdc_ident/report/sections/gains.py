@@ -118,7 +118,7 @@ def _row(name: str, line: dict[str, Any], fit: dict[str, Any]) -> list[str]:
     if estimate.get("method") == "one-sided":
         notes.append("on a bound, one-sided interval")
     if estimate.get("conditional_on"):
-        notes.append(f"given {', '.join(map(str, estimate['conditional_on']))}")
+        notes.append(f"with {', '.join(map(str, estimate['conditional_on']))} as held")
     if estimate.get("reason"):
         notes.append(str(estimate["reason"]))
     bounds = f"{_end(line.get('min'), '−∞')} … {_end(line.get('max'), '∞')}"
