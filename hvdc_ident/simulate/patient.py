@@ -16,6 +16,9 @@ from hvdc_ident.simulate.rest import REST_JAC, residual
 from hvdc_ident.simulate.structure import ACCURACY, TINY
 
 EPSILON = float(np.finfo(float).eps)
+NEAR = (
+    0.1  # radians, or of a value above 1: how far a step across a limit may lead; a sine is its tangent to 0.2 % there
+)
 SHORTEST = 2.0**-16  # of a path: a step that has to be shorter means that the path ends
 
 
@@ -113,9 +116,10 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
 
         ends_p (2, parameters), ends_w (2, 1 + inputs): the values, time first. sign: of the determinant at the start.
 
-        A step counts where undamped Newton corrections at least halve (`rest` says why; across a limit, where the
-        equations have a corner, no such ratio holds), the determinant keeps its sign, which a fold changes, and the way
-        is no longer than the two slopes at its ends allow: a jump to another branch is. Else it is halved.
+        A step counts where undamped Newton corrections at least halve (`rest` says why), the determinant keeps its sign,
+        which a fold changes, and the way is no longer than the two slopes at its ends allow: a jump to another branch is.
+        Else it is halved. Across a limit, where the equations have a corner, no such ratio holds, and a long step may end
+        anywhere: there it has to be short, within which the pieces are as good as straight.
         """
         kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  the stamp is used so that the cache knows of it
         r, x, delta, extent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
@@ -129,7 +133,7 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
             x[:] = v
             for i in range(n):
                 extent[i] = max(abs(v[i]), TINY)
-            arrived, before, first = False, np.inf, 0.0
+            arrived, before, first, across = False, np.inf, 0.0, False
             for k in range(12):
                 modes[:] = m
                 equations(address, y, w, wd, p, m, inner, 1 + nu, x, r, jac)
@@ -151,7 +155,8 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
                     break
                 cornered = False
                 for i in range(m.size):
-                    cornered = cornered or modes[i] != m[i]
+                    cornered = cornered or (k > 0 and modes[i] != m[i])
+                across = across or cornered
                 if k > 0 and size > 0.5 * before and not cornered:
                     break
                 for i in range(n):
@@ -167,6 +172,9 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
                     way = max(way, abs(x[i] - v[i]) / extent[i])
                     back = max(back, abs(delta[i]) / extent[i])
                 arrived = way <= first + back + 1e-8
+                for i in range(n):
+                    if across and abs(x[i] - v[i]) > NEAR * max(abs(v[i]), 1.0):
+                        arrived = False
             if arrived:
                 v[:] = x
                 share = ahead
