@@ -91,7 +91,8 @@ class _Walk:
             if self._stationary(low, high):
                 return "converged", "the gradient is zero"
             size = np.maximum(size, _norms(self.jacobian))
-            far = reach * np.maximum(np.abs(self.x), 1.0)
+            with np.errstate(over="ignore"):  # beyond the largest number a step has no limit
+                far = reach * np.maximum(np.abs(self.x), 1.0)
             p = _step(
                 self.jacobian, self.r, damping, size, np.maximum(low - self.x, -far), np.minimum(high - self.x, far)
             )
