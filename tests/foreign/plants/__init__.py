@@ -1,0 +1,1 @@
+"""The plants, one a file; `PLANT` is each one's."""
