@@ -133,23 +133,35 @@ class Equilibria:
     # --- the model's own steady state ---
 
     def _own(self, model: Model) -> Anchor | None:
-        """What the guesses lead to; where some states have one, of what the search from several places finds the nearest."""
+        """What the guesses lead to; where some states have one, of what the search from several places finds the nearest.
+
+        Newton's method may leave a guess for a far equilibrium, as where a limit holds on the way. Where it moves a guessed
+        state by more than its size, the slow ways, which stay near or follow the model, are asked too.
+        """
         p, u = _values(model)
         given = [(k, s.guess) for k, s in enumerate(model.states.values()) if s.guess is not None]
-        if given and len(self._guesses) > 1:
-            places, guesses = [k for k, _ in given], np.array([g for _, g in given])
-            begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))
-            ends = [self._unknowns(found[0], found[1]) for found in begun if found is not None]
-            inside = [v for v in ends if (np.abs(v) <= self._region.limit).all()]
-            if inside:
-                apart = [float(np.linalg.norm((v[places] - guesses) / (1.0 + np.abs(guesses)))) for v in inside]
-                # Ends that rounding alone sets apart are one: the first of them stands for all.
-                return self._anchored(p, u, inside[int(np.argmin(np.round(apart, 6)))])
-        try:
-            found = self.search(p, u)
-        except SteadyStateError:
+        if not given:
+            try:
+                found = self.search(p, u)
+            except SteadyStateError:
+                return None
+            return self._anchored(p, u, self._unknowns(found.y, found.w))
+        places, guesses = [k for k, _ in given], np.array([g for _, g in given])
+
+        def moved(v: Array) -> Array:
+            """By how many times its size each guessed state has moved."""
+            return np.abs(v[places] - guesses) / (1.0 + np.abs(guesses))
+
+        begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))
+        ends = [self._unknowns(found[0], found[1]) for found in begun if found is not None]
+        ends = [v for v in ends if (np.abs(v) <= self._region.limit).all()]
+        if not any(moved(v).max() <= 1.0 for v in ends):
+            slow = self._slow_ends(p, u, self._filled(self._guesses[0], p, u, 0.0), 0.0)
+            ends += [v for v, _, _, shares in slow if self._region.is_rest(shares, v)]
+        if not ends:
             return None
-        return self._anchored(p, u, self._unknowns(found.y, found.w))
+        # Ends that rounding alone sets apart are one: the first of them stands for all.
+        return self._anchored(p, u, min(ends, key=lambda v: float(np.round(np.linalg.norm(moved(v)), 6))))
 
     def _inherited(self, model: Model, root: Model, u: Array) -> Anchor | None:
         """The root's own steady state, taken over by name, with the model's effects put in and at the model's own values."""
@@ -455,10 +467,36 @@ class Equilibria:
 
     def _slowly(self, p: Array, u: Array, begin: Array, time: float) -> SteadyState:
         """The steady state by steps of least norm, or by following the model; SteadyStateError with the worst equation."""
-        from hvdc_ident.simulate.patient import follow, nearest, slide
         from hvdc_ident.simulate.rest import REST_P
 
+        tried: list[tuple[Array, Array, Array, Array]] = []
+        # The rest next to the guess comes first; where there are several, following the model may end at a far one.
+        for end in self._slow_ends(p, u, begin, time):
+            tried.append(end)
+            if self._region.is_rest(end[3], end[0]):
+                break
+        else:
+            v, r, _, shares = tried[1]  # where the model went is what tells most
+            raise self._refused(r, shares, v)
+        v, _, jac, _ = tried[-1]
         s, n = self.structure.sizes, self.n + self.extra
+        y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
+        first, m = 1 + s.nu, np.zeros(max(s.ns, 1))
+        w[0], w[1:first] = time, u
+        y[: self.n], w[first : first + self.extra] = v[: self.n], v[self.n :]
+        if s.width:
+            rows = np.zeros(n * s.width)
+            evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
+            evaluate(self._address[REST_P], y, w, p, m, rows)
+            slope = np.linalg.lstsq(jac, -rows.reshape(n, s.width), rcond=1e-12)[0]
+            y[self.n :], w[first + self.extra :] = slope[: self.n].ravel(), slope[self.n :].ravel()
+        return SteadyState(y, w)
+
+    def _slow_ends(self, p: Array, u: Array, begin: Array, time: float) -> Iterator[tuple[Array, Array, Array, Array]]:
+        """(v, residual, Jacobian, scaled residuals) where each slow way ends: least norm, following the model, sliding."""
+        from hvdc_ident.simulate.patient import follow, nearest, slide
+
+        s = self.structure.sizes
         y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
         w[0], w[1 : 1 + s.nu], m = time, u, np.zeros(max(s.ns, 1))
         values = (y, w, p, m, self._region.size)
@@ -473,29 +511,13 @@ class Equilibria:
         def slid(v: Array) -> None:
             slide(self._address, self.n, s.nu, s.nx, *values, v)
 
-        ends: list[Array] = []
         ways: tuple[Callable[[Array], None], ...] = (closest, followed, slid)
-        with np.errstate(all="ignore"):
-            # The rest next to the guess comes first; where there are several, following the model may end at a far one.
-            for way in ways:
-                v = begin.copy()
+        for way in ways:
+            v = begin.copy()
+            with np.errstate(all="ignore"):
                 way(v)
-                _, jac, shares = self._judged(v, p, u, time)
-                if self._region.is_rest(shares, v):
-                    break
-                ends.append(v)
-            else:
-                r, _, shares = self._judged(ends[1], p, u, time)  # where the model went is what tells most
-                raise self._refused(r, shares, ends[1])
-        first = 1 + s.nu
-        y[: self.n], w[first : first + self.extra] = v[: self.n], v[self.n :]
-        if s.width:
-            rows = np.zeros(n * s.width)
-            evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
-            evaluate(self._address[REST_P], y, w, p, m, rows)
-            slope = np.linalg.lstsq(jac, -rows.reshape(n, s.width), rcond=1e-12)[0]
-            y[self.n :], w[first + self.extra :] = slope[: self.n].ravel(), slope[self.n :].ravel()
-        return SteadyState(y, w)
+                judged = self._judged(v, p, u, time)
+            yield v, *judged
 
     # --- what is told where there is none ---
 

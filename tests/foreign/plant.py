@@ -90,6 +90,11 @@ class Plant:
     delayed: Sequence[str] = ()
     settling: float = 60.0
 
+    @property
+    def given(self) -> dict[str, float]:
+        """The card's values of the parameters."""
+        return {n: q["value"] for n, q in tomllib.loads(self.card)["parameters"].items()}
+
     def run(self, record: Record, hidden: bool) -> dict[str, np.ndarray]:
         """Time, inputs and outputs without noise, at the record's instants; a row at a step shows what follows it."""
         h = dict(self.hidden.parameters) if hidden else None
@@ -101,7 +106,7 @@ class Plant:
         seen = Record(record.name, plan, record.duration, record.step)
         u = {**self.rest, **{n: s[0][1] for n, s in plan.items()}}
         guess = [*self.begin.values(), *(self.extra(u, self.true, h) if h is not None else ())]
-        x = self._rest(u, h, guess)
+        x = self.steady_state(self.true, u, h, guess)
         time, edges = record.time, [0.0, *[b for b in seen.breaks if b < record.duration], record.duration]
         columns: dict[str, list[np.ndarray]] = {}
         for begin, end in itertools.pairwise(edges):
@@ -121,13 +126,13 @@ class Plant:
         shown = {n: np.array([record.input(n, t) for t in time]) for n in plan}
         return {"time": time, **shown, **{n: np.concatenate(v) for n, v in columns.items()}}
 
-    def _rest(self, u: Values, h: Values | None, guess: Sequence[float]) -> np.ndarray:
-        """The stable rest next to the guess, (n,)."""
+    def steady_state(self, p: Values, u: Values, h: Values | None, guess: Sequence[float]) -> np.ndarray:
+        """The stable steady state next to the guess, (n,)."""
 
         def rates(x: np.ndarray) -> np.ndarray:
-            return np.asarray(self.derivative(0.0, x, u, self.true, h), dtype=float)
+            return np.asarray(self.derivative(0.0, x, u, p, h), dtype=float)
 
-        # Following the plant from the guess for a while leads to where Newton's method ends on the stable rest.
+        # Followed from the guess for a while the plant is where Newton's method ends on the stable steady state.
         near = solve_ivp(lambda t, x: rates(x), (0.0, self.settling), guess, method="LSODA", rtol=1e-8, atol=1e-10)
         x = root(rates, near.y[:, -1], tol=1e-13).x
         slopes = np.column_stack([(rates(x + e) - rates(x - e)) / 2e-6 for e in 1e-6 * np.eye(x.size)])
@@ -136,8 +141,7 @@ class Plant:
 
     def study(self, folder: Path, *, hidden: bool, seed: int, tables: str) -> Path:
         """The path of a study with its card and recordings, in the folder. tables: the text of the stages' tables."""
-        given = {n: q["value"] for n, q in tomllib.loads(self.card)["parameters"].items()}
-        assert {n for n in given if given[n] != self.true[n]} <= set(self.bounds), (
+        assert {n for n in self.given if self.given[n] != self.true[n]} <= set(self.bounds), (
             "a value off the card is not estimated"
         )
         rng = np.random.default_rng(seed)

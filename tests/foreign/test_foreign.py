@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from hvdc_ident import find_operating_point, load_model
 from hvdc_ident.cli import app
 from tests.foreign.plant import Plant
 
@@ -39,6 +40,16 @@ def off(estimate: dict[str, Any], true: float) -> float:
     low, high = estimate["ci95"]
     value = estimate["value"]
     return (true - value) / (high - value) if true > value else (value - true) / (value - low)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_model_starts_where_its_plant_rests(name: str, tmp_path: Path) -> None:
+    p = plant(name)
+    (tmp_path / "model.toml").write_text(p.card, encoding="utf-8")
+    found = find_operating_point(load_model(tmp_path / "model.toml"))
+    x = p.steady_state(p.given, p.rest, None, list(p.begin.values()))
+    assert list(found.states.values()) == pytest.approx(list(x), rel=1e-6, abs=1e-7)
+    assert dict(found.outputs) == pytest.approx(dict(p.outputs(x, p.rest, p.given, None)), rel=1e-6, abs=1e-7)
 
 
 @pytest.mark.parametrize("name", PLANTS)
