@@ -259,15 +259,16 @@ def _first_change(signal: InputSignal) -> float | None:
     t, v = signal.times, signal.values
     if signal.is_constant:
         return None
-    changes = np.diff(v) != 0
-    at_break = changes & np.isin(t[:-1], signal.breaks)
-    if at_break.any():
-        return float(t[np.argmax(at_break)])
-    # no break: a smooth course, a noisy one, or both
-    scatter = _scatter(_bend(*_distinct(t, v))[0])
-    level = float(np.median(v[: max(1, min(20, v.size // 10))]))
-    away = np.abs(v - level) > max(_DEPARTURE * scatter, MERGE_TOLERANCE * float(np.ptp(v)))
-    return float(t[max(0, int(np.argmax(away)) - 1)]) if away.any() else None
+    at_break = np.flatnonzero((np.diff(v) != 0) & np.isin(t[:-1], signal.breaks))
+    end = int(at_break[0]) + 1 if at_break.size else t.size
+    # Up to the first break a smooth course, a noisy one, or both: what moves there is not quiet because a break follows.
+    x = v[:end]
+    scatter = _scatter(_bend(*_distinct(t[:end], x))[0])
+    level = float(np.median(x[: max(1, min(20, x.size // 10))]))
+    away = np.abs(x - level) > max(_DEPARTURE * scatter, MERGE_TOLERANCE * float(np.ptp(v)))
+    if away.any():
+        return float(t[max(0, int(np.argmax(away)) - 1)])
+    return float(t[at_break[0]]) if at_break.size else None
 
 
 def _distinct(t: Array, v: Array) -> tuple[Array, Array]:

@@ -228,3 +228,13 @@ def test_the_scatter_from_row_to_row_is_told_where_rows_follow_the_signal_and_on
     assert row_scatter(slow[:20], rng.standard_normal(20)) is None  # too few to tell
     walk = np.cumsum(rng.standard_normal(2000))
     assert row_scatter(np.linspace(0, 1, 2000), walk) is None  # no white noise
+
+
+def test_what_moves_before_a_later_break_is_an_event_already() -> None:
+    time = np.arange(200.0)
+    ramp = np.where(time < 100, 0.001 * time, 1.0)
+    sorted_runs = np.concatenate([np.geomspace(14.0, 850.0, 80), np.geomspace(20.0, 860.0, 120)])
+    for course in (ramp, sorted_runs):
+        assert event_time({"u": input_signal(time, course)}) == 0.0
+    noisy_step = 1.0 + 1e-3 * np.random.default_rng(0).standard_normal(200) + 0.2 * (time >= 100)
+    assert event_time({"u": input_signal(time, noisy_step)}) == 100.0
