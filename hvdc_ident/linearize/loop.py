@@ -173,14 +173,21 @@ def plant_and_controller(
 
 def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
     """The value of any name at an operating point."""
+    return signal_values(model, point, (name,))[name]
+
+
+def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> dict[str, float]:
+    """Return the values of any names at an operating point."""
     from hvdc_ident.linearize.system import system
 
     known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
-    if name in known:
-        return float(known[name])
-    s = system(model, (name,))
-    m = s.modes(point.y, point.w, point.p)
-    return float(s.values(point.y, point.w, point.p, m)[s.layout.n + s.layout.ne])
+    asked = tuple(n for n in names if n not in known)
+    found = {n: float(known[n]) for n in names if n in known}
+    if asked:
+        s = system(model, asked)
+        shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
+        found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
+    return found
 
 
 def negated(model: LinearModel) -> LinearModel:

@@ -9,7 +9,7 @@ import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression.functions import symbol
-from hvdc_ident.linearize.loop import signal_value
+from hvdc_ident.linearize.loop import signal_values
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
 from hvdc_ident.model.definition import Model
 
@@ -110,7 +110,8 @@ def _matrices(
 ) -> tuple[sp.Matrix, sp.Matrix, sp.Matrix, sp.Expr]:
     """A, B, C, D with numbers for all but the kept symbols; every branch held as it is at the point."""
     names = [*model.signals, *model.algebraic]
-    values = {symbol(n): signal_value(model, at, n) for n in (*model.states, *names, *model.inputs, *model.parameters)}
+    everything = (*model.states, *names, *model.inputs, *model.parameters)
+    values = {symbol(n): v for n, v in signal_values(model, at, everything).items()}
     values |= {sp.Symbol("time", real=True): at.time}
     inner = [*model.states, *names]
 
@@ -127,7 +128,9 @@ def _matrices(
     numbers = {k: sp.Rational(repr(float(v))) for k, v in values.items() if k not in kept}
 
     def slope(e: sp.Expr, by: str) -> sp.Expr:
-        return _rational(sp.diff(e, symbol(by)).subs(numbers).evalf(17)).xreplace(kept)
+        if symbol(by) not in e.free_symbols:
+            return sp.Integer(0)
+        return _rational(sp.diff(e, symbol(by)).xreplace(numbers).evalf(17)).xreplace(kept)
 
     rows = [held(e) for e in (*definitions, shown)]
     table = [[slope(e, n) for n in (*inner, input)] for e in rows]
