@@ -18,9 +18,18 @@ if TYPE_CHECKING:
     from hvdc_ident.fit import fit
     from hvdc_ident.formats import read_waveforms
     from hvdc_ident.identifiability import identifiability
-    from hvdc_ident.linearize import LinearModel, OperatingPoint, find_operating_point, linearize
+    from hvdc_ident.linearize import (
+        LinearModel,
+        OperatingPoint,
+        continuation,
+        find_operating_point,
+        linearize,
+        one_sided,
+        point_at,
+    )
     from hvdc_ident.linearize.compare import compare
     from hvdc_ident.linearize.gap import gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.locus import root_locus
     from hvdc_ident.linearize.loop import loop, plant_and_controller
     from hvdc_ident.linearize.margins import loop_margins, margins
     from hvdc_ident.linearize.measured import (
@@ -62,6 +71,7 @@ __all__ = [
     "__version__",
     "balanced",
     "compare",
+    "continuation",
     "diagnose",
     "export",
     "find_operating_point",
@@ -81,13 +91,16 @@ __all__ = [
     "morris",
     "ncf_margin",
     "nu_gap",
+    "one_sided",
     "plant_and_controller",
+    "point_at",
     "port_admittance",
     "port_impedance",
     "read_response",
     "read_waveforms",
     "response_at_tones",
     "response_from_record",
+    "root_locus",
     "sensitivities",
     "simulate",
     "simulated_response",
@@ -109,6 +122,7 @@ _HOME = {
     "Trajectory": "trajectory",
     "balanced": "linearize.reduce",
     "compare": "linearize.compare",
+    "continuation": "linearize",
     "diagnose": "discrepancy",
     "export": "study.export",
     "find_operating_point": "linearize",
@@ -128,13 +142,16 @@ _HOME = {
     "morris": "sensitivity.global_screening",
     "ncf_margin": "linearize.gap",
     "nu_gap": "linearize.gap",
+    "one_sided": "linearize",
     "plant_and_controller": "linearize.loop",
+    "point_at": "linearize",
     "port_admittance": "linearize.port",
     "port_impedance": "linearize.port",
     "read_response": "linearize.response_file",
     "read_waveforms": "formats",
     "response_at_tones": "linearize.measured",
     "response_from_record": "linearize.measured",
+    "root_locus": "linearize.locus",
     "sensitivities": "sensitivity.local",
     "simulate": "simulate",
     "simulated_response": "linearize.measured",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -190,10 +190,3 @@ def bands(model: LinearModel, omega: Array | Sequence[float], covariance: Array,
         plain.units,
         np.sqrt(np.maximum(variance, 0.0)),
     )
-
-
-def values_at(model: LinearModel, changes: Mapping[str, float], omega: Array) -> Array:
-    """The response after small changes of parameters, to first order: what a band is made of."""
-    slopes = sensitivity(model, omega, list(changes))
-    start = transfer(model, 1j * _checked(omega))
-    return np.asarray(start + sum(slopes[n] * v for n, v in changes.items()))

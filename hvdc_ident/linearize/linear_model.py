@@ -254,11 +254,29 @@ class LinearModel:
 
         return transfer(self, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
 
-    def bode(self, omega: Array | None = None) -> Response:
-        """The frequency response at omega in rad/s (default: around the poles), with units; it draws itself."""
-        from hvdc_ident.linearize.frequency import frequency_response
+    def bode(
+        self,
+        omega: Array | None = None,
+        *,
+        covariance: Array | None = None,
+        parameters: Sequence[str] = (),
+    ) -> Response:
+        """Return the frequency response at omega in rad/s (default: around the poles), with units; it draws itself.
 
-        return frequency_response(self, omega)
+        covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
+        have (`linearize(..., sensitivities=...)`): the response then has the standard deviation that follows, as a band.
+        """
+        from hvdc_ident.linearize.frequency import bands, default_omega, frequency_response
+
+        if covariance is None:
+            return frequency_response(self, omega)
+        return bands(self, default_omega(self) if omega is None else omega, covariance, parameters)
+
+    def sigma(self, omega: Array | None = None) -> tuple[Array, Array]:
+        """Return (omega, singular values), (n,) and (n, k), largest first, of the transfer matrix."""
+        from hvdc_ident.linearize.frequency import sigma
+
+        return sigma(self, omega)
 
     def margins(self, break_at: str | Sequence[str] | None = None) -> Margins | LoopMargins:
         """Return gain, phase, delay, modulus and disk margins; of several loops together with their common disk margin.

@@ -28,13 +28,13 @@ def check_linear(study: Study, where: str) -> None:
     inner = [*model.states]
     if isinstance(model, Model):
         inner += [*model.signals, *model.algebraic]
-    elif asked.break_at or asked.plant or asked.port or asked.formula:
+    elif asked.break_at or asked.plant or asked.port or asked.formula or asked.locus:
         raise StudyError(
-            "loops, ports and formulas need the model's equations",
+            "loops, ports, loci and formulas need the model's equations",
             where=place,
             expected="a model card or a shipped model",
             got="an FMU",
-            hint="leave break_at, plant, port and formula out",
+            hint="leave break_at, plant, port, locus and formula out",
         )
     trim = asked.trim
     if trim is not None:
@@ -47,6 +47,9 @@ def check_linear(study: Study, where: str) -> None:
     channels = [*(asked.inputs or model.inputs), *(asked.outputs or model.outputs)]
     _known("input or output of [linearize]", asked.scale, channels, f"{place}.scale")
     _known("parameter", asked.formula, model.parameters, f"{place}.formula")
+    if asked.locus:
+        moved = [*model.parameters, *model.inputs]
+        _known("parameter or input", [asked.locus.parameter], moved, f"{place}.locus.parameter")
     for port in asked.port:
         _check_port(port, study, f"{place}.port '{port.name}'")
     names = [p.name for p in asked.port]
@@ -141,6 +144,8 @@ def analyses(study: Study, linear: LinearModel) -> tuple[dict[str, Any], dict[st
         data["comparison"] = _compared(study, scaled)
     if asked.formula:
         data["formulas"] = _formulas(study, linear, asked.formula)
+    if asked.locus:
+        data["locus"] = _locus(asked.locus, linear)
     if asked.port:
         data["ports"], files = _ports(asked.port, linear)
     return data, files
@@ -232,6 +237,20 @@ def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[
     return found
 
 
+def _locus(asked: schema.Locus, linear: LinearModel) -> dict[str, Any]:
+    """The eigenvalues along the parameter, all else as at the operating point."""
+    import numpy as np
+
+    from hvdc_ident.linearize.locus import root_locus
+
+    point = linear.point
+    assert point is not None and isinstance(point.model, Model)
+    spread = np.geomspace if asked.scale == "log" else np.linspace
+    values = np.asarray(spread(asked.min, asked.max, asked.points), dtype=float)
+    fixed = {n: v for n, v in {**point.inputs, **point.parameters}.items() if n != asked.parameter}
+    return root_locus(point.model, asked.parameter, values, fixed).to_dict()
+
+
 def port_of(table: schema.Port) -> Port:
     """Return the port that a table of the study describes."""
     from hvdc_ident.linearize.port import Port
@@ -286,6 +305,8 @@ def lines(data: Mapping[str, Any]) -> list[str]:
         made = ", ".join(f"{n} = {v:.6g}" for n, v in data["trim"]["found"].items())
         found.append(f"trimmed to {wanted}: {made or 'nothing had to move'}")
     found += _margin_lines(data.get("margins", {}))
+    if "locus" in data:
+        found += _locus_lines(data["locus"])
     for port in data.get("ports", ()):
         least = port["least_real_part"]
         side = "passive" if least["value"] >= 0 else "not passive"
@@ -310,6 +331,18 @@ def lines(data: Mapping[str, Any]) -> list[str]:
         text = f.get("reason") or f"({f['numerator']}) / ({f['denominator']})"
         found.append(f"{f['output']} from {f['input']}: {text}")
     return found
+
+
+def _locus_lines(found: Mapping[str, Any]) -> list[str]:
+    """Where stability is lost or won along the locus."""
+    unit = f" {found['unit']}" if found["unit"] else ""
+    span = f"{found['parameter']} from {found['values'][0]:g} to {found['values'][-1]:g}{unit}"
+    lines = [
+        f"along {span} stability is {x['direction']} at {x['value']:.6g}{unit}, "
+        f"{abs(x['eigenvalue'][1]) / math.tau:.4g} Hz"
+        for x in found["limits"]
+    ]
+    return lines or [f"along {span} stability is neither lost nor won"]
 
 
 def _margin_lines(found: Mapping[str, Any]) -> list[str]:

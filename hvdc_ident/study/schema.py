@@ -299,6 +299,24 @@ class Port(Table):
         return self
 
 
+class Locus(Table):
+    """[linearize] locus: the eigenvalues along values of one parameter or input, each at its own operating point."""
+
+    parameter: Name
+    min: FiniteFloat
+    max: FiniteFloat
+    points: Annotated[int, Field(ge=2, le=100_000)] = 60
+    scale: Literal["linear", "log"] = "linear"
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Locus:
+        if not self.min < self.max:
+            raise ValueError("max is not above min")
+        if self.scale == "log" and self.min <= 0:
+            raise ValueError("a log scale needs min above 0")
+        return self
+
+
 class Linearize(Table):
     """[linearize]: between which inputs and outputs, where, and what is wanted of the linear model.
 
@@ -319,6 +337,7 @@ class Linearize(Table):
     compare: Name | None = None
     scale: dict[Name, Positive] = {}
     formula: Names | None = None
+    locus: Locus | None = None
     port: list[Port] = []
 
 

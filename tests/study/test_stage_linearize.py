@@ -146,12 +146,16 @@ def test_every_key_of_linearize_is_answered(servo, tmp_path):
         servo,
         tmp_path,
         'break_at = "u"\nplant = {inputs = "u", outputs = "y"}\nreduce = {order = 2, match_dc = true}\n'
-        'compare = "other.toml"\nscale = {y = 2.0}\nformula = ["K"]\ntrim = {outputs = {y = 0.5}, free = ["r"]}\n'
+        'compare = "other.toml"\nscale = {y = 2.0}\nformula = ["K"]\nlocus = {parameter = "K", min = 10, max = 200, points = 20}\n'
+        'trim = {outputs = {y = 0.5}, free = ["r"]}\n'
         '[[linearize.port]]\nname = "shaft"\nsource = "d"\nvoltage = "y"\ncurrent = "d"\nband = [0.01, 1]\n',
     )
     margins = data["margins"]["loops"]["u"]
     assert margins["disk_margin"]["gain"] == pytest.approx(1.5942, abs=5e-5)  # published
     assert margins["gain_margin"]["value"] == pytest.approx(3.6, rel=1e-9)  # 10 x 10 - 10 over 25
+    (limit,) = data["locus"]["limits"]  # Routh: 10 x 10 = 10 + K, at sqrt(10) rad/s
+    assert limit["value"] == pytest.approx(90, rel=1e-9) and limit["direction"] == "lost"
+    assert limit["eigenvalue"][1] == pytest.approx(np.sqrt(10), rel=1e-6)
     ncf = data["margins"]["ncf_margin"]
     w = np.logspace(-3, 3, 20001) * 1j
     p = 25 / (w**3 + 10 * w**2 + 10 * w + 10)
@@ -174,6 +178,7 @@ def test_every_key_of_linearize_is_answered(servo, tmp_path):
         "nu-gap",
         "reduced from 3 to 2",
         "port shaft",
+        "stability is lost at 90",
         "trimmed to y = 0.5",
     ):
         assert words in shown
@@ -193,6 +198,7 @@ def test_every_key_of_linearize_is_answered(servo, tmp_path):
         ("reduce = {order = 9}", "out of range"),
         ('compare = "nowhere.toml"', "nowhere.toml"),
         ("scale = {x1 = 2.0}", "scale"),
+        ('locus = {parameter = "x1", min = 1, max = 2}', "locus"),
         ('formula = ["r"]', "formula"),
         ("trim = {outputs = {y = 0.5}}", "free="),
         ("trim = {outputs = {x1 = 0.5}}", "trim.outputs"),

@@ -40,6 +40,7 @@ def _render(results: Results) -> str:
         + _bode(given, found)
         + _margins(shown)
         + _ports(shown)
+        + _locus(shown)
         + _others(shown)
     )
 
@@ -232,6 +233,39 @@ def _ports(data: dict[str, Any]) -> str:
     axes.grid(True, color="#dddddd", linewidth=0.5)
     drawn = svg(fig, "Impedance of the ports over frequency")
     return f"<h3>Impedance at ports</h3><figure>{drawn}</figure><p>{'; '.join(words)}.</p>"
+
+
+def _locus(data: dict[str, Any]) -> str:
+    """The eigenvalues along a parameter, and where stability is lost or won."""
+    found = data.get("locus")
+    if not found:
+        return ""
+    values = np.array(found["eigenvalues"], dtype=float)
+    fig = figure(7.5, 3.6, {"left": 0.1, "right": 0.99, "bottom": 0.14, "top": 0.97})
+    axes = fig.subplots()
+    for k in range(values.shape[1]):
+        re, im = values[:, k, 0], values[:, k, 1]
+        colour = COLOURS[k % len(COLOURS)]
+        axes.plot(re, im, color=colour, linewidth=1.2)
+        axes.plot(re[:1], im[:1], "o", color=colour, markersize=4)
+        axes.plot(re[-1:], im[-1:], "s", color=colour, markersize=4)
+    # Linear about the origin and logarithmic outside: eigenvalues lie decades apart.
+    slowest = np.abs(values[..., 0] + 1j * values[..., 1])
+    near = float(slowest[slowest > 0].min(initial=1.0))
+    for scale in (axes.set_xscale, axes.set_yscale):
+        scale("symlog", linthresh=near)
+    axes.axvline(0.0, color="#999999", linewidth=0.8)
+    axes.set_xlabel("real part, rad/s")
+    axes.set_ylabel("imaginary part, rad/s")
+    axes.grid(True, color="#dddddd", linewidth=0.5)
+    unit = f" {text(found['unit'])}" if found["unit"] else ""
+    span = f"{text(found['parameter'])} from {number(found['values'][0])} (dots) to {number(found['values'][-1])}{unit} (squares)"
+    limits = "; ".join(
+        f"stability is {text(x['direction'])} at {number(x['value'])}{unit} ({_hertz(abs(x['eigenvalue'][1]))} Hz)"
+        for x in found["limits"]
+    )
+    drawn = svg(fig, f"Eigenvalues along {found['parameter']}")
+    return f"<h3>Eigenvalues along a parameter</h3><figure>{drawn}</figure><p>{span}: {limits or 'stability is neither lost nor won'}.</p>"
 
 
 def _others(data: dict[str, Any]) -> str:

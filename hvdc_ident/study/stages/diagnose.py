@@ -51,7 +51,12 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             progress=options.progress,
         )
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
-    return Outcome({**found.to_dict(), "sizes": sizes}, found.files)
+    data = {**found.to_dict(), "sizes": sizes}
+    if study.responses:
+        names = ", ".join(r.name for r in study.responses)
+        note = f"The measured frequency responses ({names}) are not used here: an effect is looked for in recordings alone."
+        data["notes"] = [*data["notes"], note]
+    return Outcome(data, found.files)
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:
