@@ -331,6 +331,23 @@ class LinearModel:
         rows = [(f"{m.eigenvalue:.5g}", m.frequency_hz, m.damping) for m in self.modes()]
         return table_html(f"Linear model {self.name}: {sizes}", ("eigenvalue, rad/s", "Hz", "damping"), rows)
 
+    def __str__(self) -> str:
+        def listed(names: tuple[str, ...]) -> str:
+            return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+
+        stable = "stable" if (self.poles().real < 0).all() else "not stable"
+        lines = [
+            f"linear model of {self.name}: {len(self.state_names)} states, {stable}",
+            f"inputs {listed(self.input_names)}; outputs {listed(self.output_names)}",
+        ]
+        shown = [m for m in self.modes() if m.eigenvalue.imag >= 0][:20]
+        lines += [
+            f"{m.eigenvalue.real:12.5g} {m.eigenvalue.imag:+12.5g}j 1/s, {m.frequency_hz:.4g} Hz, damping "
+            f"{m.damping:.3g}, mostly {m.dominant}"
+            for m in shown
+        ]
+        return "\n".join(lines)
+
     def to_dict(self) -> dict[str, Any]:
         """The model as plain lists, with names, units, operating point and provenance."""
         from hvdc_ident.linearize.export.json_text import to_dict

@@ -17,6 +17,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.frequency import Response, sensitivity
 from hvdc_ident.linearize.jacobian import linearize
+from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
 from hvdc_ident.linearize.port import Port, disturbed_model, port_response, port_sensitivity
 from hvdc_ident.model.definition import Model
@@ -74,31 +75,40 @@ class MeasuredResponse:
         fixed = {**values, **self.fixed}
         return find_operating_point(model, fixed, self.free, outputs=dict(self.trim) or None)
 
-    def of_model(self, model: AnyModel, values: Mapping[str, float], names: Sequence[str] = ()) -> tuple[Array, Array]:
-        """Return (response, derivatives) of a model, (n, channels) and (n, channels, names), at the same frequencies.
+    def linear(self, model: AnyModel, values: Mapping[str, float], names: Sequence[str] = ()) -> LinearModel:
+        """Return the linear model that shows the response: of the channels, or of the port's disturbances.
 
-        values: of parameters. names: parameters for the derivatives, the operating point's shift included. Raises
-        SteadyStateError or LinearizationError where the model has no linear one there.
+        values: of parameters. names: parameters for derivatives. Raises SteadyStateError, or LinearizationError where the
+        model has no linear one there.
         """
-        if self.port is not None:
-            return self._at_port(model, values, names)
-        outputs, inputs = (list(dict.fromkeys(c[k] for c in self.channels)) for k in (0, 1))
-        linear = linearize(model, self.point(model, values), inputs=inputs, outputs=outputs, sensitivities=tuple(names))
-        slopes = [sensitivity(linear, self.omega, names)[n] for n in names] if names else []
-        places = [(outputs.index(o), inputs.index(i)) for o, i in self.channels]
-        return self._picked(linear.response(self.omega), slopes, places)
-
-    def _at_port(self, model: AnyModel, values: Mapping[str, float], names: Sequence[str]) -> tuple[Array, Array]:
-        assert self.port is not None
+        if self.port is None:
+            outputs, inputs = (list(dict.fromkeys(c[k] for c in self.channels)) for k in (0, 1))
+            point = self.point(model, values)
+            return linearize(model, point, inputs=inputs, outputs=outputs, sensitivities=tuple(names))
         if not isinstance(model, Model):
             raise LinearizationError("an impedance needs the model's equations", where=f"model '{model.name}'")
         disturbed, inputs, outputs = self._disturbed(model)
         point = self.point(disturbed, values)
-        linear = linearize(disturbed, point, inputs=inputs, outputs=outputs, sensitivities=tuple(names))
-        found = port_response(linear, self.port, self.omega, self.kind).values
-        slopes = np.moveaxis(port_sensitivity(linear, self.port, self.omega, self.kind, names), -1, 0)
-        axes = self.port.axes
-        return self._picked(found, list(slopes), [(axes.index(o), axes.index(i)) for o, i in self.channels])
+        return linearize(disturbed, point, inputs=inputs, outputs=outputs, sensitivities=tuple(names))
+
+    def of_model(self, model: AnyModel, values: Mapping[str, float], names: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Return (response, derivatives) of a model, (n, channels) and (n, channels, names), at the same frequencies.
+
+        The derivatives hold the operating point's shift. Arguments and errors as in `linear`.
+        """
+        return self.seen(self.linear(model, values, names), names)
+
+    def seen(self, linear: LinearModel, names: Sequence[str] = ()) -> tuple[Array, Array]:
+        """Return the same of a linear model that `linear` gave."""
+        if self.port is None:
+            rows, columns = list(linear.output_names), list(linear.input_names)
+            found = linear.response(self.omega)
+            slopes = [sensitivity(linear, self.omega, names)[n] for n in names] if names else []
+        else:
+            rows = columns = list(self.port.axes)
+            found = port_response(linear, self.port, self.omega, self.kind).values
+            slopes = list(np.moveaxis(port_sensitivity(linear, self.port, self.omega, self.kind, names), -1, 0))
+        return self._picked(found, slopes, [(rows.index(o), columns.index(i)) for o, i in self.channels])
 
     def _disturbed(self, model: Model) -> tuple[Model, list[str], list[str]]:
         """The model with the port's disturbances, made once for a model."""
@@ -132,6 +142,8 @@ class MeasuredResponse:
 
         relative: root mean square of the error over that of the measurement; largest deviations of gain (dB) and phase
         (degrees) and where; chi2_per_point: mean square of the error in standard deviations, None where none is known.
+        factor: what the model's response times it meets the measured one best by, where that is no matter of a gain alone
+        (negative, or over 2 or below a half) and explains nine tenths of the squared error; else None.
         """
         found = []
         for k, label in enumerate(self.labels):
@@ -151,9 +163,21 @@ class MeasuredResponse:
                     "gain_db": {"value": float(gain[first]), "omega": float(self.omega[first])},
                     "phase_deg": {"value": float(phase[second]), "omega": float(self.omega[second])},
                     "chi2_per_point": chi2,
+                    "factor": _factor(measured, model),
                 }
             )
         return found
+
+
+def _factor(measured: Array, model: Array) -> float | None:
+    """A sign, unit or base by which two responses differ, as `MeasuredResponse.errors` says."""
+    power = float(np.sum(np.abs(model) ** 2))
+    apart = float(np.sum(np.abs(measured - model) ** 2))
+    if power == 0.0 or apart == 0.0:
+        return None
+    factor = float(np.sum(measured * np.conj(model)).real) / power
+    left = float(np.sum(np.abs(measured - factor * model) ** 2))
+    return factor if not 0.5 <= factor <= 2.0 and left < 0.1 * apart else None
 
 
 def response_at_tones(

@@ -30,6 +30,12 @@ class Reduction:
     kept: int = 0
     match_dc: bool = False
 
+    def __str__(self) -> str:
+        order = len(self.model.state_names)
+        dc = ", with the dc gain kept" if self.match_dc else ""
+        listed = ", ".join(f"{v:.3g}" for v in self.hankel[: order + 3])
+        return f"{order} states{dc}; the gain is off by {self.bound:.4g} at most\nHankel singular values {listed}"
+
     def to_dict(self) -> dict[str, Any]:
         """The reduced model as plain numbers."""
         m = self.model

@@ -205,11 +205,13 @@ def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict
         }
         for name, values in sets.items():
             try:
-                curve = r.of_model(study.model, values)[0]
+                linear = r.linear(study.model, values)
+                curve = r.seen(linear)[0]
             except (SteadyStateError, LinearizationError) as e:
                 line["models"][name] = {"reason": str(e)}
             else:
-                line["models"][name] = {**_parts(curve), "errors": r.errors(curve)}
+                right = float(linear.poles().real.max(initial=-np.inf))
+                line["models"][name] = {**_parts(curve), "errors": r.errors(curve), "stable": right < 1e-6}
         found.append(line)
     return found
 
@@ -227,6 +229,8 @@ def response_lines(responses: Iterable[Mapping[str, Any]], of: str) -> list[str]
             continue
         if "reason" in model:
             lines.append(f"response {r['name']}: the {of} model has none: {model['reason']}")
+        if model.get("stable") is False:
+            lines.append(f"response {r['name']}, {of}: the model is unstable where it was measured")
         for e in model.get("errors", ()):
             share = "" if e["relative"] is None else f" off by {100 * e['relative']:.3g} %,"
             chi2 = "" if e["chi2_per_point"] is None else f"; {math.sqrt(e['chi2_per_point']):.3g} times the noise"
@@ -235,6 +239,11 @@ def response_lines(responses: Iterable[Mapping[str, Any]], of: str) -> list[str]
                 f"{e['gain_db']['omega'] / math.tau:.4g} Hz, phase by up to {e['phase_deg']['value']:+.3g} degrees at "
                 f"{e['phase_deg']['omega'] / math.tau:.4g} Hz{chi2}"
             )
+            if e["factor"] is not None:
+                lines.append(
+                    f"response {r['name']}, {e['channel']}: the measured one is {e['factor']:.4g} times the model's: sign, "
+                    "unit or base? `scale` in [[response]] multiplies it"
+                )
     return lines
 
 

@@ -307,3 +307,38 @@ def test_what_a_response_cannot_be_is_said(motor, old, new, words):
     motor.write_text(motor.read_text().replace(old, new))
     result = run("check", motor)
     assert result.exit_code == 2 and words in result.output and "Traceback" not in result.output
+
+
+def test_a_sign_or_a_unit_is_named_and_a_gain_is_not(motor, tmp_path):
+    text = motor.read_text()
+    for scale, said in ((-1000.0, True), (1.2, False)):
+        motor.write_text(text + f"relative_noise = 0.01\nscale = {scale}\n")
+        result = run("linearize", motor, "--out", tmp_path / "r")
+        assert result.exit_code == 0, result.output
+        assert ("sign, unit or base?" in result.output) == said
+        (r,) = json.loads((tmp_path / "r/linearization.json").read_text())["responses"]
+        factor = r["models"]["given"]["errors"][0]["factor"]
+        assert factor is None if not said else factor == pytest.approx(scale, rel=0.2)
+
+
+def test_a_model_without_states_has_a_response_too(tmp_path):
+    (tmp_path / "m.toml").write_text(
+        'schema = 1\nname = "m"\n[parameters]\na = {value = 1.0, min = 0.1, max = 10}\n[inputs]\nu = {value = 0.0}\n'
+        '[states]\n[outputs]\ny = "a*u"\n'
+    )
+    csv(tmp_path / "g.csv", F, {"G": noisy(3.0 + 0j * F, 0.01)})
+    study = tmp_path / "study.toml"
+    study.write_text(
+        'schema = 1\nname = "s"\n[model]\nsource = "m.toml"\n[parameters]\na = {start = 1}\n[fit]\nstarts = 2\n'
+        '[[response]]\nname = "g"\ndata = "g.csv"\ninput = "u"\noutput = "y"\nrelative_noise = 0.01\n'
+    )
+    low, high = fitted(study, tmp_path)["estimates"]["a"]["ci95"]
+    assert low <= 3.0 <= high
+
+
+def test_a_model_that_is_unstable_where_it_was_measured_says_so(motor, tmp_path):
+    card = tmp_path / "motor.toml"
+    card.write_text(card.read_text().replace("b = {value = 0.1, min = 0.001", "b = {value = -0.5, min = -1.0"))
+    motor.write_text(motor.read_text().replace("b = {start = 0.1, min = 0.01", "b = {min = -1.0"))
+    result = run("linearize", motor, "--out", tmp_path / "r")
+    assert result.exit_code == 0 and "unstable where it was measured" in result.output

@@ -35,7 +35,22 @@ def _response(r: dict[str, Any]) -> str:
         for n, m in r["models"].items()
         if "reason" in m
     )
-    return head + _bode(r) + _errors(r) + reasons
+    return head + _bode(r) + _errors(r) + reasons + _remarks(r)
+
+
+def _remarks(r: dict[str, Any]) -> str:
+    """That the model is unstable at some values, and that a response is off by a sign or a unit."""
+    found = [
+        f"With the {text(n)} values the model is unstable where this was measured."
+        for n, m in r["models"].items()
+        if m.get("stable") is False
+    ]
+    found += [
+        f"{text(e['channel'])}: the measured response is {number(e['factor'])} times the given model's: sign, unit or base?"
+        for e in r["models"].get("given", {}).get("errors", ())
+        if e.get("factor") is not None
+    ]
+    return f"<p>{' '.join(found)}</p>" if found else ""
 
 
 def _values(parts: dict[str, Any]) -> NDArray[np.complex128]:
