@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
@@ -11,6 +11,9 @@ import scipy.linalg
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.linear_model import LinearModel
+
+if TYPE_CHECKING:
+    from hvdc_ident.linearize.norms import Peak
 
 TOLERANCE = 1e-10
 
@@ -20,7 +23,7 @@ class Reduction:
     """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on max |G - Gr|.
 
     kept: how many states carry modes that are not stable; these are never reduced. match_dc: whether the dc gain is the
-    whole's.
+    whole's. stable: the stable part before and after.
     """
 
     model: LinearModel
@@ -29,6 +32,15 @@ class Reduction:
     bound: float
     kept: int = 0
     match_dc: bool = False
+    stable: tuple[LinearModel, LinearModel] | None = field(default=None, repr=False)
+
+    @property
+    def error(self) -> Peak:
+        """The L-infinity norm of whole - reduced, and where it is: between the stable parts, for the rest is kept."""
+        from hvdc_ident.linearize.compare import difference
+        from hvdc_ident.linearize.norms import Peak, linf_norm
+
+        return Peak(0.0, 0.0) if self.stable is None else linf_norm(difference(*self.stable))
 
     def __str__(self) -> str:
         order = len(self.model.state_names)
@@ -252,8 +264,12 @@ def balanced(
     gone = [
         complex(v) for v in all_poles if not left_over.size or np.abs(left_over - v).min() > 1e-9 * max(1.0, abs(v))
     ]
+    parts = (
+        _renamed(source.model, stable, b[kept:], c[:, kept:], d, "stable part"),
+        _renamed(source.model, a_, b_, c_, d_, "balanced"),
+    )
     hankel_values = tuple(float(v) for v in values)
-    return Reduction(reduced, (*source.removed, *gone), hankel_values, float(tails[count]), kept, match_dc)
+    return Reduction(reduced, (*source.removed, *gone), hankel_values, float(tails[count]), kept, match_dc, parts)
 
 
 def _stable_last(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array, int]:

@@ -195,12 +195,8 @@ def _margins(asked: schema.Linearize, linear: LinearModel) -> dict[str, Any]:
 
 def _reduced(asked: schema.Reduce, linear: LinearModel) -> dict[str, Any]:
     """The reduced model with the error it has and the bound that was known beforehand."""
-    from hvdc_ident.linearize.compare import difference
-    from hvdc_ident.linearize.norms import linf_norm
-
     found = linear.reduce(asked.order, asked.tolerance, match_dc=asked.match_dc)
-    error = linf_norm(difference(linear, found.model)).to_dict()
-    return {**found.to_dict(), "error": error, "states_before": len(linear.state_names)}
+    return {**found.to_dict(), "error": found.error.to_dict(), "states_before": len(linear.state_names)}
 
 
 def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:

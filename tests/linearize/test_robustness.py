@@ -170,6 +170,20 @@ def test_balanced_reduction_matches_the_dc_gain_and_keeps_what_is_not_stable(ord
     assert (at_rest < 1e-9) == match_dc
 
 
+def test_an_integrator_stays_and_the_error_is_that_of_the_rest():
+    """Model minus reduced model has the integrator twice, which cancels only but for rounding."""
+    rest = stable(11, n=4, m=1, o=1)
+    model = linear(
+        np.block([[rest.A, np.zeros((4, 1))], [np.ones((1, 4)), np.zeros((1, 1))]]),
+        np.vstack([rest.B, [[1.0]]]), np.hstack([rest.C, [[1.0]]]),
+    )  # fmt: skip
+    found = balanced(model, 3)
+    assert found.kept == 1 and found.error.value <= found.bound * (1 + 1e-9)
+    w = np.logspace(-2, 3, 2001)
+    apart = np.abs(model.response(w) - found.model.response(w)).max()
+    assert apart == pytest.approx(found.error.value, rel=1e-2)
+
+
 def test_balanced_reduction_against_python_control():
     """Its `model_reduction` with matched dc gain, of the balanced model itself: the states are the last ones."""
     model = stable(3, n=4, m=1, o=1)
