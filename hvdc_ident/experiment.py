@@ -109,7 +109,7 @@ class Experiment:
     (its offset), a state (its start) or a parameter (a value of its own). search: of such parameters where
     a fit begins and its bounds, (start, min, max); of one not named they are the model's.
     domain: "time"; or "frequency", where `time` holds frequencies in Hz and the outputs are real and imaginary parts of
-    measured responses, which a simulator of its own answers (`fit.frequency`).
+    measured responses, which a simulator of its own answers (`fit.frequency_data`).
     """
 
     name: str

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.frequency import in_time
+from hvdc_ident.fit.frequency_data import in_time
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.advice import advice
 from hvdc_ident.identifiability.merit import Merit, half_widths, merit

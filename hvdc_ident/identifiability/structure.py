@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.frequency import in_time
+from hvdc_ident.fit.frequency_data import in_time
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.local_rank import METHOD, local_rank

@@ -17,8 +17,8 @@ from hvdc_ident.linearize.reduce import without_sliding_means
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """How far a second model is from a first one, between the same inputs and outputs.
+class ModelDistance:
+    """Distance of a second model from a first one, between the same inputs and outputs.
 
     nu_gap: in [0, 1], with its winding condition. gap: in [0, 1], None where it was not found. attainable: the largest
     normalised coprime factor margin that any controller of the first attains: where the nu-gap is below it, one
@@ -65,7 +65,7 @@ class Comparison:
         return "\n".join([*lines, *self.notes])
 
 
-def compare(first: LinearModel, second: LinearModel) -> Comparison:
+def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
     """Return how far two models with the same inputs and outputs are apart.
 
     Every number depends on units: scale both first (`LinearModel.scaled`) so that 1 matters equally in each channel.
@@ -94,7 +94,7 @@ def compare(first: LinearModel, second: LinearModel) -> Comparison:
         relative = apart.value / size if size > 0 else None
     except LinearizationError as e:
         notes.append(f"difference: {e.what}")
-    return Comparison(first.name, second.name, far, both, attainable, apart, relative, tuple(notes))
+    return ModelDistance(first.name, second.name, far, both, attainable, apart, relative, tuple(notes))
 
 
 def difference(first: LinearModel, second: LinearModel) -> LinearModel:

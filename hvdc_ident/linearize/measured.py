@@ -138,7 +138,7 @@ class MeasuredResponse:
         return picked, derivatives
 
     def errors(self, model_values: Array) -> list[dict[str, Any]]:
-        """How far a model's response is from the measured one, by channel.
+        """Return the distance of a model's response from the measured one, by channel.
 
         relative: root mean square of the error over that of the measurement; largest deviations of gain (dB) and phase
         (degrees) and where; chi2_per_point: mean square of the error in standard deviations, None where none is known.

@@ -164,7 +164,7 @@ def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Arra
 
 
 def on_axis(poles: Array, a: Array) -> Array:
-    """Which eigenvalues of a matrix lie on the imaginary axis, as far as their rounding errors tell.
+    """Return a mask of the eigenvalues of a matrix that lie on the imaginary axis, as far as rounding errors tell.
 
     Eigenvalues computed in floating point are those of a matrix within n eps |A|, which moves a simple one by about so
     much; 1e-9 of its size stands for worse conditioned ones.
@@ -174,7 +174,7 @@ def on_axis(poles: Array, a: Array) -> Array:
 
 
 def visible(model: LinearModel) -> tuple[Array, Array, Array, Array]:
-    """A, B, C, D of what the inputs reach and the outputs see, whether or not the rest is stable: the transfer function."""
+    """Return A, B, C, D of the part that inputs reach and outputs see, the transfer function's, be the rest stable or not."""
     a, b, c, d = without_sliding_means(model)
     a, b, c = _scale(a, b, c)
     for transposed in (False, True):

@@ -24,7 +24,7 @@ _PARTS = {
     "phase": "deg", "ang": "deg", "angle": "deg", "arg": "deg", "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg",
     "rad": "rad", "std": "std", "sigma": "std",
 }  # fmt: skip
-"""What the words of a column's title say of it. A phase is in degrees unless its title says rad."""
+"""The meaning of the words in a column's title. A phase is in degrees unless its title says rad."""
 _FREQUENCY = ("f", "freq", "frequency", "omega", "w", "ω", *_HERTZ)
 
 

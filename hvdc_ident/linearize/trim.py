@@ -1,4 +1,4 @@
-"""Which inputs are free where outputs are to have given values at rest."""
+"""The inputs that are set for outputs to have given values at rest."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import sympy as sp
 
 from hvdc_ident.fit import FitResult, Free, Group, Problem, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
-from hvdc_ident.fit.frequency import with_responses
+from hvdc_ident.fit.frequency_data import with_responses
 from hvdc_ident.fit.individual import part_of
 from hvdc_ident.fit.loss import loss
 from hvdc_ident.fit.tolerance import tolerance

@@ -21,7 +21,7 @@ from hvdc_ident.linearize.response_file import ResponseFile, read_response
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.study import schema
-from hvdc_ident.study.linear import port_of
+from hvdc_ident.study.linear_analysis import port_of
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from hvdc_ident.linearize.measured import MeasuredResponse
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
-from hvdc_ident.study.linear import check_linear
+from hvdc_ident.study.linear_analysis import check_linear
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
 from hvdc_ident.study.responses import read_responses

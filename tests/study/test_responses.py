@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
-from hvdc_ident.fit.frequency import WithResponses, frequency_experiment
+from hvdc_ident.fit.frequency_data import WithResponses, frequency_experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.measured import MeasuredResponse
 from hvdc_ident.linearize.port import Port

@@ -39,7 +39,7 @@ def _response(r: dict[str, Any]) -> str:
 
 
 def _remarks(r: dict[str, Any]) -> str:
-    """That the model is unstable at some values, and that a response is off by a sign or a unit."""
+    """Remarks on a model that is unstable where it was measured, and on a response off by a sign or a unit."""
     found = [
         f"With the {text(n)} values the model is unstable where this was measured."
         for n, m in r["models"].items()

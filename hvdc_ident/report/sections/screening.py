@@ -1,4 +1,4 @@
-"""Which parameters matter over their whole ranges: a table of the screening's measures."""
+"""The parameters that matter over their whole ranges: a table of the screening's measures."""
 
 from __future__ import annotations
 

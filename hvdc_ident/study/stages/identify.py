@@ -17,7 +17,7 @@ FEWEST_STARTS = 4
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """A verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
-    from hvdc_ident.fit.frequency import with_responses
+    from hvdc_ident.fit.frequency_data import with_responses
     from hvdc_ident.identifiability import identifiability, identifiability_by_group
     from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.needs import need_candidates, need_experiments, need_start

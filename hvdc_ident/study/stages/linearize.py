@@ -51,7 +51,7 @@ def _described(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
-    from hvdc_ident.study.linear import analyses, modes_of
+    from hvdc_ident.study.linear_analysis import analyses, modes_of
     from hvdc_ident.study.responses import compared
 
     point = model.point
@@ -99,7 +99,7 @@ def _ordered(modes: list[dict[str, Any]], like: Sequence[Mapping[str, Any]]) -> 
 def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
     """The linear model that a study's [linearize] asks for, at these values; without that table between all inputs and outputs."""
     from hvdc_ident.linearize import linearize
-    from hvdc_ident.study.linear import operating_point
+    from hvdc_ident.study.linear_analysis import operating_point
 
     asked = study.settings.linearize
     model = linearize(
@@ -115,7 +115,7 @@ def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
 
 def told(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
-    from hvdc_ident.study.linear import lines
+    from hvdc_ident.study.linear_analysis import lines
     from hvdc_ident.study.responses import response_lines
 
     def described(found: Mapping[str, Any], of: str) -> list[str]:

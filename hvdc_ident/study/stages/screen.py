@@ -1,4 +1,4 @@
-"""The stage `screen`: which candidates matter over their whole ranges."""
+"""The stage `screen`: the candidates that matter over their whole ranges."""
 
 from __future__ import annotations
 

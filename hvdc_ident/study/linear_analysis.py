@@ -1,4 +1,4 @@
-"""What a study's [linearize] asks for beside the linear model: trimming, margins, norms, ports, comparison, reduction."""
+"""The answers to a study's [linearize] beside the linear model: trimming, margins, norms, ports, comparison, reduction."""
 
 from __future__ import annotations
 
