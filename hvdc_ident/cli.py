@@ -397,6 +397,9 @@ def export(
     kind: Annotated[
         str | None, typer.Option("--kind", metavar="me|cs", help="One kind of FMU; default both.", show_default=False)
     ] = None,
+    reduced: Annotated[
+        bool, typer.Option("--reduced", help="The reduced linear model that [linearize] reduce asks for.")
+    ] = False,
     source_only: Annotated[bool, typer.Option("--source-only", help="An FMU of sources, without a binary.")] = False,
     values: Annotated[
         str | None,
@@ -419,7 +422,9 @@ def export(
     from hvdc_ident.study.export import fmu_options, write
     from hvdc_ident.study.study import load_study
 
-    written = write(load_study(study, trust), to, linear, fmu_options(fmi, kind, source_only), values, out)
+    written = write(
+        load_study(study, trust), to, linear, fmu_options(fmi, kind, source_only), values, out, reduced=reduced
+    )
     size = written.path.stat().st_size
     if json:
         about = {"bytes": size, "values": written.values, "note": written.note}

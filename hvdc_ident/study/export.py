@@ -84,14 +84,18 @@ def write(
     fmu: FmuOptions | None = None,
     values: str | None = None,
     folder: str | Path | None = None,
+    reduced: bool = False,
 ) -> Written:
-    """The same, with what is to be said of the file: which values it holds, whether an FMU holds a binary."""
+    """The same, with what is to be said of the file: which values it holds, whether an FMU holds a binary.
+
+    reduced: the reduced linear model that a study's [linearize] asks for.
+    """
     from hvdc_ident.linearize.export import formats
     from hvdc_ident.linearize.export import write as write_linear
 
     path = Path(path)
     ending = path.suffix.lower()
-    nonlinear = isinstance(source, Study | Model) and not linear
+    nonlinear = isinstance(source, Study | Model) and not linear and not reduced
     if fmu is not None and ending != ".fmu":
         raise StudyError("options of an FMU do not go with this ending", where=str(path), expected="a file *.fmu")
     if ending not in formats() and not (nonlinear and ending in _WRITERS):
@@ -104,10 +108,24 @@ def write(
         assert isinstance(source, Study | Model)
         written = _WRITERS[ending](source, chosen, path, fmu or FmuOptions())
     else:
-        written = Written(write_linear(_linear(source, chosen), path))
+        model = _linear(source, chosen)
+        written = Written(write_linear(_reduced(source, model) if reduced else model, path))
     if chosen is None:
         return written
     return Written(written.path, "; ".join(t for t in (written.note, chosen.note) if t), chosen.name)
+
+
+def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearModel:
+    """The linear model reduced as the study's [linearize] says, in the units of the whole."""
+    asked = source.settings.linearize if isinstance(source, Study) else None
+    if asked is None or asked.reduce is None:
+        hint = "reduce = {order = 4}, or {tolerance = 0.01}, in [linearize]"
+        raise StudyError(
+            "the study asks for no reduced model", where="--reduced", expected="[linearize] reduce", hint=hint
+        )
+    r = asked.reduce
+    small = whole.scaled(asked.scale).reduce(r.order, r.tolerance, match_dc=r.match_dc).model
+    return small.scaled({n: 1.0 / size for n, size in asked.scale.items()})
 
 
 def _card(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:

@@ -188,6 +188,21 @@ def test_every_key_of_linearize_is_answered(servo, tmp_path):
     assert "Margins" in text and "nu-gap" in text and "Impedance at ports" in text and "Reduced from 3" in text
 
 
+def test_the_reduced_model_is_exported_in_the_units_of_the_whole(servo, tmp_path):
+    from hvdc_ident.linearize.export import read
+
+    servo.write_text(servo.read_text() + "scale = {y = 2.0}\nreduce = {order = 2, match_dc = true}\n")
+    for name, more in (("whole.json", ()), ("small.json", ("--reduced",))):
+        result = run("export", servo, "--to", tmp_path / name, *more)
+        assert result.exit_code == 0, result.output
+    whole, small = read(tmp_path / "whole.json"), read(tmp_path / "small.json")
+    assert small.A.shape == (2, 2)
+    np.testing.assert_allclose(small.response([0.0]), whole.response([0.0]), rtol=1e-9)
+    servo.write_text(servo.read_text().replace("reduce = {order = 2, match_dc = true}\n", ""))
+    refused = run("export", servo, "--to", tmp_path / "s.json", "--reduced")
+    assert refused.exit_code == 2 and "asks for no reduced model" in refused.output
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [
