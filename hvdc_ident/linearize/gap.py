@@ -136,7 +136,7 @@ def gap(first: LinearModel, second: LinearModel, tolerance: float = 1e-4) -> flo
 
     The graph of a plant is the range of G = [M; N], its normalised right coprime factors. The directed gap is
     sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of G2* G1, here over inputs of a finite
-    number of coefficients: a bound from below that is raised until it moves by less than the tolerance. Delays are in
+    number of coefficients: a bound from below that is raised until less than the tolerance is still to come. Delays are in
     their Pade form. Raises LinearizationError for models of other sizes, or where it does not settle.
     """
     near = nu_gap(first, second).value
@@ -193,15 +193,15 @@ def _on_circle(graph: StateSpace, scale: float) -> Complex:
 def _directed(graph: Complex, other: Complex, tolerance: float, least: float) -> float:
     """sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of other* graph, and not below `least`.
 
-    Where the operator's spectrum reaches down to s no sequence attains it, the bound rises as 1/size^2 and a third of the
-    last rise is still to come: it then stays below the nu-gap, which is the gap.
+    Where the operator's spectrum reaches down to s no sequence attains it and the bound rises as 1/size^2 at worst, so
+    that a third of the last rise is still to come: where that does not lead above the nu-gap, the gap is the nu-gap.
     """
     product = np.conj(np.swapaxes(other, 1, 2)) @ graph
     points = product.shape[0]
     squared = np.conj(np.swapaxes(product, 1, 2)) @ product
     # T'T = Toeplitz(product* product) - H'H, H the Hankel operator of the coefficients before 0: all rows of T at once.
     symbol, whole = _coefficients(product), _coefficients(squared)
-    m, best, size = product.shape[1], -np.inf, 16
+    m, best, size, settled = product.shape[1], -np.inf, 16, 0
     while True:
         lag = np.subtract.outer(np.arange(size), np.arange(size))
         toeplitz = whole[lag % points].transpose(0, 2, 1, 3).reshape(size * m, size * m)
@@ -209,7 +209,9 @@ def _directed(graph: Complex, other: Complex, tolerance: float, least: float) ->
         rows = symbol[before_zero % points].transpose(0, 2, 1, 3).reshape(LARGEST * m, size * m)
         smallest = float(np.linalg.eigvalsh(toeplitz - rows.T @ rows)[0])
         before, best = best, float(np.sqrt(1.0 - min(max(smallest, 0.0), 1.0)))
-        if abs(best - before) < tolerance or best + (best - before) < least:
+        to_come = abs(best - before) / 3.0
+        settled = settled + 1 if min(to_come, best + to_come - least) < tolerance else 0
+        if settled == 2:
             return max(best, least)
         if size == LARGEST:
             break

@@ -45,6 +45,15 @@ def test_the_gap_is_symmetric_and_never_below_the_nu_gap(seed):
     assert there >= least - 1e-12 and back >= least - 1e-12
 
 
+def test_the_gap_of_the_link_settles_though_its_poles_lie_three_decades_apart():
+    from hvdc_ident.linearize import linearize
+
+    link = load_model("vsc-hvdc-link")
+    first = linearize(link, inputs="Vdcref1", outputs="Vdc1")
+    second = linearize(link.with_values({"KIVDC": 500.0}), inputs="Vdcref1", outputs="Vdc1")
+    assert gap(first, second) == pytest.approx(nu_gap(first, second).value, abs=2e-4)
+
+
 def test_hidden_modes_do_not_wind():
     """An integrator that no input reaches, as of an angle reference, belongs to no transfer function."""
     plain = linear([[-1.0]], [[1.0]], [[1.0]])
