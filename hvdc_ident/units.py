@@ -56,7 +56,7 @@ UNITS = {
 
 
 def same_unit(a: str, b: str) -> bool:
-    """Whether two units mean the same."""
+    """Return whether two units mean the same."""
     one, other = unit_of(a), unit_of(b)
     if one is None or other is None:
         return _plain(a) == _plain(b)
@@ -90,7 +90,7 @@ def scaled(values: Array, scale: float) -> Array:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit that is known, and not merely a word or a letter that could be a name's end."""
+    """Return whether a text is a unit that is known, and not merely a word or a letter that could be a name's end."""
     return bool(text.strip()) and text.strip() not in ("1", "-") and unit_of(text) is not None
 
 

@@ -290,14 +290,14 @@ def _arrived(problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], 
 
 
 def _there(problem: Problem, best: Optimum, outcome: StartOutcome) -> bool:
-    """Whether a run ended where the best one did."""
+    """Return whether a run ended where the best one did."""
     space = problem.coordinates
     end = space.scaled(np.array([outcome.end[n] for n in problem.names]))
     return bool((np.abs(end - space.scaled(best.theta)) <= 1e-3 * space.ranges).all())
 
 
 def _stands(problem: Problem, best: Optimum, there: Sequence[StartOutcome]) -> bool:
-    """Whether the best point is an optimum: a run says so that arrived, or nothing is left to gain, or two runs agree.
+    """Return whether the best point is an optimum: a run says so that arrived, or nothing is left to gain, or two runs agree.
 
     Runs that ended at one point from different starts have found what there is to be found, whatever stopped them.
     """

@@ -21,12 +21,12 @@ FEWEST_QUIET = 8
 
 
 def from_misfit(source: str) -> bool:
-    """Whether a `noise_source` says that the standard deviation is that of the fit's own residual."""
+    """Return whether a `noise_source` says that the standard deviation is that of the fit's own residual."""
     return source.startswith(MISFIT)
 
 
 def quiet(experiments: Sequence[Experiment], output: str) -> bool:
-    """Whether every record of an output has rows enough before its event to tell its noise by."""
+    """Return whether every record of an output has rows enough before its event to tell its noise by."""
     measured = [e for e in experiments if output in e.outputs and e.measured is not None]
     counts = [
         0 if e.event is None else int(np.isfinite(e.measured[output][e.time < e.event]).sum())
@@ -56,7 +56,7 @@ def unknown_noise(experiments: Sequence[Experiment], sources: Mapping[str, str])
 
 
 def _moves_before(experiments: Sequence[Experiment], output: str) -> bool:
-    """Whether a record shows noise above its floor before its event."""
+    """Return whether a record shows noise above its floor before its event."""
     for e in experiments:
         if output in e.outputs and e.measured is not None and e.event is not None:
             keep = (e.time < e.event) & np.isfinite(e.measured[output])

@@ -23,7 +23,7 @@ def is_clock(text: str) -> bool:
 
 
 def is_date(text: str) -> bool:
-    """Whether the text is a date alone, in figures."""
+    """Return whether the text is a date alone, in figures."""
     return _DATE.fullmatch(text) is not None
 
 

@@ -80,7 +80,7 @@ def _bracketed(unit: str) -> str:
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether a line holds units and no names: at least one, and nothing else but empty cells and strokes."""
+    """Return whether a line holds units and no names: at least one, and nothing else but empty cells and strokes."""
     texts = [c.strip() for c in cells]
     known = [bool(t) and (is_unit(t.strip("[]()")) or t[0] + t[-1] in ("[]", "()")) for t in texts]
     return any(known) and all(k or t in ("", "-", "1", "[-]") for k, t in zip(known, texts, strict=True))

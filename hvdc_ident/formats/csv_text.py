@@ -182,7 +182,7 @@ def _layout(path: Path) -> _Layout:
 
 
 def _is_row(line: str) -> bool:
-    """Whether a line is one of numbers, not of names: one of its first cells is a number, a date or a time of day."""
+    """Return whether a line is one of numbers, not of names: one of its first cells is a number, a date or a time of day."""
     for separator in (*_SEPARATORS, None):
         cells = [c.strip(' "') for c in line.split(separator, 2)]  # of a line that may be very long
         if len(cells) > 1 or (separator is None and not any(s in line for s in _SEPARATORS)):

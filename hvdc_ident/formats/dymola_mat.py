@@ -61,7 +61,7 @@ class _Result:
 
 
 def starts_as_version_4(top: bytes) -> bool:
-    """Whether the bytes begin as a MATLAB v4 file does: its first matrix's header, with a size that can be."""
+    """Return whether the bytes begin as a MATLAB v4 file does: its first matrix's header, with a size that can be."""
     order = _order(top)
     if len(top) < _HEADER or order is None:
         return False

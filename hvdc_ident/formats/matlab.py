@@ -36,7 +36,7 @@ _FEWEST = 8
 
 
 def recognises(path: Path) -> bool:
-    """Whether the file starts as MATLAB's versions 4 to 7.3 do, and is no result file of Dymola's."""
+    """Return whether the file starts as MATLAB's versions 4 to 7.3 do, and is no result file of Dymola's."""
     with open(path, "rb") as file:
         top = file.read(64)
     if top.startswith((_V5, _V73)):

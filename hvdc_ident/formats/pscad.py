@@ -39,7 +39,7 @@ class _Channel:
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is an .inf with a channel line, or an .out of such a run."""
+    """Return whether it is an .inf with a channel line, or an .out of such a run."""
     if path.suffix.lower() not in SUFFIXES or not _inf(path).is_file():
         return False
     with open(_inf(path), "rb") as file:

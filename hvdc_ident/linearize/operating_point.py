@@ -65,7 +65,7 @@ class OperatingPoint:
 
     @cached_property
     def stable(self) -> bool | None:
-        """Whether no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
+        """Return whether no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
         from hvdc_ident.linearize.standing import is_stable
 
         return is_stable(self)

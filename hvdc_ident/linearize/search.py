@@ -88,7 +88,7 @@ class Search:
 
     @property
     def is_plain(self) -> bool:
-        """Whether all that is asked for is the steady state at given inputs and parameters."""
+        """Return whether all that is asked for is the steady state at given inputs and parameters."""
         whole = len(self.equation_rows) == self.system.layout.n + self.system.layout.ne
         nothing = not (self.freed_u or self.freed_p or self.fixed_places or self.fixed_rows or self.bounded_rows)
         return whole and nothing and not (np.isfinite(self.low).any() or np.isfinite(self.high).any())

@@ -16,7 +16,7 @@ from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting
 
 
 def is_stable(point: OperatingPoint) -> bool | None:
-    """Whether no eigenvalue lies right of the imaginary axis, but for rounding; None for an FMU and on a kink."""
+    """Return whether no eigenvalue lies right of the imaginary axis, but for rounding; None for an FMU and on a kink."""
     return None if point.search is None else _stable(point, point.y, point.w)
 
 

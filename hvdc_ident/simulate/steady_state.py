@@ -277,7 +277,7 @@ class Equilibria:
         return Path(v, 1.0, "arrived")
 
     def _turns(self, v: Array, at: _Values, ends_p: Array, ends_w: Array) -> bool:
-        """Whether the branch turns back a little beyond v, where `trace` ended: followed by its length instead of by the values.
+        """Return whether the branch turns back a little beyond v, where `trace` ended: followed by its length instead of by the values.
 
         Keller's bordered equations: the branch's own direction stays regular at a fold, where the values do not. A jump,
         behind which there is nothing to follow, is no fold, nor is a place where steady states lie side by side. Within
@@ -614,7 +614,7 @@ class _Region:
         return cls(np.concatenate([sizes, rest, np.full(extra, 1 / CLOSE)]), np.concatenate([limits, unknown]))
 
     def is_rest(self, shares: Array, v: Array) -> bool:
-        """Whether v solves the equations, by the scaled residuals there, within the limits."""
+        """Return whether v solves the equations, by the scaled residuals there, within the limits."""
         return bool((shares < ACCURACY).all() and (np.abs(v) <= self.limit).all())
 
 

@@ -101,14 +101,14 @@ class Comparison:
         )
 
     def differs(self, sure: float) -> bool:
-        """Whether the recorded level lies outside what the model can be, by more than noise and than a row shows."""
+        """Return whether the recorded level lies outside what the model can be, by more than noise and than a row shows."""
         if self.recorded is None:
             return False
         gap = max(min(self.levels) - self.recorded, self.recorded - max(self.levels), 0.0)
         return gap > max(sure * self.error, self.noise, FINEST * self.size)
 
     def is_moved_otherwise(self, sure: float) -> bool:
-        """Whether no run of the model moves in the direction and within the size of the record."""
+        """Return whether no run of the model moves in the direction and within the size of the record."""
         return bool(self.movements) and all(abs(m.slope - 1.0) > sure * m.error for m in self.movements)
 
     def level_mismatch(self, c: Conversion) -> float:
@@ -134,7 +134,7 @@ class Comparison:
         return max(math.hypot(apart(near, 1.0, error), error / math.hypot(1.0, error)), FINEST)
 
     def is_matched(self, c: Conversion) -> bool:
-        """Whether the conversion, undone, brings the level far nearer; or the movement, and leaves the level within a share
+        """Return whether the conversion, undone, brings the level far nearer; or the movement, and leaves the level within a share
         of the movement."""
         level = self.level_mismatch(c)
         if STRONG * level <= self.level_mismatch(NONE):
