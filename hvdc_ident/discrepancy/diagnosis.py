@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.refits.adequacy import Binned
 from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.refits.refit import Refit, judged
 from hvdc_ident.discrepancy.scores.localise import localise
-from hvdc_ident.discrepancy.search.forward import Outcome, forward
+from hvdc_ident.discrepancy.search.forward import Outcome, from_either_side
 from hvdc_ident.discrepancy.signatures.candidates import entries
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
@@ -86,7 +86,7 @@ def diagnose(
         ModelSimulator(model), given, free, held or {}, report, starts=chosen.starts, seed=seed, executor=executor
     )
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
-    outcome = forward(search, first)
+    outcome = from_either_side(search, first)
     judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)
     other = None

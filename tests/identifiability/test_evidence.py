@@ -156,7 +156,7 @@ def test_a_limit_far_from_its_bound_is_not_read_at_the_bound_where_several_are_o
     y = 2.0 - 0.02 * t + 0.02 * np.random.default_rng(5).normal(size=t.size)
     y[:3] += 0.02  # no slower than a step
     data = recorded("e", t, {"y": 0.02}, y=y)
-    free = [Free("a", 1, 0.1, 10), Free("k", 10, 1e-3, 1e5), Free("c", 0.1, 0.0, 5.0)]
+    free = [Free("a", 1, 0.1, 10), Free("k", 1e5, 1e-3, 1e5), Free("c", 0.1, 0.0, 5.0)]
     report = identifiability(closed(plateau, a=1.0, **physical), [data], free, starts=4)
     assert {n for n, v in report.parameters.items() if v.verdict == "at-bound"} == {"k", "c"}
 

@@ -54,20 +54,25 @@ def returned(module: str, given: ast.expr) -> Any:
     return typing.get_type_hints(found.__call__ if isinstance(found, type) else found)["return"]
 
 
-def unkept(hint: Any) -> list[str]:
-    """The parts of a type that the store has no form for."""
+def unkept(hint: Any, above: tuple[Any, ...] = ()) -> list[str]:
+    """The parts of a type that the store has no form for. above: the types that it is a part of; one may hold itself."""
+    if hint in above:
+        return []
+    above = (*above, hint)
     kind, parts = typing.get_origin(hint), typing.get_args(hint)
     if kind is typing.Literal:
         return []
     if kind in (typing.Union, types.UnionType, list, tuple, dict, Mapping, Sequence, FrozenMap) or (
         isinstance(kind, type) and issubclass(kind, Mapping | Sequence)
     ):
-        return [bad for part in parts if part is not Ellipsis for bad in unkept(part)]
+        return [bad for part in parts if part is not Ellipsis for bad in unkept(part, above)]
     if hint in PLAIN or kind is np.ndarray or hint is Any:
         return []
     if dataclasses.is_dataclass(hint) and hint.__module__.startswith("hvdc_ident") and "." not in hint.__qualname__:
         own = typing.get_type_hints(hint)
-        return [f"{hint.__name__}.{f.name}: {bad}" for f in dataclasses.fields(hint) for bad in unkept(own[f.name])]
+        return [
+            f"{hint.__name__}.{f.name}: {bad}" for f in dataclasses.fields(hint) for bad in unkept(own[f.name], above)
+        ]
     return [str(hint)]
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from hvdc_ident.discrepancy.refits.refit import Refit
+from hvdc_ident.discrepancy.refits.refit import Refit, judged
 from hvdc_ident.discrepancy.search.pairs import pair
 from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.search.settle import settled
-from hvdc_ident.discrepancy.trials.refitted import is_noise
+from hvdc_ident.discrepancy.trials.jobs import as_given
+from hvdc_ident.discrepancy.trials.refitted import is_far, is_noise
+from hvdc_ident.discrepancy.trials.select import Ruler
 from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.errors import SimulationError
 
@@ -24,6 +26,27 @@ class Outcome:
     rounds: tuple[Round, ...]
     kept: tuple[Round, ...]
     notes: tuple[str, ...] = ()
+
+
+def from_either_side(search: Search, first: Refit) -> Outcome:
+    """The search from the refitted gains; where that leaves more than noise, from the given ones if it then ends nearer.
+
+    Gains that have moved far to make up for what is missing may leave no room for it: beside them a lag of its true size is
+    unstable, and no score tells of it. first: the nominal model, refitted.
+    """
+    outcome = forward(search, first)
+    theta = as_given(first)
+    if theta is None or not is_far(first, outcome.refit):
+        return outcome
+    search.tell(0, 1, "once more, from the given values")
+    try:
+        again = forward(search, judged(replace(first, theta=theta)))
+    except SimulationError as error:
+        return replace(outcome, notes=(*outcome.notes, f"from the given values nothing was looked for: {error}"))
+    ruler = Ruler.of(min(outcome.refit, again.refit, key=lambda r: r.chi2))
+    more = again.refit.count - outcome.refit.count
+    nearer = bool(again.kept) and ruler.gain(outcome.refit.chi2, again.refit.chi2, more) > search.options.named_bic
+    return again if nearer else outcome
 
 
 def forward(search: Search, first: Refit) -> Outcome:

@@ -99,7 +99,7 @@ PLANT = Plant(
     ),
     derivative=_derivative,
     outputs=_outputs,
-    hidden=Hidden("lag", ("outputs.P",), {"T": 0.03}, ("second-order", "delay", "window-mean", "lead-lag")),
+    hidden=Hidden("lag", ("P",), {"T": 0.03}, ("second-order", "delay", "window-mean", "lead-lag")),
     extra=lambda u, p, h: (0.75,),
     settling=20.0,
     write=_write,
