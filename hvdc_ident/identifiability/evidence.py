@@ -133,8 +133,9 @@ def bounded(p: Profile) -> bool:
 def partner(optimum: Optimum, i: int) -> str:
     """The parameter whose column is most like the i-th."""
     matrix = optimum.information.matrix
-    d = np.sqrt(np.diag(matrix))
-    cosines = np.abs(matrix[i] / np.where(d > 0, d * d[i], 1.0))
+    size = np.sqrt(np.diag(matrix))
+    size = np.where(size > 0, size, 1.0)  # a parameter without information is like no other
+    cosines = np.abs(matrix[i]) / (size * size[i])
     cosines[i] = -1.0
     return optimum.names[int(np.argmax(cosines))] if len(optimum.names) > 1 else ""
 
