@@ -218,6 +218,8 @@ def _line(output: str, size: Size, source: str) -> str:
         )
     kind = "stated" if source == GIVEN else "estimated" if source.startswith(ESTIMATED) else "row-to-row"
     ratio = f"chi2/dof {size.ratio:.3g}"
+    if size.times == 0.0:
+        return f"the residual of {output} is 0: nothing of the {kind} noise is in these rows ({ratio})"
     if size.verdict == "noise-overstated":
         return f"the {kind} noise of {output} is {_times(1.0 / size.times)} what the residual shows ({ratio})"
     if size.verdict == "noise-understated":

@@ -122,3 +122,8 @@ def test_a_second_optimum_as_good_is_told_beside_each_estimate_that_it_moves():
     assert result.status == "two-optima"
     assert "another optimum, as good, has" in result.estimates["a"].reason
     assert result.estimates["b"].reason == ""
+
+
+def test_a_record_that_stands_still_at_the_model_is_told_without_a_factor():
+    still = straight(0.1, np.zeros(T.size)).adequacy
+    assert still.verdict == "noise-overstated" and "the residual of y is 0" in still.text

@@ -55,7 +55,7 @@ def _best(rows: Array, residual: Array) -> list[tuple[int, int]]:
     for i in range(len(b)):
         for j in range(i + 1, len(b)):
             det = g[i, i] * g[j, j] - g[i, j] ** 2
-            if det < 0.05 * g[i, i] * g[j, j]:
+            if not det > 0.05 * g[i, i] * g[j, j]:  # also where one of them leaves no trace
                 continue
             t = (b[i] ** 2 * g[j, j] - 2 * b[i] * b[j] * g[i, j] + b[j] ** 2 * g[i, i]) / det
             if t > 1.2 * max(single[i], single[j]) + 20.0:
