@@ -14,6 +14,7 @@ from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.model.definition import Model
 from hvdc_ident.parameters import Parameter
+from hvdc_ident.study.stages.identify import told
 from tests.fit.simulators import recorded
 from tests.identifiability.cases import closed
 
@@ -124,3 +125,19 @@ def test_a_damping_that_the_misfit_hides_is_right_beside_the_effect_that_is_name
     assert found.parameters_after["D"] == pytest.approx(D, rel=1e-2)
     assert found.parameters_after["H"] == pytest.approx(H, rel=1e-3)
     assert found.parameters_after["R"] == pytest.approx(R, rel=1e-3)
+
+
+def test_a_misfit_is_told_first_and_beside_every_interval() -> None:
+    line = {"verdict": "identifiable", "reason": "known", "ci95": [1.0, 2.0]}
+    data = {
+        "parameters": {"a": line, "b": {**line, "verdict": "insensitive", "ci95": None}},
+        "misspecified": True,
+        "misspecification": {"signs": ["the residuals are 40 times the noise"], "next": "diagnose"},
+        "pilot": {"chi2_per_dof": 1600.0},
+        "notes": [],
+        "recommended_experiment": None,
+    }
+    first, a, b = told(data)
+    assert first.startswith("The model does not explain these data: the residuals are 40 times the noise.")
+    assert a.endswith("(chi2/dof 1.6e+03)") and "chi2" not in b
+    assert "chi2" not in "".join(told({**data, "misspecified": False}))

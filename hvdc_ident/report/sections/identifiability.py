@@ -20,7 +20,14 @@ def _render(results: Results) -> str:
     parameters = found.get("parameters") or {}
     if not parameters:
         return ""
-    parts = [_lead(found), _verdicts(parameters), _model(found), _pictures(found), _experiments(found), _next(found)]
+    parts = [
+        _lead(found),
+        _model(found),
+        _verdicts(found, parameters),
+        _pictures(found),
+        _experiments(found),
+        _next(found),
+    ]
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
     return "".join(parts) + notes
 
@@ -47,7 +54,9 @@ def _structure(structural: dict[str, Any]) -> str:
     return f"What perfect data could tell: {text(structural['status'])}"
 
 
-def _verdicts(parameters: dict[str, Any]) -> str:
+def _verdicts(found: dict[str, Any], parameters: dict[str, Any]) -> str:
+    ratio = (found.get("pilot") or {}).get("chi2_per_dof") if found.get("misspecified") else None
+    interval = "95 % interval" if ratio is None else f"95 % interval (χ²/dof {number(ratio, 3)})"
     drawn_anew = any(v.get("ci95_experiments") for v in parameters.values())
     rows = []
     for name, v in parameters.items():
@@ -55,7 +64,7 @@ def _verdicts(parameters: dict[str, Any]) -> str:
             "parameter": f"<strong>{text(name)}</strong>",
             "verdict": text(v.get("verdict", "")),
             "value": number(v.get("value")),
-            "95 % interval": _interval(v.get("ci95")),
+            interval: _interval(v.get("ci95")),
             "experiments drawn anew": _interval(v.get("ci95_experiments")),
             "unit": text(v.get("unit", "")),
             "collinearity": number(v.get("collinearity"), 3),

@@ -53,14 +53,22 @@ def groups_of(study: Study) -> list[Group]:
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:
-    """Every verdict in a line, the remarks, and what to measure next."""
+    """Return whether the model explains the data, every verdict in a line, the remarks, and what to measure next.
+
+    A misfit comes first and its size stands beside every interval: what is read alone is to be believed alone.
+    """
     width = max(map(len, data["parameters"]), default=0)
-    lines = [f"{n:{width}}  {v['verdict']}: {v['reason']}" for n, v in data["parameters"].items()]
+    lines = []
+    beside = ""
     if data["misspecified"]:
         signs = data["misspecification"]
         lines.append(
             f"The model does not explain these data: {'; '.join(signs['signs'])}. {signs['next'].capitalize()}."
         )
+        ratio = (data.get("pilot") or {}).get("chi2_per_dof")
+        beside = "" if ratio is None else f" (chi2/dof {ratio:.3g})"
+    for name, v in data["parameters"].items():
+        lines.append(f"{name:{width}}  {v['verdict']}: {v['reason']}{beside if v['ci95'] else ''}")
     lines += data["notes"]
     advice = data["recommended_experiment"]
     return [*lines, f"Measure next: {advice['text']}"] if advice else lines
