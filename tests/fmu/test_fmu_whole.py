@@ -10,11 +10,13 @@ import pytest
 from c_fmu import needs_compiler
 from typer.testing import CliRunner
 
-from hvdc_ident import simulate
+from hvdc_ident import diagnose, load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fit import Free
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.model.card import parse_card
+from hvdc_ident.trajectory import Trajectory
 
 pytestmark = needs_compiler
 
@@ -131,3 +133,21 @@ def test_the_page_has_every_stage_and_its_figures(whole):
         "differs from central differences by",
     ):
         assert words in re.sub(r"<[^>]+>", "", page), words
+
+
+def test_what_is_missing_at_an_input_is_found_there(whole):
+    """The signal of that place is the experiment's own input, which no FMU gives as an output."""
+    model, random, time = parse_card(CARD), np.random.default_rng(4), np.linspace(0.0, 3.0, 121)
+    lagging = model.with_effects([{"effect": "lag", "at": "r", "parameters": {"T": LAG}}])
+    records = []
+    for name, level in (("up", 1.0), ("down", -0.6)):
+        r = InputSignal.corners([(0, 0), (0.5, 0), (0.5, level), (1.7, level), (1.7, -level / 2)])
+        run = simulate(lagging, experiment(name, time, {"r": r}))
+        seen = np.column_stack([run[o] for o in ("y", "c")]) + 5e-3 * random.normal(size=(time.size, 2))
+        measured = Trajectory(time, seen, ("y", "c"), ("", ""))
+        records.append(experiment(name, time, {"r": r}, measured=measured, noise={"y": 5e-3, "c": 5e-3}))
+    free = [Free("kp", 2.5, 0.5, 8.0), Free("ki", 8.0, 2.0, 40.0)]
+    found = diagnose(load_model(whole.parent / "pi.fmu"), records, free, effects=["lag"], places=["r"])
+    (effect,) = found.effects
+    low, high = effect.parameters["T"].ci95
+    assert effect.at == ("r",) and low < LAG < high < 1.3 * LAG

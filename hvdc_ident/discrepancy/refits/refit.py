@@ -13,12 +13,14 @@ from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.nominal import Nominal, orthonormal
 from hvdc_ident.effects import clearance, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
+from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate import simulate
 from hvdc_ident.trajectory import Array
@@ -310,10 +312,24 @@ def press(blocks: Sequence[Block], parts: int = 4) -> float | None:
 
 
 def signal(refit: Refit, place: str) -> dict[str, Array]:
-    """The signal at a place of the model as refitted, by fitted experiment. Raises SimulationError where it cannot be run."""
+    """The signal at a place of the model as refitted, by fitted experiment. Raises SimulationError where it cannot be run.
+
+    A model that is closed inside, as an FMU, gives only its outputs: what enters it is the experiment's own input.
+    """
     name = place.removeprefix("outputs.")
-    runs = {e.name: e.with_(measured=None) for e in refit.problem.fitted_experiments}
-    return {n: np.asarray(simulate(refit.model, e, refit.values, outputs=[name])[name]) for n, e in runs.items()}
+    model, experiments = refit.model, refit.problem.fitted_experiments
+    if not isinstance(model, Model) and name == place and name in model.inputs:
+        at_rest = {**{n: i.value for n, i in model.inputs.items()}, **refit.values}
+        return {e.name: _input(e, name, e.values.get(name, at_rest[name])) for e in experiments}
+    runs = {e.name: e.with_(measured=None) for e in experiments}
+    return {n: np.asarray(simulate(model, e, refit.values, outputs=[name])[name]) for n, e in runs.items()}
+
+
+def _input(experiment: Experiment, name: str, at_rest: float) -> Array:
+    """An input at the experiment's rows, (n,); at_rest: what it is where the experiment does not move it."""
+    moved = experiment.inputs.get(name)
+    course = np.full(experiment.time.size, at_rest) if moved is None else moved(experiment.time)
+    return np.asarray(course + experiment.offsets.get(name, 0.0))
 
 
 def unseen(refit: Refit) -> float | None:
