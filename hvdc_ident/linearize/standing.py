@@ -77,7 +77,7 @@ def _fastest(point: OperatingPoint) -> str:
 
 
 def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
-    """The stable steady states that the model runs to from here, or that its guesses lead to."""
+    """The nearest of the stable steady states that the model runs to from here, or that its guesses lead to."""
     matrix = _matrix(point, point.y, point.w)
     assert matrix is not None
     values, vectors = np.linalg.eig(matrix)
@@ -92,6 +92,7 @@ def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
     stable = [
         x for x in others if not np.allclose(x, v, rtol=1e-6, atol=1e-6) and _stable(point, *_split(at, point, x))
     ]
+    stable.sort(key=lambda x: float(np.abs((x[:nx] - v[:nx]) / size).max()))  # of a machine's turns the nearest
     if not stable:
         return "No stable steady state was found nearby."
     return f"A stable one stands at {at.text(stable[0])}; a `guess` there in the model's states leads to it."

@@ -19,6 +19,7 @@ EPSILON = float(np.finfo(float).eps)
 NEAR = (
     0.1  # radians, or of a value above 1: how far a step across a limit may lead; a sine is its tangent to 0.2 % there
 )
+SAME = 1e-6  # of a value: places nearer than this are one steady state, reached by different arithmetic
 SHORTEST = 2.0**-16  # of a path: a step that has to be shorter means that the path ends
 
 
@@ -117,12 +118,14 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
         ends_p (2, parameters), ends_w (2, 1 + inputs): the values, time first. sign: of the determinant at the start.
 
         A step counts where undamped Newton corrections at least halve (`rest` says why), the determinant keeps its sign,
-        which a fold changes, and the way is no longer than the two slopes at its ends allow: a jump to another branch is.
-        Else it is halved. Across a limit, where the equations have a corner, no such ratio holds, and a long step may end
-        anywhere: there it has to be short, within which the pieces are as good as straight.
+        which a fold changes, the way is no longer than the two slopes at its ends allow: a jump to another branch is; and
+        Newton's method leads back to where the step began, which from another branch it does not. (Corrections that halve
+        on the way there show the condition in their own direction only.) Else it is halved. Across a limit, where the
+        equations have a corner, no such ratio holds, and a long step may end anywhere: there it has to be short, within
+        which the pieces are as good as straight.
         """
         kept, n, wd = stamp, v.size, np.zeros(w.size)  # noqa: F841  the stamp is used so that the cache knows of it
-        r, x, delta, extent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        r, x, delta, extent, trial = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
         jac, matrix, pivots, modes = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n, np.int64), np.zeros(m.size)
         share, h = 0.0, 1.0
         while share < 1.0 and h > SHORTEST:
@@ -175,6 +178,28 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
                 for i in range(n):
                     if across and abs(x[i] - v[i]) > NEAR * max(abs(v[i]), 1.0):
                         arrived = False
+                if arrived and not across:
+                    arrived, before = False, np.inf
+                    trial[:] = x
+                    for k in range(12):
+                        equations(address, y, w, wd, p, m, inner, 1 + nu, trial, r, jac)
+                        matrix[:] = jac
+                        delta[:] = r
+                        if not lu(matrix, pivots):
+                            break
+                        solve(matrix, pivots, delta)
+                        size, off = 0.0, 0.0
+                        for i in range(n):
+                            size = max(size, abs(delta[i]) / extent[i])
+                            off = max(off, abs(trial[i] - v[i]) / extent[i])
+                        if size < 1e-11 or (size < 1e-8 and size > 0.5 * before):
+                            arrived = off < SAME
+                            break
+                        if k > 0 and not size <= 0.5 * before:
+                            break
+                        for i in range(n):
+                            trial[i] -= delta[i]
+                        before = size
             if arrived:
                 v[:] = x
                 share = ahead

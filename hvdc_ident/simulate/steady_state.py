@@ -32,6 +32,7 @@ CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
 HALVES = 0.5
 """The most that an undamped Newton correction may keep of the one before: Kantorovich's condition (`rest` says how)."""
 ROOM = 256
+DOUBLINGS = 11  # of a hundredth of a state's size: to ten times that, beyond which a state is hardly a neighbour
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Equilibria:
         anchor = self.anchor(model, u)
         if anchor is None or not anchor.sign:
             return self.search(p, u, time, None if anchor is None else anchor.v, search=search)
-        found = self._newton(anchor.v, p, u, time, HALVES, anchor.sign)
+        found = self._directly(anchor, p, u, time)
         if found is not None:
             return SteadyState(*found[:2])
         path = self._connected(model, anchor, p, u, time, search)
@@ -185,7 +186,7 @@ class Equilibria:
             begun = self._with_effects(model, p_root, u_root, known) if _has_effects(model) else None
         if begun is None or not begun.sign or (np.array_equal(p_root, p_own) and np.array_equal(u_root, u_own)):
             return begun
-        found = self._newton(begun.v, p_own, u_own, 0.0, HALVES, begun.sign)
+        found = self._directly(begun, p_own, u_own, 0.0)
         if found is not None:
             return Anchor(p_own, u_own, self._unknowns(found[0], found[1]), found[2])
         path = self._follow_any(_ways(begun, p_own, u_own, 0.0), begun)
@@ -352,6 +353,18 @@ class Equilibria:
             raise MemoryError
         return (y, w, float(rule[1])) if answer == 1 else None
 
+    def _directly(self, anchor: Anchor, p: Array, u: Array, time: float) -> tuple[Array, Array, float] | None:
+        """(y, w, sign) of the solution at other values that Newton's method finds from a known one, and leads back from.
+
+        Corrections that halve are Kantorovich's condition as far as their own direction shows it: with an exponential rate
+        they also halve on the way to another branch. From that one the way back ends elsewhere.
+        """
+        found = self._newton(anchor.v, p, u, time, HALVES, anchor.sign)
+        if found is None:
+            return None
+        back = self._newton(self._unknowns(found[0], found[1]), anchor.p, anchor.u, 0.0, HALVES, anchor.sign)
+        return found if back is not None and _alike(self._unknowns(back[0], back[1]), anchor.v) else None
+
     def unknowns(self, found: SteadyState) -> Array:
         """[x, z, delayed, sampled values] of a steady state, as `names` names them."""
         return self._unknowns(found.y, found.w)
@@ -436,20 +449,33 @@ class Equilibria:
     # --- others ---
 
     def neighbours(self, p: Array, u: Array, time: float, v: Array, along: Array) -> list[Array]:
-        """Other steady states that the model runs to from v, moved a little along a direction (states,) and against it."""
+        """Other steady states near v: that the model runs to from there, moved a little along a direction (states,) and against
+        it, and that Newton's method finds from farther and farther along it.
+
+        What follows the model takes one Newton step for each in time and may leap over the nearest one.
+        """
         from hvdc_ident.simulate.patient import follow, nearest
 
         s = self.structure.sizes
         y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
         w[0], w[1 : 1 + s.nu] = time, u
-        found: list[Array] = []
+        values, rest = (self._address, self.n, s.nu), (np.ascontiguousarray(p, dtype=float), m, self._region.size)
+        ends: list[Array] = []
         for sign in (1.0, -1.0):
             x = v.copy()
             x[: s.nx] += sign * along
             with np.errstate(all="ignore"):
-                values = (self._address, self.n, s.nu)
-                follow(*values, s.nx, y, w, np.ascontiguousarray(p, dtype=float), m, self._region.size, x)
-                nearest(*values, y, w, np.ascontiguousarray(p, dtype=float), m, self._region.size, x)
+                follow(*values, s.nx, y, w, *rest, x)
+                nearest(*values, y, w, *rest, x)
+            ends.append(x)
+            for far in 2.0 ** np.arange(DOUBLINGS):
+                begin = v.copy()
+                begin[: s.nx] += sign * far * along
+                solved = self._newton(begin, p, u, time)
+                ends += [] if solved is None else [self._unknowns(solved[0], solved[1])]
+        found: list[Array] = []
+        for x in ends:
+            with np.errstate(all="ignore"):
                 _, _, shares = self._judged(x, p, u, time)
             if self._region.is_rest(shares, x) and not _alike(x, v) and not any(_alike(x, k) for k in found):
                 found.append(x)
@@ -546,8 +572,8 @@ class Equilibria:
         )
 
     def text(self, v: Array) -> str:
-        """The states by name and value, for messages; the first six of a larger model."""
-        shown = [f"{n} = {x:.4g}" for n, x in zip(self.structure.states, v, strict=False)]
+        """The states by name and value, what rounding leaves of 0 as 0, for messages; the first six of a larger model."""
+        shown = [f"{n} = {0.0 if abs(x) < ACCURACY else x:.4g}" for n, x in zip(self.structure.states, v, strict=False)]
         return ", ".join(shown[:6]) + (", ..." if len(shown) > 6 else "")
 
     def _refused(self, r: Array, shares: Array, v: Array) -> SteadyStateError:

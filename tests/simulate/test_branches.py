@@ -225,3 +225,77 @@ def test_no_point_far_outside_a_state_s_own_range_passes():
         found += 1
         assert abs(point.states["Vdc1"]) < 10
     assert found
+
+
+# A stirred tank with an exothermic reaction: cold, at the middle (unstable), or ignited; Arrhenius' rate bends so sharply
+# that Newton's method leaps from one to another with corrections that halve.
+TANK = """
+schema = 1
+name = "tank"
+[parameters]
+k0 = {value = 7.2e10}
+E = {value = 8750.0}
+heat = {value = 209.2}
+UA = {value = 2.09}
+[inputs]
+cf = {value = 1.0}
+Tc = {value = 300.0}
+[states]
+c = {derivative = "cf - c - rate", guess = START_C}
+T = {derivative = "350 - T + heat*rate + UA*(Tc - T)", guess = START_T}
+[signals]
+rate = "k0*exp(-E/T)*c"
+[outputs]
+T = "T"
+"""
+
+
+def tank_balance(temperature, p):
+    """The heat balance with the concentration's own balance put in."""
+    k = p["k0"] * math.exp(-p["E"] / temperature)
+    return 350 - temperature + p["heat"] * p["cf"] * k / (1 + k) + p["UA"] * (p["Tc"] - temperature)
+
+
+@pytest.mark.parametrize(("c", "temperature"), [(0.9, 325.0), (0.2, 370.0)])
+def test_a_tank_stays_cold_or_ignited_or_says_where_that_ends(c, temperature):
+    model = parse_card(TANK.replace("START_C", str(c)).replace("START_T", str(temperature)))
+    own = {n: q.value for n, q in model.parameters.items()} | {n: i.value for n, i in model.inputs.items()}
+    random = np.random.default_rng(3)
+    arrived = 0
+    for _ in range(60):
+        spread = {"E": 0.1, "Tc": 0.05}
+        values = {n: v * math.exp(spread.get(n, 0.7) * random.uniform(-1, 1)) for n, v in own.items()}
+        at: float | None = brentq(tank_balance, temperature - 5, temperature + 5, args=(own,))
+        for share in np.linspace(0, 1, 801)[1:]:
+            p = {n: v + share * (values[n] - v) for n, v in own.items()}
+            ends = [tank_balance(at + d, p) for d in (-1.5, 1.5)]
+            if ends[0] * ends[1] > 0:  # a fold: the straight way ends here
+                at = None
+                break
+            at = brentq(tank_balance, at - 1.5, at + 1.5, args=(p,))
+        if at is not None:
+            arrived += 1
+            found, branch = start(model, **values)
+            assert found["T"] == pytest.approx(at, rel=1e-6) and branch == "own"
+    assert arrived > 5
+
+
+def test_of_several_stable_rests_the_nearest_is_offered():
+    """Pushed off its upper rest a weakly damped machine slips many turns one way; the other way it swings back at once."""
+    machine = parse_card("""
+schema = 1
+name = "machine"
+[parameters]
+H = {value = 4.0}
+[inputs]
+Pm = {value = 0.8}
+[states]
+delta = {derivative = "314.16*w", guess = 3.0}
+w = {derivative = "(Pm - 2.2*sin(delta) - 4*w)/(2*H)"}
+[outputs]
+P = "2.2*sin(delta)"
+""")
+    point = find_operating_point(machine)
+    low = math.asin(0.8 / 2.2)
+    assert point.states["delta"] == pytest.approx(math.pi - low) and not point.stable
+    assert any(f"A stable one stands at delta = {low:.4g}, w = 0;" in note for note in point.notes), point.notes
