@@ -71,7 +71,7 @@ def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
 
 
 def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
-    """The modes, one a row; with those at the fitted values each beside the given one that it belongs to."""
+    """The modes, one a row; with those at the fitted values each under the given one that it belongs to."""
     head = ["eigenvalue, rad/s", "frequency, Hz", "damping"]
     rest = ["mode of", "states that take part", "kind"]
     if fitted is None:
@@ -85,9 +85,10 @@ def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
     pairs = [
         (g, f) for g, f in zip(given, fitted["modes"], strict=True) if max(g["eigenvalue"][1], f["eigenvalue"][1]) >= 0
     ]
-    rows = [[*_numbers(g), *_numbers(f), *_words(f)] for g, f in pairs]
-    names = [f"{h}: {which}" for which in ("given", "fitted") for h in head]
-    return table([*names, *rest], rows, words=(6, 7, 8))
+    rows = [
+        [name, *_numbers(m), *_words(m)] for pair in pairs for name, m in zip(("given", "fitted"), pair, strict=True)
+    ]
+    return table(["values", *head, *rest], rows, words=(0, 4, 5, 6))
 
 
 def _numbers(m: dict[str, Any]) -> list[str]:
