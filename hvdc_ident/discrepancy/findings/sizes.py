@@ -8,7 +8,7 @@ from typing import Any
 
 from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.errors import ComputationError
+from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
@@ -42,7 +42,7 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
         value = _size(size.value, neutral, share)
         try:
             run = simulate(_with(model, found, value), chosen, found.parameters_after, outputs=[place[0]])
-        except ComputationError:
+        except (ComputationError, SteadyStateError):  # as where a smaller limit leaves no rest to begin at
             continue
         shown["sizes"].append(value)
         shown["shares"].append(share)
