@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtri
 
-from hvdc_ident.fit.noise import ESTIMATED, GIVEN, from_misfit
+from hvdc_ident.fit.noise import ESTIMATED, FLOOR, GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.weights import MAD
@@ -130,6 +130,8 @@ def _size(
     residual = np.concatenate([b.residual for b in blocks])
     effective, white = _independent(residual.size, independence), independence[1] == 0.0
     spare = max(effective - residual.size * (1.0 - share), 1.0)
+    if from_misfit(source) and source != MISFIT:
+        return Size(None, 0.0, np.inf, None, white, "fits")
     if not from_misfit(source):
         noise: float | None = float(np.sqrt(sum(b.sigma**2 * b.residual.size for b in blocks) / residual.size))
         ratio, behind = _power(problem, residual) / share, problem.noise_dof
@@ -212,6 +214,8 @@ def _words(
 
 def _line(output: str, size: Size, source: str) -> str:
     """What is said of one output."""
+    if size.verdict == "fits" and size.ratio is None:
+        return f"{output} is met to {FLOOR:g} of its range, and the intervals are of what is left below that"
     if size.verdict == "not-judged" or size.times is None or size.ratio is None:
         return (
             f"the noise of {output} is taken from the fit's own residual, which then cannot tell whether the model fits"
@@ -221,16 +225,17 @@ def _line(output: str, size: Size, source: str) -> str:
     if size.times == 0.0:
         return f"the residual of {output} is 0: nothing of the {kind} noise is in these rows ({ratio})"
     if size.verdict == "noise-overstated":
-        return f"the {kind} noise of {output} is {_times(1.0 / size.times)} what the residual shows ({ratio})"
+        return f"the {kind} noise of {output} is {times_text(1.0 / size.times)} what the residual shows ({ratio})"
     if size.verdict == "noise-understated":
         return (
-            f"the residual of {output} is white and {_times(size.times)} the {kind} noise ({ratio}): that noise is too "
+            f"the residual of {output} is white and {times_text(size.times)} the {kind} noise ({ratio}): that noise is too "
             "small, or the model lacks something too fast for these rows to show"
         )
     if size.verdict == "does-not-fit":
-        return f"the residual of {output} is {_times(size.times)} the {kind} noise ({ratio})"
+        return f"the residual of {output} is {times_text(size.times)} the {kind} noise ({ratio})"
     return ""
 
 
-def _times(factor: float) -> str:
+def times_text(factor: float) -> str:
+    """Return "31 times" or "1,030 times": two figures, or whole numbers from 100 on."""
     return f"{factor:.2g} times" if factor < 100 else f"{factor:,.0f} times"

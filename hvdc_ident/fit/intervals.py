@@ -78,13 +78,19 @@ def _inside(unknown: Free, value: float, known: Uncertainty, limits: tuple[float
     reasons = ["the interval is wider than the bounds"] if math.isfinite(width) and 2.0 * half > width else []
     if half > WIDER * plain > 0:
         reasons.append(
-            f"the residuals are correlated, so that {known.rows} rows are worth {sum(known.effective.values()):.3g} "
-            f"independent ones and the interval is {half / plain:.2g} times as wide as if they were independent"
+            f"the residuals are correlated, so that {known.rows} rows are worth no more than "
+            f"{_counted(sum(known.effective.values()))} and the interval is {half / plain:.2g} times as wide as if they were independent"
         )
     independent = within(plain) if any(known.rho.values()) else None
     return Estimate(
         value, std, within(half), "covariance", std_raw=raw, reason="; ".join(reasons), ci95_independent=independent
     )
+
+
+def _counted(samples: float) -> str:
+    """So many independent rows, in words."""
+    number = f"{samples:.3g}"
+    return f"{number} independent {'row' if number == '1' else 'rows'}"
 
 
 def _on_bound(unknown: Free, value: float, slope: float, known: Uncertainty, *, alone: bool) -> Estimate:

@@ -127,3 +127,8 @@ def test_a_second_optimum_as_good_is_told_beside_each_estimate_that_it_moves():
 def test_a_record_that_stands_still_at_the_model_is_told_without_a_factor():
     still = straight(0.1, np.zeros(T.size)).adequacy
     assert still.verdict == "noise-overstated" and "the residual of y is 0" in still.text
+
+
+def test_a_record_that_the_model_meets_to_its_last_digits_fits():
+    judged = straight(None, 1 + 2 * T).adequacy
+    assert judged.verdict == "fits" and "to 1e-06 of its range" in judged.text
