@@ -47,6 +47,11 @@ class Side:
     reason: str = ""
     evaluations: int = 0
 
+    @property
+    def crossing(self) -> float | None:
+        """The value at which the cost has risen enough; None where it never does, also at a bound set by physics."""
+        return self.limit if self.status == "closed" and not self.reason else None
+
 
 @dataclass(frozen=True)
 class Walk:

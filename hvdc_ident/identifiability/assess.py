@@ -197,7 +197,19 @@ def _unjudged(so_far: Findings, whole: Optimum, fitted: Sequence[str], at: Optim
     told = told_by_noise(whole, fitted, others) if others else {}
     for n, half in told.items():
         so_far.found[n] = verdicts.not_judged(so_far.found[n], float(np.sqrt(at.excess)), half)
+    _widened_by_misfit(so_far, whole, fitted, at)
     return tuple(n for n in so_far.free if n in told)
+
+
+def _widened_by_misfit(so_far: Findings, whole: Optimum, fitted: Sequence[str], at: Optimum) -> None:
+    """Remark on the weak parameters that the noise alone would let be known within `WIDE`. at: as for `_unjudged`."""
+    weak = [n for n in fitted if so_far.found[n].verdict == "weak"]
+    halves = told_by_noise(whole, [n for n in fitted if n not in weak], weak) if weak else {}
+    for n, half in halves.items():
+        judged = so_far.found[n]
+        scale = verdicts.scale_of(so_far.free[n], judged.value)[0]
+        if half <= verdicts.WIDE * scale and (judged.collinearity or 0.0) <= verdicts.COLLINEAR:
+            so_far.found[n] = verdicts.misfit_made(judged, float(np.sqrt(at.excess)), half)
 
 
 def _whole(so_far: Findings, at: Optimum) -> Optimum:

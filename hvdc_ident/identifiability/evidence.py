@@ -18,7 +18,7 @@ from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.verdicts import Verdict
-from hvdc_ident.sensitivity.fisher import independent, pivoted_order
+from hvdc_ident.sensitivity.fisher import independent, pivoted_order, rise_over_range
 from hvdc_ident.trajectory import Array
 
 DRAWS = 999
@@ -125,6 +125,19 @@ def physical_bounds(problem: Problem) -> dict[str, tuple[bool, bool]]:
     return {f.name: (f.min == own[f.name].min, f.max == own[f.name].max) for f in problem.free}
 
 
+def undetermined(optimum: Optimum, p: Profile, ends: tuple[float, float]) -> bool:
+    """Return whether a profile has no crossing on a side and, at the optimum, no curvature: only a far limit is known.
+
+    A level that no record reaches is one. By its curvature the whole range between the ends would then change nothing (the
+    rule for insensitive parameters), so every value up to the bound is as good, and which one a search ended at is chance.
+    """
+    if p.one_sided or None not in (p.lower.crossing, p.upper.crossing):
+        return False
+    i = optimum.names.index(p.name)
+    curvature = optimum.information.matrix[i, i] / optimum.slope[i] ** 2
+    return rise_over_range(curvature, ends[1] - ends[0]) < p.threshold
+
+
 def bounded(p: Profile) -> bool:
     """Whether the interval is known: both ends, or the one that a parameter on its bound has."""
     return p.closed or (p.one_sided and "closed" in (p.lower.status, p.upper.status))
@@ -159,9 +172,7 @@ def joint_limits(
         return FrozenMap(found)
     other: dict[str, float] = {}
     for n in on_bound:
-        crossing = next(
-            (s.limit for s in (found[n].lower, found[n].upper) if s.status == "closed" and not s.reason), None
-        )
+        crossing = next((c for c in (found[n].lower.crossing, found[n].upper.crossing) if c is not None), None)
         if crossing is None:
             continue
         there = found[n].thetas[int(np.argmin(np.abs(found[n].values - crossing)))]

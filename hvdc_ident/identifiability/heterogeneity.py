@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.uncertainty import score_covariance
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
@@ -113,6 +114,6 @@ def misspecification(optimum: Optimum, found: FrozenMap[Heterogeneity], units: d
                 f"(Q {h.q:.0f} for {h.dof} degree{'' if h.dof == 1 else 's'} of freedom, I2 {100 * h.i2:.0f} %)"
             )
     if optimum.excess > 1.0:
-        signs.append(f"the residuals are {np.sqrt(optimum.excess):.2g} times the noise")
+        signs.append(f"the residuals are {times_text(float(np.sqrt(optimum.excess)))} the noise")
     pointer = "the model may lack an effect; hvdc-ident diagnose looks for it" if signs else ""
     return Misspecification(bool(signs), tuple(signs), pointer)

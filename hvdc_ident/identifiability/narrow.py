@@ -23,6 +23,7 @@ from hvdc_ident.identifiability.evidence import (
     rise_at_ends,
     spreads,
     thresholds,
+    undetermined,
 )
 from hvdc_ident.identifiability.findings import Findings
 from hvdc_ident.identifiability.optima import other_optima
@@ -134,7 +135,7 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
             return walked(at, list(other), threshold=other).by_name
 
         by_name = joint_limits(optimum, around.by_name, limits, again, seed=so_far.seed)
-        opened = [n for n, p in by_name.items() if not bounded(p)]
+        opened = [n for n, p in by_name.items() if not bounded(p) or _undetermined(so_far, optimum, p)]
         if not opened:
             so_far.tell("other optima")
             others = other_optima(optimum, limits, so_far.ends)
@@ -158,6 +159,11 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
             so_far.combinations.append(replace(combo, held=(victim,)))
         optimum = so_far.without(optimum, {victim: so_far.found[victim].reason})
     return None
+
+
+def _undetermined(so_far: Findings, optimum: Optimum, profile: Profile) -> bool:
+    free = so_far.free[profile.name]
+    return undetermined(optimum, profile, range_of(free, profile.value, so_far.walk.reach))
 
 
 def _locally(so_far: Findings, judged: Verdict, profile: Profile) -> Verdict:

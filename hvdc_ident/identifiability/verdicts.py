@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import Profile
 from hvdc_ident.fit.unknown import Free
@@ -105,13 +106,16 @@ def insensitive(
 
 
 def practical(profile: Profile, words: str, unit: str) -> Verdict:
-    """Its profile is open inside the bounds. words: the combination it belongs to, if any."""
-    parts = []
-    if profile.lower.status != "closed":
-        parts.append(f"from below ({profile.lower.reason})")
-    if profile.upper.status != "closed":
-        parts.append(f"from above ({profile.upper.reason})")
-    text = f"These data do not bound it {' nor '.join(parts)}." + (f" Of these data {words}." if words else "")
+    """Its profile is open inside the bounds, or flat where it is best. words: the combination it belongs to, if any."""
+    low, high = profile.lower.crossing, profile.upper.crossing
+    ends = (("below", low, profile.lower.reason), ("above", high, profile.upper.reason))
+    text = (
+        f"These data do not bound it {' nor '.join(f'from {side} ({why})' for side, end, why in ends if end is None)}"
+    )
+    if low is not None or high is not None:
+        known = f"above {_with_unit(low, unit)}" if low is not None else f"below {_with_unit(high or 0.0, unit)}"
+        text += f"; with 95 % confidence it is {known}"
+    text += "." + (f" Of these data {words}." if words else "")
     return Verdict(profile.name, "practically-unidentifiable", text, profile.value, unit, profile.ci95, profile=profile)
 
 
@@ -120,12 +124,20 @@ def not_judged(judged: Verdict, times: float, half: float) -> Verdict:
 
     One at a bound stands there all the same, with the remark.
     """
-    why = f"the model misses these records by {times:.2g} times the noise; diagnose first"
+    why = f"the model misses these records by {times_text(times)} the noise; diagnose first"
     if judged.verdict == "at-bound":
         return judged.noted(f"Not to be believed before the misfit is explained: {why}.")
     text = f"Not judged: {why}. Against that misfit it is {judged.verdict}; "
     text += f"against the noise alone it would be known to ±{_with_unit(half, judged.unit)}."
     return replace(judged, verdict="not-judged", reason=text)
+
+
+def misfit_made(judged: Verdict, times: float, half: float) -> Verdict:
+    """A weak verdict with the remark that only the misfit makes it so. times: the misfit over the noise. half: as above."""
+    return judged.noted(
+        f"That is the misfit's doing, {times_text(times)} the noise: against the noise alone it would be known to "
+        f"±{_with_unit(half, judged.unit)}; diagnose first."
+    )
 
 
 def lost(name: str, words: str, value: float, unit: str) -> Verdict:
@@ -162,19 +174,32 @@ def closed(
     judged = replace(judged, collinearity=collinearity, partner=partner)
     span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
     if share > WIDE or collinearity > COLLINEAR:
-        told = f"It is known only to lie in {span}"
-        if share <= 1.0 or math.isfinite(free.max - free.min) or free.min > 0:
+        told = _where(profile, span, share)
+        ends = (profile.lower.crossing, profile.upper.crossing)
+        if ends == (None, None):
+            pass  # the width of the bounds is no result
+        elif share <= 1.0 or math.isfinite(free.max - free.min) or free.min > 0:
             told += f", ±{100 * share:.3g} % {of}"
         else:
-            told += ", either side of its own value; it has no bounds, and its card no scale, to compare that with"
+            told += ", wider than its value; it has no bounds, and its card no typical size, to compare that with"
         if collinearity > COLLINEAR:
-            told += f", and {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
+            told += f", {'but' if share <= WIDE else 'and'} {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
         return replace(judged, reason=f"{told}.")
     text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
     if collinearity > 0.5 * COLLINEAR:
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
     relative = std / abs(profile.value) if profile.value else None
     return replace(judged, verdict="identifiable", reason=f"{text}.", std=std, relative_std=relative)
+
+
+def _where(profile: Profile, span: str, share: float) -> str:
+    """What the profile says of a weak one; an end that is only the parameter's own bound is no finding of the data."""
+    low, high = profile.lower.crossing, profile.upper.crossing
+    if low is not None and high is not None:
+        return f"It is known {'only ' if share > WIDE else ''}to lie in {span}"
+    if low is not None or high is not None:
+        return f"It is known only to lie in {span}, where the {'upper' if high is None else 'lower'} end is its physical bound"
+    return f"These data do not narrow its physical bounds, {span}"
 
 
 def scale_of(free: Free, value: float) -> tuple[float, str]:

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.model.definition import Model
 from hvdc_ident.parameters import Parameter
@@ -50,7 +51,7 @@ def test_what_only_the_misfit_hides_is_not_judged_and_free_for_a_diagnosis() -> 
     c = report.parameters["c"]
     assert c.verdict == "not-judged" and report.not_judged == ("c",)
     times = np.sqrt(report.pilot["chi2_per_dof"])
-    assert f"misses these records by {times:.2g} times the noise; diagnose first" in c.reason
+    assert f"misses these records by {times_text(times)} the noise; diagnose first" in c.reason
     # the half-width of white noise, from the normal equations
     columns = np.column_stack([np.ones_like(T), T, T**2 / 20])
     half = 1.96 * NOISE * np.sqrt(np.linalg.inv(columns.T @ columns)[2, 2])
@@ -141,3 +142,17 @@ def test_a_misfit_is_told_first_and_beside_every_interval() -> None:
     assert first.startswith("The model does not explain these data: the residuals are 40 times the noise.")
     assert a.endswith("(chi2/dof 1.6e+03)") and "chi2" not in b
     assert "chi2" not in "".join(told({**data, "misspecified": False}))
+
+
+@pytest.mark.parametrize("high", [3.0, 50.0])
+def test_a_weak_verdict_that_the_misfit_makes_says_so_and_takes_no_bound_for_a_finding(high) -> None:
+    plant = closed(lambda t, p: (p["k"] * t, {"k": t}), k=Parameter(1.0, min=0.1, max=high))
+    y = 2.0 * T + 0.2 * np.sin(12.0 * T) + NOISE * np.random.default_rng(1).normal(size=T.size)
+    report = identifiability(plant, [recorded("e", T, {"y": NOISE}, y=y)], [Free("k", 1.0, 0.1, high)], starts=2)
+    k = report.parameters["k"]
+    assert k.verdict == "weak" and k.ci95[0] == 0.1
+    whole = k.ci95[1] == high
+    assert whole == (high == 3.0)
+    assert ("do not narrow its physical bounds" if whole else "the lower end is its physical bound") in k.reason
+    half = 1.96 * NOISE / np.sqrt(T @ T)  # of white noise, from the normal equation
+    assert float(k.reason.split("±")[-1].split(";")[0]) == pytest.approx(half, rel=2e-3)

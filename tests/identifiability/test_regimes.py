@@ -11,6 +11,7 @@ from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.model.definition import Model, State
+from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import recorded
 
 TIME = np.linspace(0.0, 3.0, 151)
@@ -92,3 +93,17 @@ def test_a_regime_far_from_the_start_counts() -> None:
     report = judged(model, data, k=(0.2, 0.1, 4.0), g=(4.0, 0.25, 4.0))
     assert {n: v.verdict for n, v in report.parameters.items()} == {"k": "identifiable", "g": "identifiable"}
     assert report.parameters["k"].value == pytest.approx(3.2, rel=5e-3)
+
+
+def test_a_level_above_all_that_the_records_reach_is_held_and_its_one_sided_limit_told() -> None:
+    """Any level above the largest k*u, 3, is as good: where a search left it is no estimate."""
+    values = {"k": 2.0, "top": Parameter(8.0, min=1.0, max=20.0)}
+    model = behind_an_integrator("never-reached", "min(k*u, top)", **values)
+    data = record(0.75 * U, rate=RATE)
+    for given in (8.0, 15.0):
+        report = judged(model, data, k=(2.0, 0.5, 4.0), top=(given, 1.0, 20.0))
+        top = report.parameters["top"]
+        assert top.verdict == "practically-unidentifiable" and "from above" in top.reason
+        assert report.identifiable == ("k",) and report.held["top"][0] == given
+        assert top.ci95[0] == pytest.approx(3.0, rel=2e-3)
+        assert "with 95 % confidence it is above " in top.reason
