@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -112,9 +113,11 @@ def told(data: Mapping[str, Any]) -> list[str]:
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
         given = f" (given {data['candidates'][name]['given']:.6g})"
-        lines.append(f"{name} = {e['value']:.6g}{unit}{given}{_interval(e['ci95'], beside)}" + _note(e))
+        value = f"{e['value']:.{_figures(e['ci95'])}g}"
+        lines.append(f"{name} = {value}{unit}{given}{_interval(e['ci95'], beside)}" + _note(e))
     held = [n for n in data["candidates"] if n not in data["estimates"]]
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
+    lines += _conditions(data)
     lines += response_lines(data.get("responses", ()), "fitted")
     return lines + _searched(data)
 
@@ -141,7 +144,28 @@ def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:
         return ""
     if low is None or high is None:
         return f", 95 %: {'below' if low is None else 'above'} {high if low is None else low:.6g} ({beside})"
-    return f", 95 %: {low:.6g} to {high:.6g} ({beside})"
+    figures = _figures(ci95)
+    return f", 95 %: {low:.{figures}g} to {high:.{figures}g} ({beside})"
+
+
+def _figures(ci95: Sequence[float | None] | None) -> int:
+    """Return the significant figures that tell the ends of an interval apart: 6, or two more than they share; 15 at most."""
+    low, high = ci95 or (None, None)
+    if low is None or high is None or low >= high:
+        return 6
+    return min(15, max(6, math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))) + 2))
+
+
+def _conditions(data: Mapping[str, Any]) -> list[str]:
+    """The held parameters on whose values the estimates rest: those that these records do not tell, yet answer to."""
+    given = {n for e in data["estimates"].values() for n in e["conditional_on"]}
+    given |= {n for n, why in data["held"].items() if why.startswith(("practically-unidentifiable", "not-judged"))}
+    names = ", ".join(n for n in data["candidates"] if n in given and n in data["held"])
+    if not names or not data["fitted"]:
+        return []
+    return [
+        f"The estimates and their intervals hold for {names} as held: another value there may move them beyond these."
+    ]
 
 
 def _note(estimate: Mapping[str, Any]) -> str:
