@@ -13,10 +13,26 @@ from hvdc_ident.units import PREFIXED, PREFIXES, UNITS, conversion, same_unit
 SIGN_SHARE, OTHER_SHARE, BOTH_SHARE = 0.5, 0.4, 0.1
 """Prior probabilities, given that a channel is wrong: its sign (the commonest mistake), one of the other known
 conversions (all alike), or both."""
+EXCHANGE_SHARE = 0.1
+"""Prior probability, given that channels are wrong, that two columns are exchanged: as rare as two mistakes in one channel."""
 
 GRID = (50.0, 60.0)  # Hz
 LARGEST = 1e6
-ELECTRICAL = ("V", "A", "W", "var", "VA")
+AMPLITUDES, POWERS = ("V", "A"), ("W", "var", "VA")
+ELECTRICAL = (*AMPLITUDES, *POWERS)
+OF_AMPLITUDES = {
+    "sqrt(2): peak for rms": sqrt(2.0),
+    "1/sqrt(2): rms for peak": 1.0 / sqrt(2.0),
+    "sqrt(3): line to line for phase": sqrt(3.0),
+    "1/sqrt(3): phase for line to line": 1.0 / sqrt(3.0),
+}
+OF_POWERS = {
+    "3/2: power of dq peak values": 1.5,
+    "2/3: power of dq peak values": 2.0 / 3.0,
+    "3: all phases for one": 3.0,
+    "1/3: one phase for all": 1.0 / 3.0,
+}
+OF_POLES = {"2: both poles for one": 2.0, "1/2: one pole for both": 0.5}
 NAMES = {"%": "per cent", "deg": "degrees", "rad": "radians", "rpm": "1/min"}
 
 
@@ -82,8 +98,10 @@ def _of_unit(unit: str) -> list[tuple[str, float, float]]:
         found += [
             line for f in GRID for line in ((f"in Hz of {f:g}", f, 0.0), (f"in rad/s of {f:g} Hz", 2 * pi * f, 0.0))
         ]
-    if pu or any(conversion(unit, b) for b in ELECTRICAL):
-        found += _electrical()
+    if pu or any(conversion(unit, b) for b in AMPLITUDES):
+        found += _factors({**OF_AMPLITUDES, **OF_POLES})
+    if pu or any(conversion(unit, b) for b in POWERS):
+        found += _factors({**OF_POWERS, **({} if pu else OF_POLES)})
     if same_unit(unit, "Hz"):
         found += [
             ("in rad/s", 2 * pi, 0.0),
@@ -95,27 +113,21 @@ def _of_unit(unit: str) -> list[tuple[str, float, float]]:
     return found
 
 
-def _electrical() -> list[tuple[str, float, float]]:
-    sizes = {
-        "sqrt(2): peak for rms": sqrt(2.0),
-        "1/sqrt(2): rms for peak": 1.0 / sqrt(2.0),
-        "sqrt(3): line to line for phase": sqrt(3.0),
-        "1/sqrt(3): phase for line to line": 1.0 / sqrt(3.0),
-        "2: both poles for one": 2.0,
-        "1/2: one pole for both": 0.5,
-        "3/2: power of dq peak values": 1.5,
-        "2/3: power of dq peak values": 2.0 / 3.0,
-        "3: all phases for one": 3.0,
-        "1/3: one phase for all": 1.0 / 3.0,
-    }
+def _factors(sizes: Mapping[str, float]) -> list[tuple[str, float, float]]:
     return [(f"a factor of {name}", size, 0.0) for name, size in sizes.items()]
 
 
 def _of_bases(unit: str, parameters: Mapping[str, Parameter]) -> list[tuple[str, float, float]]:
-    """Bases among the parameters: their values for a per-unit signal, and the ratios of two of one kind."""
-    if not same_unit(unit, "pu"):
-        return []
+    """Bases among the parameters: their values for a per-unit signal, and the ratios of two of one kind; for a signal in
+    V, A, W, var or VA those of its kind, that it may have been divided by."""
     bases = {n: p for n, p in parameters.items() if p.value > 0.0 and any(conversion(p.unit, b) for b in ELECTRICAL)}
+    if not same_unit(unit, "pu"):
+        of_kind = [(n, p, by[0] * p.value) for n, p in bases.items() if (by := conversion(p.unit, unit)) is not None]
+        return [
+            (f"{what} of {n} = {p.value:g} {p.unit}", size / base, 0.0)
+            for n, p, base in of_kind
+            for what, size in (("per unit", 1.0), ("in per cent", 100.0))
+        ]
     found = [(f"in {p.unit} of the base {n} = {p.value:g}", p.value, 0.0) for n, p in bases.items()]
     for (a, one), (b, other) in permutations(bases.items(), 2):
         by = conversion(one.unit, other.unit)

@@ -1,11 +1,12 @@
-"""Mistakes that show in all outputs of an experiment at once: an input in another unit or of the other sign, the time in
-another unit."""
+"""Mistakes that show in several outputs of an experiment at once: two columns exchanged, an input in another unit or of
+the other sign, the time in another unit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -16,22 +17,24 @@ from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate import engine
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.study.conversions import LARGEST, Conversion, input_conversions
-from hvdc_ident.study.rest_comparison import FINEST, NONE, Comparison, apart, freed, run_of
+from hvdc_ident.study.conversions import EXCHANGE_SHARE, LARGEST, Conversion, input_conversions
+from hvdc_ident.study.rest_comparison import FINEST, Comparison, apart, freed, run_of
 from hvdc_ident.trajectory import Array
 
 SCALE = math.log(1.0 / FINEST)
 """The range of a mismatch: its logarithm, from FINEST to 1."""
 ANYTHING = 4.0 * math.log(LARGEST)
 """The range of an input's level against the model's: its logarithm, up and down, with either sign."""
+SMALLEST_FACTOR = math.sqrt(2.0)
+"""The smallest factor between two ways of counting a quantity (peak and rms); a smaller one is another operating point."""
 POSITIVE = math.log(3.0)
 """Log odds from which evidence is positive (Kass, Raftery 1995): enough for a question, which is all that is asked."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What would explain all outputs of an experiment at once. channel: "input NAME" or "time"; suggestion: in a few words;
-    text: in a sentence."""
+    """What would explain several outputs of an experiment at once. channel: "input NAME", "time", or two outputs;
+    suggestion: in a few words; text: in a sentence."""
 
     channel: str
     suggestion: str
@@ -53,12 +56,12 @@ def common_cause(
     misfit of the movement decides.
     """
     best: tuple[float, Cause | None] = (max(odds, POSITIVE), None)
-    for name, signal, c, prior in _input_mistakes(simulator.model, e) if doubted else ():
-        run = run_of(simulator, e.with_(inputs=e.inputs | {name: _scaled(signal, c)}))
+    for inputs, prior, cause in _input_mistakes(simulator.model, e) if doubted else ():
+        run = run_of(simulator, e.with_(inputs=e.inputs | inputs))
         if not isinstance(run, str):
-            total = prior + _gain(own, run)
+            total = prior + sum(c.log_odds_by(Comparison.of(c.record, run[c.record.output])) for c in own)
             if total > best[0]:
-                best = total, _input_cause(simulator.model, name, signal, c)
+                best = total, cause
     mistakes = _time_mistakes(simulator.model, e)
     before = _misfits(freed(simulator, e, candidates, own)) if mistakes else {}
     for factor, unit in mistakes:
@@ -69,7 +72,7 @@ def common_cause(
             after = _misfits(scaled)
             total = sum(math.log(before[o] / after[o]) for o in before if o in after) - math.log(len(mistakes))
             if total > best[0]:
-                text = f"none of the model's modes lies between a row and the record's length: is the time in {unit}?"
+                text = f"no time constant of the model lies between the sampling step and the record's length: is the time in {unit}?"
                 best = total, Cause("time", f"in {unit}", text)
     return best[1]
 
@@ -79,46 +82,97 @@ def _misfits(comparisons: Sequence[Comparison]) -> dict[str, float]:
     return {c.record.output: min(m.misfit for m in c.movements) or FINEST for c in comparisons if c.movements}
 
 
-def _gain(own: Sequence[Comparison], run: Mapping[str, Array]) -> float:
-    """The log odds of another run of the model against the given one, over all outputs of an experiment."""
-    total = 0.0
-    for c in own:
-        other = Comparison.of(c.record, run[c.record.output])
-        total += math.log(c.level_mismatch(NONE) / other.level_mismatch(NONE))
-        total += math.log(c.movement_mismatch(NONE) / other.movement_mismatch(NONE))
-    return total
+def exchanged(own: Sequence[Comparison], named: Mapping[int, float], sure: float) -> dict[int, tuple[Cause, float]]:
+    """By the id of a comparison: the two outputs of one experiment whose columns seem to be exchanged, with its log odds.
+
+    own: of one experiment. named: log odds of what each suggests by itself, by id. Both outputs have to differ, and each
+    has to gain by the exchange more than the choice costs, ln 2, as by a conversion.
+    """
+    off = [c for c in own if c.differs(sure) or c.is_moved_otherwise(sure)]
+    tried = []
+    for a, b in combinations(off, 2):
+        one, other = Comparison.of(a.record, b.simulated), Comparison.of(b.record, a.simulated)
+        if a.is_matched_by(one) and b.is_matched_by(other):
+            gain = a.log_odds_by(one) + b.log_odds_by(other) - 2.0 * math.log(2.0)
+            total = gain + math.log(EXCHANGE_SHARE / math.comb(len(own), 2))
+            if total > max(POSITIVE, named.get(id(a), 0.0) + named.get(id(b), 0.0)):
+                tried.append((total, a, b))
+    found: dict[int, tuple[Cause, float]] = {}
+    for total, a, b in sorted(tried, key=lambda line: -line[0]):
+        if id(a) not in found and id(b) not in found:
+            cause = _exchange_cause(a, b)
+            found |= {id(c): (cause, total / 2.0) for c in (a, b)}
+    return found
 
 
-def _input_mistakes(model: AnyModel, e: Experiment) -> Iterable[tuple[str, InputSignal, Conversion, float]]:
-    """The recorded inputs with what may have been done to them, and the log of its prior odds.
+def _exchange_cause(a: Comparison, b: Comparison) -> Cause:
+    one, other = a.record.output, b.record.output
+    text = f"{one} moves as the model's {other} does and {other} as its {one}"
+    if None not in (a.recorded, b.recorded, a.model, b.model):
+        text = (
+            f"before the event {one} reads {a.recorded:+.4g} and {other} {b.recorded:+.4g}, "
+            f"the model rests at {a.model:+.4g} and {b.model:+.4g}"
+        )
+    return Cause(f"{one}, {other}", "columns exchanged", f"{text}: are the columns of {one} and {other} exchanged?")
 
-    A level that comes nearer to the model's own once a large factor is undone speaks for that as a level of an output
-    does; that an input's sign differs from the model's speaks for nothing.
+
+def _input_mistakes(model: AnyModel, e: Experiment) -> Iterable[tuple[Mapping[str, InputSignal], float, Cause]]:
+    """The recorded inputs with what may have been done to them undone, the log of its prior odds, and what it is called.
+
+    A level that comes nearer to the model's own once a large factor, or an exchange of two columns, is undone speaks for
+    that as a level of an output does; that an input's sign differs from the model's speaks for nothing. A factor that is
+    no known conversion is tried too, so large that it brings the level to the model's own: of that the level tells nothing.
     """
     recorded = [n for n in e.inputs if n in model.inputs and n not in e.drive]
     for name in recorded:
         signal, own = e.inputs[name], model.inputs[name].value
         level = float(signal.values[0])
-        for c in input_conversions(model.inputs[name].unit):
+        known = input_conversions(model.inputs[name].unit)
+        for c in known:
             prior = math.log(c.prior / len(recorded))
             if c.factor > 0.0 and own and level:
-                zero = FINEST * abs(own)
-                distance = max(apart(c.undone(level), own, zero), FINEST)
-                if distance >= apart(level, own, zero):
+                speaks = _nearer_level(level, c.undone(level), own)
+                if speaks is None:
                     continue
-                prior += math.log(ANYTHING / (2.0 * SCALE * distance))
-            yield name, signal, c, prior
+                prior += speaks
+            yield {name: _scaled(signal, c)}, prior, _input_cause(model, name, signal, c)
+        if own * level > 0.0 and abs(math.log(level / own)) > math.log(SMALLEST_FACTOR):
+            c = Conversion("per unit, or on another base", level / own)
+            prior = math.log(known[-1].prior / len(recorded))
+            yield {name: _scaled(signal, c)}, prior, _input_cause(model, name, signal, c)
+    for a, b in combinations(recorded, 2):
+        one, other = e.inputs[a], e.inputs[b]
+        levels, owns = (float(one.values[0]), float(other.values[0])), (model.inputs[a].value, model.inputs[b].value)
+        speak = [_nearer_level(levels[0], levels[1], owns[0]), _nearer_level(levels[1], levels[0], owns[1])]
+        prior = math.log(EXCHANGE_SHARE / math.comb(len(recorded), 2))
+        prior += sum(s for s in speak if s is not None) if None not in speak else 0.0
+        yield {a: other, b: one}, prior, _input_exchange(a, b, levels, owns)
+
+
+def _nearer_level(level: float, undone: float, own: float) -> float | None:
+    """The log odds by which an input's level speaks for what was undone; None where that comes no nearer to the model's."""
+    zero = FINEST * abs(own)
+    if not zero:
+        return None
+    distance = max(apart(undone, own, zero), FINEST)
+    return math.log(ANYTHING / (2.0 * SCALE * distance)) if distance < apart(level, own, zero) else None
 
 
 def input_after_failure(simulator: ModelSimulator, e: Experiment) -> list[str]:
     """A line for the input whose level, as recorded, leaves the model without a run, where undoing a unit gives one."""
     found = []
-    for name, signal, c, prior in _input_mistakes(simulator.model, e):
-        if prior > 0.0 and not isinstance(
-            run_of(simulator, e.with_(inputs=e.inputs | {name: _scaled(signal, c)})), str
-        ):
-            found.append((prior, f"{e.name}: {_input_cause(simulator.model, name, signal, c).text}"))
+    for inputs, prior, cause in _input_mistakes(simulator.model, e):
+        if prior > 0.0 and not isinstance(run_of(simulator, e.with_(inputs=e.inputs | inputs)), str):
+            found.append((prior, f"{e.name}: {cause.text}"))
     return [max(found)[1]] if found else []
+
+
+def _input_exchange(a: str, b: str, levels: tuple[float, float], owns: tuple[float, float]) -> Cause:
+    text = (
+        f"before the event input {a} reads {levels[0]:.4g} and {b} {levels[1]:.4g}, the model's values are {owns[0]:.4g} and "
+        f"{owns[1]:.4g}: are the columns of {a} and {b} exchanged?"
+    )
+    return Cause(f"input {a}", f"columns of {a} and {b} exchanged", text)
 
 
 def _input_cause(model: AnyModel, name: str, signal: InputSignal, c: Conversion) -> Cause:

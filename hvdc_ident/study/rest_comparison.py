@@ -66,10 +66,11 @@ class Movement:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A record against the model. recorded, error: level and standard error, None where there is no level. model: at the
-    given values. levels: of all runs; movements: of all runs in which both move."""
+    """A record against the model. simulated: (n,) at the given values. recorded, error: level and standard error, None
+    where there is no level. model: at the given values. levels: of all runs; movements: of all runs in which both move."""
 
     record: Record
+    simulated: Array
     recorded: float | None
     error: float
     model: float | None
@@ -86,11 +87,12 @@ class Comparison:
         size = movement.size if movement else 0.0
         moved = (movement,) if movement else ()
         if not record.before.any():
-            return cls(record, None, 0.0, None, noise, (), moved, size)
+            return cls(record, simulated, None, 0.0, None, noise, (), moved, size)
         gap = (record.values - simulated)[record.before]
         model = float(simulated[record.before].mean())
         error = _error_of_mean(gap, noise, record.deterministic)
-        return cls(record, float(record.values[record.before].mean()), error, model, noise, (model,), moved, size)
+        recorded = float(record.values[record.before].mean())
+        return cls(record, simulated, recorded, error, model, noise, (model,), moved, size)
 
     def with_run(self, simulated: Array) -> Comparison:
         """The same with one more run of the model."""
@@ -136,16 +138,32 @@ class Comparison:
     def is_matched(self, c: Conversion) -> bool:
         """Return whether the conversion, undone, brings the level far nearer; or the movement, and leaves the level within a share
         of the movement."""
-        level = self.level_mismatch(c)
+        return self._nearer(self.level_mismatch(c), self.movement_mismatch(c))
+
+    def is_matched_by(self, other: Comparison) -> bool:
+        """Return whether another run, or another output, matches the record as a conversion would have to."""
+        other = self._as_sized(other)
+        return self._nearer(other.level_mismatch(NONE), other.movement_mismatch(NONE))
+
+    def _as_sized(self, other: Comparison) -> Comparison:
+        """The other with no larger movement than this one: beside a run that wanders off every level would look near."""
+        return replace(other, size=min(self.size, other.size))
+
+    def _nearer(self, level: float, movement: float) -> bool:
         if STRONG * level <= self.level_mismatch(NONE):
             return True
-        follows = STRONG * self.movement_mismatch(c) <= self.movement_mismatch(NONE)
-        return follows and (self.recorded is None or STRONG * level <= 1.0)
+        return STRONG * movement <= self.movement_mismatch(NONE) and (self.recorded is None or STRONG * level <= 1.0)
 
     def log_odds(self, c: Conversion) -> float:
         """Of the conversion against a model that is off, without priors."""
         level = math.log(self.level_mismatch(NONE) / self.level_mismatch(c))
         return level + math.log(self.movement_mismatch(NONE) / self.movement_mismatch(c))
+
+    def log_odds_by(self, other: Comparison) -> float:
+        """Of another run, or another output, against this one, without priors."""
+        other = self._as_sized(other)
+        level = math.log(self.level_mismatch(NONE) / other.level_mismatch(NONE))
+        return level + math.log(self.movement_mismatch(NONE) / other.movement_mismatch(NONE))
 
 
 def apart(a: float, b: float, zero: float) -> float:

@@ -28,7 +28,7 @@ from hvdc_ident.fit.unknown import Free
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.conversions import Conversion, conversions
-from hvdc_ident.study.rest_causes import POSITIVE, Cause, common_cause, input_after_failure
+from hvdc_ident.study.rest_causes import POSITIVE, Cause, common_cause, exchanged, input_after_failure
 from hvdc_ident.study.rest_comparison import FINEST, NONE, Comparison, Record, freed, run_of
 from hvdc_ident.words import listed
 
@@ -50,7 +50,7 @@ class RestLevel:
     recorded: the mean of the recorded rows before the event; error: its standard error. model: the model's at its given
     values; low, high: what it can be with the candidates within their bounds. difference: recorded - model;
     noise_units: the same over the noise of a single row. slope: the recorded movement over the simulated.
-    channel: what the suggestion is about: the output, "input NAME" or "time". factor: what the recording seems to be
+    channel: what the suggestion is about: the output, two outputs ("P, Q"), "input NAME" or "time". factor: what the recording seems to be
     multiplied by; suggestion: what that is, in a few words; text: in a sentence, empty where there is nothing to say.
     """
 
@@ -160,10 +160,14 @@ def _judged(
     found = []
     for name in dict.fromkeys(c.record.experiment for c in comparisons):
         own = [c for c in comparisons if c.record.experiment == name]
-        odds = sum(named[id(c)][1] for c in own if id(c) in named)
+        alone = {id(c): named[id(c)][1] for c in own if id(c) in named}
+        swapped = exchanged(own, alone, sure)
+        odds = sum((alone | {k: gain for k, (_, gain) in swapped.items()}).values())
         doubted = any(id(c) in named or c.differs(sure) for c in own)
         cause = common_cause(simulator, experiments[name], candidates, own, odds, doubted)
-        found += [_told(c, named.get(id(c), (None, 0.0))[0], cause, sure) for c in own]
+        found += [
+            _told(c, named.get(id(c), (None, 0.0))[0], cause or swapped.get(id(c), (None, 0.0))[0], sure) for c in own
+        ]
     return found
 
 
