@@ -266,3 +266,42 @@ def test_a_sound_study_is_not_troubled(tmp_path: Path) -> None:
     assert run(app, ["simulate", path]).stdout.splitlines()[0].startswith("simulate: done")
     assert run(app, ["report", path]).exit_code == 0
     assert "one that the model can rest at" in (tmp_path / "s-results" / "report.html").read_text("utf-8")
+
+
+TWO = """schema = 1
+name = "two"
+[parameters]
+T = {value = 0.3, unit = "s", min = 0.05, max = 2}
+k = {value = 3.0}
+[inputs]
+u = {value = 1.02}
+[states]
+x = {derivative = "(u - x)/T"}
+[outputs]
+y = "x"
+z = "5 - k*x"
+"""
+
+
+def two(folder: Path, first: str, second: str, slope: float = 3.0) -> RestLevels:
+    """The comparison for a plant of y = x, z = 5 - slope x, its columns recorded under the names `first` and `second`."""
+    (folder / "two.toml").write_text(TWO)
+    random = np.random.default_rng(5)
+    x = response(1.02, 1.1)
+    y, z = (v + 1e-3 * random.standard_normal(TIME.size) for v in (x, 5.0 - slope * x))
+    u = {"u": InputSignal.step(1.0, 1.02, 1.1)}
+    std = FrozenMap({"y": 1e-3, "z": 1e-3})
+    seen = trajectory(TIME, {first: y, second: z})
+    return compare_rest(
+        load_model(folder / "two.toml"), (experiment("step", TIME, u, measured=seen, noise=std, event=1.0),), CANDIDATES
+    )
+
+
+def test_exchanged_columns_are_named(tmp_path: Path) -> None:
+    (line,) = two(tmp_path, "z", "y").lines
+    assert "are the columns of z and y exchanged?" in line
+
+
+def test_columns_in_their_place_are_not_called_exchanged(tmp_path: Path) -> None:
+    assert not two(tmp_path, "y", "z").lines
+    assert not any("exchanged" in line for line in two(tmp_path, "y", "z", slope=3.4).lines)
