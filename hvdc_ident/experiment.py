@@ -167,7 +167,7 @@ class Experiment:
 
     @property
     def recording(self) -> dict[str, Any]:
-        """What became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, not_recorded}.
+        """Return what became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, not_recorded}.
 
         rows: compared or not. dropped: of the file, left out. jumps: instants with two rows. time_unit: as the file or
         the study says it, None where neither does (then s). not_recorded: by output the number of rows without a value.

@@ -51,13 +51,13 @@ class Size:
 
     @property
     def times(self) -> float | None:
-        """How many times the noise the residual is."""
+        """Return the residual as a multiple of the noise."""
         return None if self.ratio is None else float(np.sqrt(self.ratio))
 
 
 @dataclass(frozen=True)
 class Adequacy:
-    """What the size of the residuals says.
+    """The verdict on the size of the residuals.
 
     verdict: fits; does-not-fit; noise-understated (white residuals above the noise told: not the mark of a wrong model);
     noise-overstated; not-judged (no noise is known but the residual's own). chi2_per_dof: over all outputs, against the noise
@@ -213,7 +213,7 @@ def _words(
 
 
 def _line(output: str, size: Size, source: str) -> str:
-    """What is said of one output."""
+    """Return the sentence on one output."""
     if size.verdict == "fits" and size.ratio is None:
         return f"{output} is met to {FLOOR:g} of its range, and the intervals are of what is left below that"
     if size.verdict == "not-judged" or size.times is None or size.ratio is None:

@@ -164,7 +164,7 @@ class Walker:
 
     @cached_property
     def _parabola(self) -> float:
-        """How far off a parabola would cross, in scaled coordinates; infinite where it does not rise."""
+        """Return how far off a parabola would cross, in scaled coordinates; infinite where it does not rise."""
         slope = self.space.slope(self.best.theta)
         h = self.best.at.curvature * np.outer(slope, slope)
         others = ~self.fixed

@@ -193,7 +193,7 @@ def closed(
 
 
 def _where(profile: Profile, span: str, share: float) -> str:
-    """What the profile says of a weak one; an end that is only the parameter's own bound is no finding of the data."""
+    """Return the words for the profile of a weak parameter; an end that is only the parameter's own bound is no finding of the data."""
     low, high = profile.lower.crossing, profile.upper.crossing
     if low is not None and high is not None:
         return f"It is known {'only ' if share > WIDE else ''}to lie in {span}"
@@ -203,7 +203,7 @@ def _where(profile: Profile, span: str, share: float) -> str:
 
 
 def scale_of(free: Free, value: float) -> tuple[float, str]:
-    """What a width is compared with, in the parameter's unit, and what that is in words.
+    """Return the scale that a width is compared with, in the parameter's unit, and what that is in words.
 
     The value where it is positive by its bounds, else the range; without bounds the value too, or the card's typical size
     where that is more. Never the start, which is the user's guess and would make the verdict one.

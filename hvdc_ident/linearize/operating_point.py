@@ -72,7 +72,7 @@ class OperatingPoint:
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """What a reader has to know of the point: that it is unstable, not the model's own one, or far off; with the other one's place."""
+        """Remarks on the point: that it is unstable, not the model's own one, or far off; with the other one's place."""
         from hvdc_ident.linearize.standing import notes
 
         return notes(self)

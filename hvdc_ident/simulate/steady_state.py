@@ -134,7 +134,7 @@ class Equilibria:
     # --- the model's own steady state ---
 
     def _own(self, model: Model) -> Anchor | None:
-        """What the guesses lead to; where some states have one, of what the search from several places finds the nearest.
+        """Return the steady state that the guesses lead to; where some states have one, the nearest of several searches.
 
         Newton's method may leave a guess for a far equilibrium, as where a limit holds on the way. Where it moves a guessed
         state by more than its size, the slow ways, which stay near or follow the model, are asked too.

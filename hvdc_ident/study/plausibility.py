@@ -21,7 +21,7 @@ FINISHED = ("converged", "at-bound", "two-optima")
 
 
 def violations(stage: str, data: Mapping[str, Any]) -> list[str]:
-    """What keeps a stage's JSON from being told as a result, in words; empty where nothing does.
+    """Return what keeps a stage's JSON from being told as a result, in words; empty where nothing does.
 
     stage: its name. A stage without checks of its own has those that hold for every result.
     """

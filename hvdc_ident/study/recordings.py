@@ -290,7 +290,7 @@ def _conversion_words(
     data: Trajectory,
     mapping: tuple[float, float],
 ) -> str:
-    """What was done to a column beyond what the study states: the conversion of its unit; "" where nothing was."""
+    """Return what was done to a column beyond what the study states: the conversion of its unit; "" where nothing was."""
     line = table.columns.get(signal) or schema.Column()
     if line.scale is not None or line.base is not None or mapping == (1.0, line.offset or 0.0):
         return ""

@@ -81,7 +81,7 @@ class RestLevels:
 
     @property
     def lines(self) -> list[str]:
-        """What a user has to know before anything is fitted; what several experiments show alike is told once."""
+        """Sentences to be read before anything is fitted; what several experiments show alike is told once."""
         groups: dict[tuple[str, str | None, str], list[RestLevel]] = {}
         for level in self.levels:
             if level.text:
@@ -255,7 +255,7 @@ def _reading(c: Comparison, conversion: Conversion) -> str:
 
 
 def _recorded(record: Record) -> RestLevel:
-    """What is known without the model."""
+    """Return the levels as far as they are known without the model."""
     mean = float(record.values[record.before].mean()) if record.before.any() else None
     return RestLevel(record.experiment, record.output, record.unit, recorded=mean)
 

@@ -1,4 +1,4 @@
-"""What a reader has to know of the steady states that a study's runs begin at."""
+"""Remarks on the steady states that a study's runs begin at."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def _given(study: Study, why: str = "") -> ValueSet:
 
 
 def _outcome(fit: Mapping[str, Any]) -> str:
-    """How a fit ended, and how far above the noise: what a reader has to know of its values."""
+    """Return how a fit ended, and how far above the noise: what a reader has to know of its values."""
     held = [n for n in fit.get("candidates", {}) if n not in (fit.get("fitted") or [])]
     chi = fit.get("chi2_per_dof")
     verdict = str((fit.get("adequacy") or {}).get("verdict", ""))

@@ -133,7 +133,7 @@ WORDS = {
 
 
 def _beside(data: Mapping[str, Any]) -> str:
-    """What every interval has beside it: how large the residual is against the noise the interval rests on."""
+    """Return the remark beside every interval: how large the residual is against the noise the interval rests on."""
     chi2 = (data.get("adequacy") or {}).get("chi2_per_dof")
     return f"chi2/dof {chi2:.3g}" if chi2 is not None else "noise from the residual"
 
