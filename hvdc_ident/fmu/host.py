@@ -77,17 +77,35 @@ class Host:
         self.__post_init__()
 
     def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> tuple[dict[str, Any], dict[str, Array]]:
-        """The worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker."""
+        """The worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker.
+
+        An answer {"again": 1} says that a new process may do what this one, which was used before, cannot: the process
+        is replaced and asked once more, and only its answer counts.
+        """
         with self._lock:
             worker = self._ready()
-            worker.runs += 1
-            try:
-                worker.requests.send_bytes(packed(heading, arrays))
-            except OSError:
-                raise self._lost(worker, "before the run") from None
-            answer, out = self._heard(worker, self.limits.deadline, "run")
+            fresh = worker.runs == 0
+            answer, out = self._asked(worker, heading, arrays)
+            if answer.get("again") and not fresh:
+                self._end(worker)
+                worker = self._ready()
+                answer, out = self._asked(worker, heading, arrays)
+            if "failed" in answer:
+                raise self._failure(answer)
+            if answer.get("again"):
+                raise self._error("the FMU's worker wants a new process, and had one")
             self.memory = int(answer.get("memory", 0))
             return answer, out
+
+    def _asked(
+        self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]
+    ) -> tuple[dict[str, Any], dict[str, Array]]:
+        worker.runs += 1
+        try:
+            worker.requests.send_bytes(packed(heading, arrays))
+        except OSError:
+            raise self._lost(worker, "before the run") from None
+        return self._heard(worker, self.limits.deadline, "run")
 
     # --- one answer ---
 
@@ -112,18 +130,20 @@ class Host:
                 continue
             if "ended" in heading:
                 raise self._died(worker, f"in the {what}", int(heading["ended"]), int(heading["peak"]))
-            if "done" in heading:
-                return heading, arrays
             if heading.get("fatal"):
                 self._end(worker)
-            t = heading.get("time")
-            said = heading.get("said", "")
-            raise self._error(
-                heading["failed"],
-                where="" if t is None else f"t = {t:.6g} s",
-                got=f"the FMU said: {said}" if said else "",
-                hint=heading.get("hint", ""),
-            )
+            return heading, arrays
+
+    def _failure(self, heading: Mapping[str, Any]) -> SimulationError:
+        """The failure that a worker told."""
+        t = heading.get("time")
+        said = heading.get("said", "")
+        return self._error(
+            heading["failed"],
+            where="" if t is None else f"t = {t:.6g} s",
+            got=f"the FMU said: {said}" if said else "",
+            hint=heading.get("hint", ""),
+        )
 
     def _error(self, what: str, where: str = "", got: str = "", hint: str = "") -> SimulationError:
         name = self.description.path.name
@@ -200,7 +220,9 @@ class Host:
             heading = {"parent": os.getpid(), "memory": self.limits.memory, "folder": str(folder)}
             worker.requests.send_bytes(packed(heading))
             worker.requests.send_bytes(pickle.dumps(self.description))
-            self._heard(worker, self.limits.load, "loading")
+            answer, _ = self._heard(worker, self.limits.load, "loading")
+            if "failed" in answer:
+                raise self._failure(answer)
         except OSError:
             self._useless = self._lost(worker, "in the loading")
             raise self._useless from None

@@ -21,6 +21,10 @@ class RunFailed(Exception):
         self.what, self.t, self.hint = what, t, hint
 
 
+class NoInstance(RunFailed):
+    """The FMU gave no instance. In a process that had one before, a new process is worth a try: some give only one."""
+
+
 class Plant:
     """An FMU with an instance, brought to the start of a run again and again.
 
@@ -109,7 +113,7 @@ class Plant:
         except RuntimeError:
             said = f": {self.binding.messages[-1]}" if self.binding.messages else ""
             hint = "a wrong GUID, a missing licence or resource make an FMU refuse"
-            raise RunFailed(f"the FMU gave no instance{said}", hint=hint) from None
+            raise NoInstance(f"the FMU gave no instance{said}", hint=hint) from None
 
     def abandon(self) -> None:
         """Nothing; the instance is forgotten, for after a failure it cannot be trusted even to free itself."""

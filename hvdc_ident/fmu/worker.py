@@ -78,17 +78,22 @@ def _loaded(description: Any, folder: str, tell: Any) -> Any:
 
 
 def _guarded(answers: Connection, work: Any, jobs: Any = None) -> Any:
-    """What the work returns; None where it failed, which was told. A fatal failure ends the process."""
+    """What the work returns; None where it failed, which was told. A fatal failure ends the process.
+
+    A failure with "again" may have come from what the process did before: the host asks once more in a new one.
+    """
     from fmpy.fmi1 import FMICallException
 
     from hvdc_ident.fmu.messages import packed
-    from hvdc_ident.fmu.plant import RunFailed
+    from hvdc_ident.fmu.plant import NoInstance, RunFailed
 
     fatal = False
     try:
         return work()
     except RunFailed as e:
         told: dict[str, Any] = {"failed": e.what, "hint": e.hint, "time": e.t}
+        if isinstance(e, NoInstance) and jobs is not None:  # there was an instance: a process may give only one
+            told["again"] = 1
     except FMICallException as e:
         words = {2: "discard", 3: "error", 4: "fatal"}.get(e.status, f"status {e.status}")
         told, fatal = {"failed": f"{e.function} returned {words}"}, e.status not in (2, 3)

@@ -150,3 +150,13 @@ def test_nothing_of_a_worker_stays(tmp_path):
     gc.collect()
     assert process.poll() is not None and not folder.exists()
     assert len(os.listdir("/proc/self/fd")) < before
+
+
+def test_an_fmu_that_gives_one_instance_a_process_gets_a_new_process_for_each_run(tmp_path):
+    """Its reset fails too, so that every run but the first needs what the process cannot give again."""
+    once = broken("once", "{ static int made; if (made++) return 0; }", defines=("AT_RESET=return 3",))
+    model = read_fmu(build(once, tmp_path), interface="co-simulation", limits=PATIENT)
+    for lag in (0.1, 0.05, 0.1):
+        assert np.abs(simulate(model, STEP, {"T": lag})["out"] - answer(TIME, lag)).max() < 1e-6
+    assert model.host.started == 3
+    model.host.close()
