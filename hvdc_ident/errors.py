@@ -97,12 +97,37 @@ class FitError(ComputationError):
     """An estimation that did not reach an optimum."""
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "") -> UnknownNameError:
-    """An error for a name that is not among the known ones, with the nearest of them as the hint."""
+LINE = 100
+"""Characters: a message shows as many known names as a line holds, and never more than 12."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "", listing: str = "") -> UnknownNameError:
+    """Return the error for a name that is not among the known ones, with the nearest of them as the hint.
+
+    listing: what lists all of them, said where the message cannot.
+    """
     names = [str(k) for k in known]
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-    shown = ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
-    hint = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    if not near and name.strip():  # the end of a path in a hierarchy is near to none of its names
+        part = name.strip().casefold()
+        near = sorted((n for n in names if part in n.casefold()), key=len)[:3]
+    shown = ", ".join(names[: _shown(names)])
+    more = len(names) - _shown(names)
+    hints = [f"did you mean {' or '.join(repr(n) for n in near)}?"] if near else []
+    hints += [f"{listing} lists them"] if listing and more else []
     return UnknownNameError(
-        f"no {kind} '{name}'", where=where, expected=f"one of {shown}" if names else f"no {kind}s at all", hint=hint
+        f"no {kind} '{name}'",
+        where=where,
+        expected=(f"one of {shown}" + (f" and {more} more" if more else "")) if names else f"no {kind}s at all",
+        hint=" ".join(hints),
     )
+
+
+def _shown(names: list[str]) -> int:
+    """Return how many names a message shows."""
+    total = 0
+    for count, name in enumerate(names[:12]):
+        total += len(name) + 2
+        if total > LINE and count:
+            return count
+    return min(len(names), 12)

@@ -29,7 +29,7 @@ from hvdc_ident.fit import Free, Simulator
 from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model.external import AnyModel, recording
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 CLOSED = (
@@ -73,9 +73,9 @@ def diagnose(
     Raises StudyError or UnknownNameError where there is nothing to diagnose, SimulationError where the nominal model
     cannot be run.
     """
-    model = _model_of(subject)
     chosen = options or Options()
     given, free = tuple(experiments), tuple(parameters)
+    model = recording(_model_of(subject), (o for e in given for o in e.outputs))
     names: Any = "all" if effects == "all" else tuple(e.name for e in entries(effects))
     _check_material(material or {}, given)
     search = Search(

@@ -1,11 +1,11 @@
-"""What an FMU says of itself: its variables, what it can do, and what of it is used here."""
+"""An FMU's own account of itself: its variables, its abilities, and which of them are used here."""
 
 from __future__ import annotations
 
 import math
 import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,8 +24,8 @@ SETTABLE = ("parameter", "input")
 class Variable:
     """One variable. kind: its type in the FMI version. start: None where the FMU does not say it. nominal: above 0.
 
-    tunable: whether it may be set during a run. whole: whether it takes whole numbers only. also: aliases, which are
-    other names of the same value reference.
+    causality, variability: in FMI's words. tunable: whether it may be set during a run. whole: whether it takes whole
+    numbers only. also: aliases, which are other names of the same value reference.
     """
 
     name: str
@@ -37,9 +37,24 @@ class Variable:
     min: float = -math.inf
     max: float = math.inf
     description: str = ""
-    tunable: bool = False
-    continuous: bool = True
+    causality: str = "local"
+    variability: str = "continuous"
     also: tuple[str, ...] = ()
+
+    @property
+    def tunable(self) -> bool:
+        """Return whether it may be set during a run."""
+        return self.variability == "tunable"
+
+    @property
+    def continuous(self) -> bool:
+        """Return whether it may change at any instant, not at events alone."""
+        return self.variability == "continuous"
+
+    @property
+    def recordable(self) -> bool:
+        """Return whether a run can record it; a parameter stays where it is put."""
+        return self.causality not in ("parameter", "structuralParameter")
 
     @property
     def whole(self) -> bool:
@@ -49,9 +64,12 @@ class Variable:
 
 @dataclass(frozen=True)
 class Description:
-    """What a worker and a model need to know of an FMU.
+    """An FMU as a worker and a model know it.
 
     version: 2 or 3. token: the GUID or instantiation token. derivatives: value references in the order of the states.
+    variables: every scalar number by name, aliases included. arrays: sizes in words of those that are arrays, which
+    stay at their start and are not recorded. shown: names recorded where none are asked for, the outputs that it
+    declares or, without any, its states.
     completed_step: whether it wants to hear of finished integrator steps. directional: whether it offers directional
     derivatives. variable_step: whether communication steps may differ. interpolates: whether it takes the slope of
     inputs. step: communication step it suggests, s, or None.
@@ -75,6 +93,14 @@ class Description:
     interpolates: bool = False
     step: float | None = None
     text: str = ""
+    variables: FrozenMap[Variable] = field(default_factory=FrozenMap)
+    arrays: FrozenMap[str] = field(default_factory=FrozenMap)
+    shown: tuple[str, ...] = ()
+
+    def variable(self, name: str) -> Variable:
+        """Return the variable that a recorded name stands for. Raises KeyError where there is none."""
+        known = next((k for k in (self.outputs, self.states) if name in k), self.variables)
+        return known[name]
 
 
 def read_description(path: Path, interface: Interface | None = None) -> Description:
@@ -91,12 +117,12 @@ def read_description(path: Path, interface: Interface | None = None) -> Descript
     kind, chosen = _interface(path, given, interface)
     identifier = check_identifier(path, chosen.modelIdentifier)
     _check_binary(path, names, given.fmiMajorVersion, identifier)
-    variables = given.modelVariables
-    _refuse_clocks(path, variables)
+    _refuse_clocks(path, given.modelVariables)
     states, derivatives = _states(path, given) if kind == "model-exchange" else (FrozenMap(), ())
-    found = {c: [v for v in variables if v.causality == c] for c in ("parameter", "input", "output")}
-    for v in (*found["parameter"], *found["input"], *found["output"]):
-        _refuse_array(path, v)
+    numbers = [v for v in given.modelVariables if v.type in (*REAL, *WHOLE)]
+    variables = FrozenMap({v.name: _variable(v) for v in numbers if not v.dimensions})
+    found = {c: [v for v in variables.values() if v.causality == c] for c in ("parameter", "input", "output")}
+    outputs = FrozenMap({v.name: v for v in found["output"]})
     experiment = given.defaultExperiment
     return Description(
         path=path,
@@ -105,9 +131,9 @@ def read_description(path: Path, interface: Interface | None = None) -> Descript
         interface=kind,
         identifier=identifier,
         token=given.instantiationToken or "",
-        parameters=_merged(_variable(v) for v in found["parameter"] if v.type in (*REAL, *WHOLE)),
-        inputs=_merged(_variable(v) for v in found["input"] if v.type in (*REAL, *WHOLE)),
-        outputs=FrozenMap({v.name: _variable(v) for v in found["output"] if v.type in (*REAL, *WHOLE)}),
+        parameters=_merged(found["parameter"]),
+        inputs=_merged(found["input"]),
+        outputs=outputs,
         states=states,
         derivatives=derivatives,
         indicators=int(given.numberOfEventIndicators),
@@ -118,6 +144,9 @@ def read_description(path: Path, interface: Interface | None = None) -> Descript
         step=_number(getattr(chosen, "fixedInternalStepSize", None))
         or _number(experiment.stepSize if experiment else None),
         text=given.description or "",
+        variables=variables,
+        arrays=FrozenMap({v.name: _size(v) for v in numbers if v.dimensions}),
+        shown=tuple(outputs) or _named_states(given, variables),
     )
 
 
@@ -198,16 +227,27 @@ def _refuse_clocks(path: Path, variables: Iterable[Any]) -> None:
             )
 
 
-def _refuse_array(path: Path, v: Any) -> None:
+def _size(v: Any) -> str:
+    """Return an array's size in words, "2 x 3"."""
+    return " x ".join(str(n) for n in v.shape or ())
+
+
+def _refuse_array(path: Path, v: Any, given: Any) -> None:
     if v.dimensions:
-        size = " x ".join(str(n) for n in v.shape)
+        other = "use its co-simulation (interface), or " if given.coSimulation else ""
         raise ModelError(
-            "the FMU has an array among what is used, which is not supported",
+            "a state of the FMU is an array, which is not supported",
             where=f"{path}, variable '{v.name}'",
-            expected="scalar parameters, inputs, outputs and states",
-            got=f"an array of {size}",
-            hint="export its elements as scalars",
+            expected="scalar states",
+            got=f"an array of {_size(v)}",
+            hint=f"{other}export its elements as scalars",
         )
+
+
+def _named_states(given: Any, variables: FrozenMap[Variable]) -> tuple[str, ...]:
+    """Return the names of the scalar states that the model structure tells of, for co-simulation too."""
+    states = (u.variable.derivative for u in given.derivatives)
+    return tuple(dict.fromkeys(s.name for s in states if s is not None and getattr(s, "name", None) in variables))
 
 
 def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...]]:
@@ -222,7 +262,7 @@ def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...
                 f"the derivative '{derivative.name}' does not say of which state it is", where=f"{path}, ModelStructure"
             )
         state = first.get(state.valueReference, state)  # where an output has the reference too, FMPy takes the last
-        _refuse_array(path, state)
+        _refuse_array(path, state, given)
         if state.name in states:
             raise ModelError(f"the state '{state.name}' has two derivatives", where=f"{path}, ModelStructure")
         states[state.name] = _variable(state)
@@ -250,8 +290,8 @@ def _variable(v: Any) -> Variable:
         min=-math.inf if low is None else low,
         max=math.inf if high is None else high,
         description=said("description") or "",
-        tunable=v.variability == "tunable",
-        continuous=v.variability == "continuous",
+        causality=v.causality or "local",
+        variability=v.variability or ("continuous" if v.type in REAL else "discrete"),
     )
 
 
@@ -271,8 +311,6 @@ def _number(text: object) -> float | None:
 
 def _merged(variables: Iterable[Variable]) -> FrozenMap[Variable]:
     """By name, one for each value reference: what shares one is one variable under several names."""
-    from dataclasses import replace
-
     found: dict[tuple[int, bool], Variable] = {}
     for v in variables:
         key = (v.reference, v.kind in REAL)

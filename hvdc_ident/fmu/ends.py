@@ -8,6 +8,7 @@ refused.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from hvdc_ident.errors import unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fmu.grid import joined, kept_rows, refined, signal_of
 from hvdc_ident.fmu.passage import ALONG, added, entrance, exit_
-from hvdc_ident.fmu.run import bare, inputs_of, unit_of
+from hvdc_ident.fmu.run import bare, inputs_of
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.engine import simulate as engine_run
@@ -60,7 +61,8 @@ def with_effects(model: FmuModel, uses: Iterable[Any]) -> FmuModel:
 
 def _free_prefix(model: FmuModel, use: EffectUse) -> str:
     """What the effect's parameters are called after, so that none takes a name of the model's."""
-    first = use.prefix or f"{use.label}_{use.at[0].removeprefix('outputs.').replace('.', '_')}"
+    place = re.sub(r"\W+", "_", use.at[0].removeprefix("outputs.")).strip("_")  # der(mass.v), a[1]
+    first = use.prefix or f"{use.label}_{place}"
     names = effects()[use.effect].parameters
     tried = (first, *(f"{first}_{k}" for k in range(2, 10_000)))
     return next(p for p in tried if not any(f"{p}_{n}" in model.parameters for n in names))
@@ -97,7 +99,7 @@ class _Ends:
         breaks = [b for s in experiment.inputs.values() for b in s.breaks.tolist()]
         self.breaks = np.unique(np.array(breaks))
         self.time = joined(experiment.time, self.breaks, FINE) if self.leaves else experiment.time
-        self.raw = tuple(dict.fromkeys([*names, *model.outputs])) if self.leaves else names
+        self.raw = tuple(model.outputs) if self.leaves else names
 
     def simulation(self, sensitivities: tuple[str, ...]) -> Simulation:
         own = tuple(n for n in sensitivities if n in self.model.fmu.parameters)
@@ -115,7 +117,7 @@ class _Ends:
         table = np.empty(shape)
         for k, n in enumerate(sensitivities):
             table[:, :, k] = found[n]
-        units = tuple(unit_of(self.model, n) for n in self.names)
+        units = tuple(self.model.outputs[n].unit for n in self.names)
         return Simulation(
             Trajectory(self.experiment.time, values, self.names, units),
             sensitivities,
@@ -203,7 +205,7 @@ class _Ends:
         return passed.trajectory.values, found
 
     def _passed(self, raw: Array, sensitivities: tuple[str, ...] = (), slope: Array | None = None) -> Simulation:
-        """The exit's run on given outputs of the FMU, and how these move with ALONG; what is no output passes as it is."""
+        """The exit's run on given outputs of the FMU, and how these move with ALONG."""
         outputs = list(self.model.outputs)
         signals = {f"u{k}": signal_of(self.time, raw[:, self.raw.index(n)], self.breaks) for k, n in enumerate(outputs)}
         if slope is not None:
@@ -214,18 +216,10 @@ class _Ends:
         inner = Experiment("exit", self.experiment.time, FrozenMap(signals))
         leaving = self.exit if slope is None else exit_(self.model, along=True)
         run = engine_run(leaving, inner, values, sensitivities, tolerance=self.tolerance)
-        columns, slopes = [], []
-        for n in self.names:
-            if n in outputs:
-                columns.append(run[f"y{outputs.index(n)}"])
-                slopes.append(run.gradient(f"y{outputs.index(n)}"))
-            else:
-                place = np.searchsorted(self.time, self.experiment.time, side="right") - 1
-                columns.append(raw[place, self.raw.index(n)])
-                own = np.zeros((place.size, len(sensitivities)))
-                slopes.append(own if slope is None else slope[place][:, [self.raw.index(n)]])
-        trajectory = Trajectory(self.experiment.time, np.column_stack(columns), self.names)
-        return Simulation(trajectory, sensitivities, np.stack(slopes, axis=1), run.statistics)
+        leaving_as = [f"y{outputs.index(n)}" for n in self.names]
+        trajectory = Trajectory(self.experiment.time, np.column_stack([run[y] for y in leaving_as]), self.names)
+        gradients = np.stack([run.gradient(y) for y in leaving_as], axis=1)
+        return Simulation(trajectory, sensitivities, gradients, run.statistics)
 
     def _along(self, raw: Array, slope: Array) -> Array:
         """(n, names) change of what is recorded as the FMU's outputs move along the slope, (rows, raw)."""

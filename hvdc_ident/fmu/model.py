@@ -41,6 +41,7 @@ class FmuModel:
     """An FMU with its parameters' and inputs' values, and effects at its inputs and outputs.
 
     The start of a run is what the FMU's own initialisation gives for the inputs' first values.
+    outputs: what the FMU declares as such (its states where it declares none), and what `recording` added.
     host: its worker, shared by all models made from this one. effects: in the order they were put on.
     """
 
@@ -85,7 +86,10 @@ class FmuModel:
     def text(self) -> str:
         """Text that differs where the file, the values or the effects do."""
         inputs = {n: i.value for n, i in self.inputs.items()}
-        return "\n".join(map(repr, (self.name, self.source, self.fmu.interface, self.values, inputs, self.effects)))
+        recorded = tuple(self.outputs)
+        return "\n".join(
+            map(repr, (self.name, self.source, self.fmu.interface, self.values, inputs, recorded, self.effects))
+        )
 
     @property
     def sensitivity_error(self) -> float:
@@ -114,7 +118,44 @@ class FmuModel:
                     return ModelError(
                         f"'{name}' is another name of '{v.name}'", where=f"model '{self.name}'", expected=f"'{v.name}'"
                     )
-        return unknown_name("parameter or input", name, [*self.parameters, *self.inputs], where=f"model '{self.name}'")
+        known = [*self.parameters, *self.inputs]
+        return unknown_name("parameter or input", name, known, where=f"model '{self.name}'", listing=self._listing)
+
+    def recording(self, names: Iterable[str]) -> FmuModel:
+        """Return the model with these variables among its outputs: any number of the FMU that changes in a run.
+
+        Raises UnknownNameError for what is no variable, ModelError for a parameter or an array.
+        """
+        new = {n: self._recorded(n) for n in names if n not in self.outputs}
+        return replace(self, outputs=self.outputs | new) if new else self
+
+    def records(self, name: str) -> bool:
+        """Return whether `recording` takes the name."""
+        return name in self.outputs or (name in self.fmu.variables and self.fmu.variables[name].recordable)
+
+    def _recorded(self, name: str) -> Output:
+        fmu, where = self.fmu, f"model '{self.name}'"
+        variable = fmu.variables.get(name) or fmu.states.get(name)
+        if variable is not None and variable.recordable:
+            return _output(variable)
+        if variable is not None:
+            raise ModelError(
+                f"'{name}' is a parameter, which stays where it is put", where=where, expected="a variable to record"
+            )
+        if name in fmu.arrays:
+            raise ModelError(
+                f"'{name}' is an array of {fmu.arrays[name]}, and arrays are not recorded",
+                where=where,
+                expected="a scalar variable",
+                hint="export its elements as scalars, or take an output of the FMU that is one",
+            )
+        known = dict.fromkeys((*self.outputs, *(n for n, v in fmu.variables.items() if v.recordable)))
+        raise unknown_name("output", name, known, where=where, listing=self._listing)
+
+    @property
+    def _listing(self) -> str:
+        """The command that lists the FMU's variables."""
+        return f"`hvdc-ident check {self.fmu.path.name} --find TEXT`"
 
     def with_effects(self, effects: Iterable[Any]) -> FmuModel:
         """The model with effects at its inputs and outputs, one after the other; neutral ones change nothing."""
@@ -146,9 +187,9 @@ class FmuModel:
     ) -> Simulation:
         """A run of the experiment in the FMU's worker.
 
-        values: parameters, and inputs that stay constant, where they differ from the model's. outputs: names of outputs
-        or states; default, what the experiment measured, else all outputs. notes: how derivatives were had and, where by
-        differences, their relative error.
+        values: parameters, and inputs that stay constant, where they differ from the model's. outputs: names of any
+        variables that change; default, what the experiment measured, else all outputs. notes: how derivatives were had
+        and, where by differences, their relative error.
 
         Raises UnknownNameError for names it has not, SimulationError where the run fails.
         """
@@ -187,7 +228,7 @@ def read_fmu(source: str | Path, *, interface: Interface | None = None, limits: 
         host=host,
         parameters=FrozenMap({n: _parameter(v, float(starts[n] or 0.0)) for n, v in found.parameters.items()}),
         inputs=FrozenMap({n: Input(v.start or 0.0, v.unit, v.description) for n, v in found.inputs.items()}),
-        outputs=FrozenMap({n: _output(v) for n, v in found.outputs.items()}),
+        outputs=FrozenMap({n: _output(found.variable(n)) for n in found.shown}),
         states=FrozenMap({n: FmuState(v.unit, v.description, v.nominal) for n, v in found.states.items()}),
         description=found.text,
         source=digest(path.read_bytes()),

@@ -43,9 +43,8 @@ class Plant:
         self.next_time: float | None = None
 
     def block(self, names: tuple[str, ...]) -> Block:
-        """Some outputs, or states, to be read together."""
-        known = {**self.description.states, **self.description.outputs}
-        return Block(self.binding, tuple(known[n] for n in names))
+        """Return variables of these names, to be read together: outputs, states, or any other."""
+        return Block(self.binding, tuple(self.description.variable(n) for n in names))
 
     def begin(
         self, values: Mapping[str, float], inputs: Array, start: float, stop: float | None, tolerance: float | None

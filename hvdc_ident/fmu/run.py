@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hvdc_ident.errors import HvdcIdentError, ModelError, unknown_name
+from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.frozen import FrozenMap
@@ -35,7 +35,13 @@ def simulate(
 
     place = f"experiment '{experiment.name}'"
     given = {**experiment.values, **values}
-    checked = model.driven(experiment.drive).with_effects(chains(experiment))
+    names = tuple(model.outputs if outputs is None else outputs)
+    try:
+        checked = (
+            model.recording((*names, *experiment.instrument)).driven(experiment.drive).with_effects(chains(experiment))
+        )
+    except InputError as e:
+        raise e.at(place) from None
     for name in (*given, *experiment.inputs):
         if name not in checked.parameters and name not in checked.inputs:
             known = [*checked.parameters, *checked.inputs]
@@ -54,10 +60,6 @@ def simulate(
     for name in experiment.offsets:
         if name not in checked.inputs:
             raise unknown_name("input", name, checked.inputs, where=f"{place}, offsets")
-    names = tuple(checked.outputs if outputs is None else outputs)
-    for name in names:
-        if name not in checked.outputs and name not in checked.states:
-            raise unknown_name("output", name, [*checked.outputs, *checked.states], where=place)
     try:
         if checked.effects:
             return simulate_with_effects(checked, experiment, given, sensitivities, names, tolerance)
@@ -92,10 +94,12 @@ def bare(
         "breaks": signals.breaks,
     }
     answer, out = model.host.ask(heading, arrays)
-    units = tuple(unit_of(model, n) for n in names)
+    units = tuple(model.outputs[n].unit for n in names)
     accepted, events, evaluations, segments = answer["counts"]
     method = "lsoda" if model.has_equations else "co-simulation"
     notes = dict(answer["notes"])
+    if not model.fmu.outputs and set(names) == set(model.fmu.shown):
+        notes["outputs"] = "the FMU declares none: its states are recorded"
     errors = dict(zip(sensitivities, out["errors"].tolist(), strict=True))
     model.host.sensitivity_error = max([model.host.sensitivity_error, *errors.values()])
     worst = max(errors, key=lambda n: errors[n], default=None)
@@ -118,11 +122,6 @@ def inputs_of(model: FmuModel, experiment: Experiment, given: Mapping[str, float
         offset = experiment.offsets.get(name, 0.0)
         found[name] = InputSignal(signal.times, signal.values + offset, signal.breaks) if offset else signal
     return found
-
-
-def unit_of(model: FmuModel, name: str) -> str:
-    """The unit of an output or a state."""
-    return model.outputs[name].unit if name in model.outputs else model.states[name].unit
 
 
 def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:

@@ -55,8 +55,7 @@ class Tangent:
     def __init__(self, plant: Plant, parameters: Sequence[str], sizes: Sequence[float], outputs: Sequence[str]) -> None:
         d = plant.description
         states = [v.reference for v in d.states.values()]
-        known = {**d.states, **d.outputs}
-        shown = [known[n].reference for n in outputs]
+        shown = [d.variable(n).reference for n in outputs]
         varied = {**d.inputs, **d.parameters}
         self.sizes = tuple(sizes)
         self.count = len(parameters)
@@ -205,8 +204,7 @@ class Point:
         d = self.plant.description
         if not d.directional:
             return None
-        known = {**d.states, **d.outputs}
-        unknowns = [*d.derivatives, *(known[n].reference for n in self.names)]
+        unknowns = [*d.derivatives, *(d.variable(n).reference for n in self.names)]
         inputs = list(d.inputs.values())
         knowns = [v.reference for v in (*d.states.values(), *(inputs[k] for k in self.smooth))]
         try:

@@ -61,6 +61,12 @@ class External(Protocol):
     def with_values(self, values: Mapping[str, float]) -> External:
         """The model with other parameter or input values."""
 
+    def recording(self, names: Iterable[str]) -> External:
+        """Return the model with these variables among its outputs. Raises InputError for what it cannot record."""
+
+    def records(self, name: str) -> bool:
+        """Return whether `recording` takes the name."""
+
     def with_effects(self, effects: Iterable[Any]) -> External:
         """The model with effects at its slots."""
 
@@ -83,3 +89,8 @@ class External(Protocol):
 
 
 AnyModel: TypeAlias = Model | External
+
+
+def recording(model: AnyModel, names: Iterable[str]) -> AnyModel:
+    """Return the model with the names among its outputs; equations have what they declare, and stay as they are."""
+    return model if isinstance(model, Model) else model.recording(names)

@@ -12,7 +12,8 @@ from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.measured import MeasuredResponse
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear_analysis import check_linear
@@ -80,7 +81,7 @@ def load_study(path: str | Path, trust: bool = False) -> Study:
     content = _read(file)
     settings = parse_study(content, file)
     where = file.name
-    model, model_sources = _model(settings.model, file, trust)
+    model, model_sources = _model(settings, file, trust)
     other, other_sources = _compared_with(settings, file, trust)
     compared, compared_sources = _linear_model_compared_with(settings, file, trust)
     recordings = Recordings(file.parent)
@@ -129,8 +130,9 @@ def _read(file: Path) -> bytes:
         raise StudyError(f"the study file cannot be read: {(e.strerror or str(e)).lower()}", where=str(file)) from None
 
 
-def _model(table: schema.Model, file: Path, trust: bool) -> tuple[AnyModel, dict[str, str]]:
+def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyModel, dict[str, str]]:
     """The model as the study wants it, and the hash of the file it comes from."""
+    table = settings.model
     source, sources = _source(table.source, file, "model.source")
     place = "model.source"
     try:
@@ -138,6 +140,9 @@ def _model(table: schema.Model, file: Path, trust: bool) -> tuple[AnyModel, dict
         if table.parameterisation is not None:
             place = "model.parameterisation"
             model = model.parameterised(table.parameterisation)
+        for asked, names in _recorded(settings):  # before the effects, which may sit at what is recorded
+            place = asked
+            model = recording(model, names)
         if table.effect:
             place = "model.effect"
             model = model.with_effects([e.model_dump(by_alias=True, exclude_none=True) for e in table.effect])
@@ -146,6 +151,18 @@ def _model(table: schema.Model, file: Path, trust: bool) -> tuple[AnyModel, dict
     except InputError as e:
         raise e.at(f"{file.name}, {place}") from None
     return model, sources
+
+
+def _recorded(settings: schema.StudyFile) -> Iterable[tuple[str, Iterable[str]]]:
+    """The names of outputs that a study's tables ask for, and where."""
+    for e in settings.experiment:
+        yield f"experiment '{e.name}'.outputs", e.outputs
+    for r in settings.response:
+        yield f"response '{r.name}'.output", [r.output] if r.output else []
+        yield f"response '{r.name}'.trim.outputs", r.trim.outputs if r.trim else []
+    if settings.linearize is not None:
+        yield "linearize.outputs", settings.linearize.outputs or []
+        yield "linearize.trim.outputs", settings.linearize.trim.outputs if settings.linearize.trim else []
 
 
 def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, str]]:
@@ -169,7 +186,7 @@ def _compared_with(settings: schema.StudyFile, file: Path, trust: bool) -> tuple
     name = against_of(settings.sweep, f"{file.name}, sweep")
     if name in ("data", "base"):
         return None, {}
-    return _other_model(name, file, "sweep.against", trust)
+    return _other_model(name, settings, file, "sweep.against", trust)
 
 
 def _linear_model_compared_with(
@@ -177,16 +194,21 @@ def _linear_model_compared_with(
 ) -> tuple[AnyModel | None, dict[str, str]]:
     """The other model that the linear model is compared with, where it is, and its file's hash."""
     asked = settings.linearize.compare if settings.linearize else None
-    return _other_model(asked, file, "linearize.compare", trust) if asked else (None, {})
+    return _other_model(asked, settings, file, "linearize.compare", trust) if asked else (None, {})
 
 
-def _other_model(name: str, file: Path, place: str, trust: bool) -> tuple[AnyModel, dict[str, str]]:
+def _other_model(
+    name: str, settings: schema.StudyFile, file: Path, place: str, trust: bool
+) -> tuple[AnyModel, dict[str, str]]:
     """A model that a study names beside its own, and its file's hash."""
     source, sources = _source(name, file, place)
     try:
-        return load_model(source, trust=trust), sources
+        model = load_model(source, trust=trust)
     except InputError as e:
         raise e.at(f"{file.name}, {place}") from None
+    if not isinstance(model, Model):  # it is compared where it has the same variables
+        model = model.recording([n for _, names in _recorded(settings) for n in names if model.records(n)])
+    return model, sources
 
 
 def _is_path(source: str) -> bool:

@@ -216,8 +216,16 @@ def test_what_fmi_has_and_this_has_not(tmp_path):
     array = three.replace('start="0.1"/>', 'start="1 2"><Dimension start="2"/></Float64>').replace(
         '<Float64 name="T"', '<Float64 name="T"'
     )
-    with pytest.raises(ModelError, match=r"variable 'T': the FMU has an array.*scalar"):
-        load_model(written(tmp_path / "a.fmu", array, version=3))
+    model = load_model(written(tmp_path / "a.fmu", array, version=3))
+    assert list(model.parameters) == []  # it stays at its start
+    with pytest.raises(ModelError, match=r"'T' is an array of 2, and arrays are not recorded.*scalar"):
+        model.recording(["T"])
+    array = three.replace('valueReference="0" causality="local" variability="continuous"/>',
+        'valueReference="0" causality="local" variability="continuous"><Dimension start="3"/></Float64>', 1)  # fmt: skip
+    with pytest.raises(
+        ModelError, match=r"variable 'x': a state of the FMU is an array.*scalar states, got an array of 3"
+    ):
+        load_model(written(tmp_path / "a2.fmu", array, version=3))
     clock = three.replace(
         "</ModelVariables>",
         '<Clock name="tick" valueReference="77" causality="input" variability="discrete" intervalVariability="constant"/></ModelVariables>',
