@@ -140,7 +140,7 @@ def _written(
         "fingerprint": mark,
         "files": list(outcome.files),
         "rest_levels": levels,
-        "steady_state": steady_notes(study),
+        "steady_state": steady_notes(study, searches=wanted.searches),
     }
     taken = {"options": {n: getattr(options, n) for n in wanted.takes}} if wanted.takes else {}
     implausible = {"implausible": wrong} if wrong else {}

@@ -75,7 +75,7 @@ class Stage:
     after: the stages it builds on; they run first. order: place among the stages of a run.
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `Options` that only some stages have and that decide its result. tell: the result in lines for people,
-    from its JSON.
+    from its JSON. searches: whether it also runs at the start values, where a search begins; all run at the given ones.
     """
 
     name: str
@@ -88,6 +88,7 @@ class Stage:
     uses: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
+    searches: bool = False
 
 
 @cache

@@ -29,7 +29,7 @@ def summary(study: Study, seed: int = 0) -> dict[str, Any]:
         },
         "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
         "experiments": {e.name: _experiment(e, study) for e in study.experiments},
-        "steady_state": steady_notes(study),
+        "steady_state": steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages())),
         "responses": {r.name: described(r) for r in study.responses},
         "stages": [s.name for s in stages() if s.wanted(study)],
         "rest_levels": rest.to_list(),

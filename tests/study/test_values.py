@@ -122,6 +122,47 @@ def fitted(results: dict[str, Any]) -> dict[str, float]:
     return dict(results["fit"]["values"])
 
 
+LEVER = """schema = 1
+name = "lever"
+[parameters]
+a = {{value = {given}, min = -10, max = 10}}
+[inputs]
+u = {{value = 1.0}}
+[states]
+x = {{derivative = "a*x + u"}}
+[outputs]
+y = "x"
+"""
+
+
+@pytest.mark.parametrize("given, start, at_given, at_start", [(-2, 0.5, False, True), (0.5, -2, True, False)])
+def test_a_start_is_judged_at_the_values_that_a_stage_runs_at(
+    tmp_path: Path, given: float, start: float, at_given: bool, at_start: bool
+) -> None:
+    """x' = a x + u rests at -u/a, where it is stable for a < 0 only."""
+    (tmp_path / "lever.toml").write_text(LEVER.format(given=given))
+    t = np.linspace(0.0, 2.0, 101)
+    # From rest at u = 1 the input falls to 0.9 at 0.5 s; a is -1.
+    y = np.where(t < 0.5, 1.0, 0.9 + 0.1 * np.exp(-np.maximum(t - 0.5, 0.0)))
+    rows = np.column_stack([t, np.where(t < 0.5, 1.0, 0.9), y])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="time,u,y", comments="")
+    (tmp_path / "s.toml").write_text(
+        'schema = 1\n[model]\nsource = "lever.toml"\n[identifiability]\n'
+        + f"[parameters]\na = {{start = {start}, min = -4, max = 1}}\n"
+        + EXPERIMENT.format("a", "fit")
+    )
+
+    def unstable(command: str) -> set[str]:
+        """Where an unstable steady state is said to lie."""
+        lines = json.loads(run(command, tmp_path / "s.toml", "--json").stdout)["steady_state"]
+        return {line.split(":")[0] for line in lines if "Unstable" in line}
+
+    given_places = {"model", "experiment a"} if at_given else set()
+    start_places = {f"{w}, at the start values" for w in ("model", "experiment a")} if at_start else set()
+    assert unstable("simulate") == given_places
+    assert unstable("check") == unstable("identify") == given_places | start_places
+
+
 # What is given.
 
 

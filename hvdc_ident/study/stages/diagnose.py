@@ -95,4 +95,5 @@ STAGE = Stage(
     order=50,
     after=("identify", "fit"),
     tell=told,
+    searches=True,
 )

@@ -198,4 +198,5 @@ STAGE = Stage(
     after=("identify",),
     takes=("force",),
     tell=told,
+    searches=True,
 )

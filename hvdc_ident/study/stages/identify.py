@@ -82,4 +82,5 @@ STAGE = Stage(
     wanted=lambda study: study.settings.identifiability is not None or study.settings.fit is not None,
     order=30,
     tell=told,
+    searches=True,
 )
