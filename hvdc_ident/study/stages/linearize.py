@@ -125,8 +125,10 @@ def told(data: Mapping[str, Any]) -> list[str]:
     found = ["at the given values:", *described(data, "given")]
     if fitted.get("modes"):
         return [*found, f"at the {data['fitted_note']}:", *described(fitted, "fitted")]
-    why = fitted.get("message") or data["fitted_note"]
-    return [*found, f"none at fitted values: {why}"] if why else found
+    if fitted.get("message"):
+        return [*found, f"At the fitted values there is {fitted['message']}."]
+    why = data["fitted_note"]
+    return [*found, f"There is no linear model at fitted values: {why}."] if why else found
 
 
 STAGE = Stage(
