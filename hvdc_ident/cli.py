@@ -62,15 +62,18 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*arguments: Any, **named: Any) -> None:
+        def end(code: int, message: str) -> NoReturn:
+            _end(code, _pasteable(message, named.get("study"), named.get("out"), named.get("trust", False)))
+
         try:
             command(*arguments, **named)
             sys.stdout.flush()
         except typer.Exit:
             raise
         except HvdcIdentError as e:
-            _end(2 if isinstance(e, InputError) else 1, str(e))
+            end(2 if isinstance(e, InputError) else 1, str(e))
         except _Failed as e:
-            _end(1, str(e))
+            end(1, str(e))
         except KeyboardInterrupt:
             _end(130, "interrupted; what was finished is kept, and the same command goes on from there")
         except BrokenPipeError:
@@ -93,6 +96,14 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 def _end(code: int, message: str) -> NoReturn:
     typer.echo(f"{'interrupted' if code == 130 else 'error'}: {message.removeprefix('interrupted; ')}", err=True)
     raise typer.Exit(code)
+
+
+def _pasteable(text: str, study: Path | None, out: Path | None, trust: bool) -> str:
+    """The text with the commands in it as they are to be typed here, by the arguments of the command that says it."""
+    from hvdc_ident.words import with_study
+
+    options = [*(("--out", str(out)) if out else ()), *(("--trust",) if trust else ())]
+    return text if study is None else with_study(text, str(study), *options)
 
 
 def _say(text: str, *, json: bool, quiet: bool) -> None:
@@ -148,7 +159,7 @@ def demo(
         study = load_study(write_demo(out, seed=seed, progress=told))
         announce = _announcer(json=json, quiet=quiet)
         done = _run_all(study, out, Options(workers, seed, told, executor=executor, announce=announce))
-    _tell_run(study, out, done, json=json, quiet=quiet)
+    _tell_run(study, out, done, lambda line: _pasteable(line, study.path, out, False), json=json, quiet=quiet)
 
 
 @app.command()
@@ -208,7 +219,7 @@ def run_(
     with progress(quiet or json) as told:
         announce = _announcer(json=json, quiet=quiet)
         done = _run_all(loaded, folder, Options(workers, seed, told, executor=executor, announce=announce))
-    _tell_run(loaded, folder, done, json=json, quiet=quiet)
+    _tell_run(loaded, folder, done, lambda line: _pasteable(line, study, out, trust), json=json, quiet=quiet)
 
 
 def _run_all(study: Study, folder: Path, options: Options) -> list[Any]:
@@ -222,7 +233,10 @@ def _run_all(study: Study, folder: Path, options: Options) -> list[Any]:
     return done
 
 
-def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet: bool) -> None:
+def _tell_run(
+    study: Study, folder: Path, done: list[Any], typed: Callable[[str], str], *, json: bool, quiet: bool
+) -> None:
+    """Tell how the stages of a run went. typed: a line with the commands in it as they are to be typed here."""
     if json:
         from hvdc_ident.study.pipeline import heading_of
 
@@ -239,7 +253,7 @@ def _tell_run(study: Study, folder: Path, done: list[Any], *, json: bool, quiet:
         rest = f", {status}" if status in ("at-bound", "two-optima") and not d.failed else ""
         if (d.data.get("adequacy") or {}).get("verdict") == "does-not-fit" and not d.failed:
             rest += f", but the model does not fit; next: {d.data['adequacy']['next']}"
-        _say(f"{d.stage.name}: {state}{rest}", json=json, quiet=quiet)
+        _say(typed(f"{d.stage.name}: {state}{rest}"), json=json, quiet=quiet)
     _say(f"report: {folder / 'report.html'}", json=json, quiet=quiet)
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:
@@ -266,7 +280,7 @@ def _run_one(
     for line in done.data.get("steady_state", ()):
         _say(f"steady state, {line}", json=json, quiet=quiet)
     for line in () if done.failed else stage.tell(done.data):
-        _say(line, json=json, quiet=quiet)
+        _say(_pasteable(line, study, out, trust), json=json, quiet=quiet)
     _say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}", json=json, quiet=quiet)
     if done.failed:
         raise _Failed(f"{stage.name}: {done.failed}")

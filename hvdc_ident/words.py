@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -28,6 +30,15 @@ def listed(names: Iterable[str]) -> str:
     """The names as a sentence has them: A, B and C."""
     *most, last = [*names] or [""]
     return f"{', '.join(most)} and {last}" if most else last
+
+
+def with_study(text: str, study: str, *options: str) -> str:
+    """Return the text with every "hvdc-ident COMMAND STUDY" in it made a command to paste: of this study, with these options.
+
+    Results say STUDY, for they do not know where their reader stands.
+    """
+    typed = shlex.join([study, *options])
+    return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda found: f"{found[1]} {typed}", text)
 
 
 def form_of(told: Mapping[str, Any]) -> str:

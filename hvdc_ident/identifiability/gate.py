@@ -111,7 +111,9 @@ def _nothing_to_fit(report: Mapping[str, Any]) -> str:
     said = ", ".join(f"{n} is {line['verdict']}" for n, line in report["parameters"].items())
     unjudged = report.get("not_judged", ())
     diagnose = (
-        f"{', '.join(unjudged)} may be once the misfit is explained: run hvdc-ident diagnose; " if unjudged else ""
+        f"{', '.join(unjudged)} may be once the misfit is explained: run `hvdc-ident diagnose STUDY`; "
+        if unjudged
+        else ""
     )
     return (
         f"no candidate can be estimated from these data: {said}. Try: {diagnose}`hvdc-ident identify STUDY` says why and "

@@ -115,5 +115,5 @@ def misspecification(optimum: Optimum, found: FrozenMap[Heterogeneity], units: d
             )
     if optimum.excess > 1.0:
         signs.append(f"the residuals are {times_text(float(np.sqrt(optimum.excess)))} the noise")
-    pointer = "the model may lack an effect; hvdc-ident diagnose looks for it" if signs else ""
+    pointer = "the model may lack an effect; hvdc-ident diagnose STUDY looks for it" if signs else ""
     return Misspecification(bool(signs), tuple(signs), pointer)

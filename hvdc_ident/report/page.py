@@ -12,6 +12,7 @@ from hvdc_ident.report.html import text
 from hvdc_ident.report.interactive import scripts
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.section import Section
+from hvdc_ident.words import with_study
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """
@@ -69,7 +70,9 @@ def page(folder: Path) -> str:
         if body:
             parts.append(f"<section>\n<h2>{text(section.title)}</h2>\n{body}\n</section>")
     heading = results.heading
-    return document(str(heading.get("study", "study")), str(heading.get("software", "")), "\n".join(parts))
+    # The first file read is the study's, and the page's reader stands beside it as well as anywhere.
+    body = with_study("\n".join(parts), text(next(iter(heading.get("sources") or {}), "STUDY")))
+    return document(str(heading.get("study", "study")), str(heading.get("software", "")), body)
 
 
 def document(title: str, subtitle: str, body: str) -> str:

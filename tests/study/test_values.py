@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,27 @@ def test_a_start_is_judged_at_the_values_that_a_stage_runs_at(
     start_places = {f"{w}, at the start values" for w in ("model", "experiment a")} if at_start else set()
     assert unstable("simulate") == given_places
     assert unstable("check") == unstable("identify") == given_places | start_places
+
+
+def test_the_command_that_is_offered_next_works_where_it_is_pasted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From another folder, with a blank in a name and another folder of results; the JSON knows no place."""
+    folder = tmp_path / "my studies"
+    path = write_study(folder, questions="[fit]\nstarts = 1\n")
+    rows = np.loadtxt(folder / "a.csv", delimiter=",", skiprows=1)
+    rows[:, 2] += np.where(TIME < EVENT, 0.0, 0.01 * np.sin(2 * np.pi * 5.0 * TIME))  # no gain makes such a tone
+    np.savetxt(folder / "a.csv", rows, delimiter=",", header="time,u,y", comments="")
+    monkeypatch.chdir(tmp_path)
+    for command in ("identify", "fit"):
+        result = run(command, path.relative_to(tmp_path), "--out", "other results")
+        assert result.exit_code == 0
+        line = next(n for n in result.output.splitlines() if "hvdc-ident diagnose" in n)
+        typed = shlex.split(line[line.index("hvdc-ident diagnose") :])
+        assert typed[1:3] == ["diagnose", "my studies/s.toml"] and typed[3:5] == ["--out", "other results"]
+        assert load_study(typed[2]).path.resolve() == path.resolve()
+    for file in ("fit", "identifiability"):
+        assert "hvdc-ident diagnose STUDY" in (tmp_path / "other results" / f"{file}.json").read_text()
 
 
 # What is given.

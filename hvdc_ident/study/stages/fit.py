@@ -40,8 +40,6 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 
         result = gated_fit(problem, report, fit, force=options.force, whole=fitting.as_reported(study))
     data = {**result.to_dict(), **_context(study, problem, options, report, result)}
-    if data["adequacy"]:
-        data["adequacy"]["next"] = data["adequacy"]["next"].replace("STUDY", study.path.name)
     if result.status == "failed":
         return Outcome(data, failed=result.message)
     through = fitting.with_settings(study, gated(problem, gate(report, options.force)))

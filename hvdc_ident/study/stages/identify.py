@@ -62,9 +62,8 @@ def told(data: Mapping[str, Any]) -> Sequence[str]:
     beside = ""
     if data["misspecified"]:
         signs = data["misspecification"]
-        lines.append(
-            f"The model does not explain these data: {'; '.join(signs['signs'])}. {signs['next'].capitalize()}."
-        )
+        what_next = signs["next"][:1].upper() + signs["next"][1:]
+        lines.append(f"The model does not explain these data: {'; '.join(signs['signs'])}. {what_next}.")
         ratio = (data.get("pilot") or {}).get("chi2_per_dof")
         beside = "" if ratio is None else f" (chi2/dof {ratio:.3g})"
     for name, v in data["parameters"].items():
