@@ -32,8 +32,7 @@ def own_memory() -> int:
 
 def processor(model: FmuModel) -> float:
     """Seconds of processor time of this process and the FMU's."""
-    worker = model.host._worker
-    fields = Path(f"/proc/{worker.child}/stat").read_text().rpartition(") ")[2].split()
+    fields = Path(f"/proc/{model.host._processes.workers[0].pid}/stat").read_text().rpartition(") ")[2].split()
     return time.process_time() + (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 

@@ -9,12 +9,14 @@ import contextlib
 from collections.abc import Sequence
 from ctypes import byref, c_double
 from dataclasses import dataclass
+from math import nan
 from typing import Any
 
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from hvdc_ident.fmu.description import REAL, Description, Variable
+from hvdc_ident.fmu.messages import NOW, START, STOP, no_progress
 from hvdc_ident.trajectory import Array
 
 Failure = FMICallException
@@ -105,6 +107,7 @@ class Binding:
             self.version, self.exchange
         ]
         self.messages: list[str] = []
+        self.progress = no_progress()  # where it is noted how far a run is
         self.fmu: Any = kind(
             guid=description.token,
             unzipDirectory=folder,
@@ -174,6 +177,8 @@ class Binding:
     # --- initialisation ---
 
     def enter_initialization(self, start: float, stop: float | None, tolerance: float | None) -> None:
+        self.progress[START] = self.progress[NOW] = start
+        self.progress[STOP] = nan if stop is None else stop
         if self.version == 2:
             self.fmu.setupExperiment(tolerance=tolerance, startTime=start, stopTime=stop)
             self.fmu.enterInitializationMode()
@@ -215,6 +220,7 @@ class Binding:
     # --- model exchange ---
 
     def set_time(self, t: float) -> None:
+        self.progress[NOW] = t
         if self.version == 2:
             self.fmu.fmi2SetTime(self.component, t)
         else:
@@ -286,6 +292,7 @@ class Binding:
 
     def step(self, t: float, h: float) -> float:
         """The time reached. Raises RuntimeError where the FMU asks for the end of the run."""
+        self.progress[NOW] = t
         if self.version == 2:
             self.fmu.fmi2DoStep(self.component, t, h, 1)
             return t + h

@@ -1,4 +1,4 @@
-"""The worker of an FMU as its owner sees it: started when needed, watched, and replaced when it dies, hangs or is old.
+"""The workers of an FMU as their owner sees them: started when needed, watched, and replaced when one dies, hangs or is old.
 
 This contains crashes, hangs and leaks. It does not contain malice: load only FMUs you trust.
 """
@@ -6,16 +6,18 @@ This contains crashes, hangs and leaks. It does not contain malice: load only FM
 from __future__ import annotations
 
 import contextlib
+import math
+import multiprocessing
 import os
 import pickle
-import shutil
-import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from multiprocessing import reduction
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
 from pathlib import Path
@@ -23,250 +25,407 @@ from threading import Lock
 from typing import IO, Any
 
 import hvdc_ident
-from hvdc_ident.errors import SimulationError
-from hvdc_ident.fmu.archive import unpack
+from hvdc_ident.errors import InputError, SimulationError
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.messages import packed, unpacked
+from hvdc_ident.fmu.endings import Budget, Ending, crash, overdue
+from hvdc_ident.fmu.folder import Folder, joined
+from hvdc_ident.fmu.folder import unpacked as new_folder
+from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_file, progress_in, unpacked
 from hvdc_ident.trajectory import Array
+
+Answer = tuple[dict[str, Any], dict[str, Array]]
+PATIENCE = 5.0  # s for the supervisor to tell how a worker ended, of which it needs a few milliseconds
+LOOKS = 20  # looks at the progress within a deadline: what has not moved over the last two of them stands still
 
 
 @dataclass(frozen=True)
 class Limits:
     """What an FMU may use. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
-    runs: after which a worker is replaced by a new one, as it is where it keeps half of its memory."""
+    runs: after which a worker is replaced by a new one, as it is where it keeps half of its memory; workers: processes
+    at once, None: as many as there are cores, or one in a process that is itself one of several."""
 
     deadline: float = 60.0
     load: float = 60.0
     memory: int | None = 2 * 2**30
     runs: int = 500
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("deadline", "load", "memory", "runs", "workers"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InputError("a limit is not above 0", where=f"limits of an FMU, {name}", got=f"{value:g}")
 
 
 @dataclass(eq=False)
 class _Worker:
-    process: subprocess.Popen[bytes]
-    requests: Connection
-    answers: Connection
+    """A process with the FMU in it. said: what it prints goes there. progress: how far it is."""
+
+    number: int
+    connection: Connection
     said: IO[bytes]
-    owner: int
+    progress: memoryview[float]
+    budget: Budget
     runs: int = 0
-    child: int = 0  # the process with the FMU in it, which the worker forked
-    resident: int = 0  # bytes it began with
+    resident: int = 0
+    space: int = 0
+
+    @property
+    def pid(self) -> int:
+        """Its process, 0 before it began."""
+        return int(self.progress[PROCESS])
+
+    def close(self) -> None:
+        for end in (self.connection, self.said):
+            with contextlib.suppress(OSError):
+                end.close()
+
+
+class _Supervisor:
+    """The process that starts workers and knows how they ended. See `hvdc_ident.fmu.supervisor`."""
+
+    def __init__(self, description: Description, limits: Limits, folder: Folder) -> None:
+        self.owner, self.memory = os.getpid(), limits.memory
+        here, there = socket.socketpair()
+        root = str(Path(hvdc_ident.__file__).resolve().parents[1])
+        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        self.said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "hvdc_ident.fmu.supervisor", str(there.fileno()), str(folder.lock)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self.said,
+            pass_fds=(there.fileno(), folder.lock),
+            env={**os.environ, **one, "PYTHONPATH": path},
+            start_new_session=True,  # what a terminal sends to all its processes is for the host
+        )
+        there.close()
+        self.connection = Connection(here.detach())
+        self.last = ""  # line that it wrote
+        self.ended: dict[int, Ending] = {}
+        self.started = 0
+        heading = {"parent": os.getpid(), "memory": limits.memory, "folder": str(folder.path)}
+        self.connection.send_bytes(packed(heading))
+        self.connection.send_bytes(pickle.dumps(description))
+
+    def start(self, heading: Mapping[str, Any]) -> _Worker:
+        """A worker that loads the FMU now. Raises OSError where the supervisor is gone."""
+        self.started += 1
+        here, there = socket.socketpair()
+        progress, said = progress_file(), tempfile.TemporaryFile()  # noqa: SIM115 - they live as long as the worker
+        with there, progress, socket.socket(fileno=os.dup(self.connection.fileno())) as passing:
+            worker = _Worker(
+                self.started, Connection(here.detach()), said, progress_in(progress.fileno()), Budget(self.memory)
+            )
+            worker.progress[BEGAN], worker.progress[NOW] = time.monotonic(), math.nan
+            self.connection.send_bytes(packed({**heading, "start": worker.number}))
+            reduction.sendfds(passing, [there.fileno(), progress.fileno(), said.fileno()])
+        return worker
+
+    def end(self, worker: _Worker) -> Ending | None:
+        """How a worker ended, which it is made to do where it has not; None where the supervisor is gone."""
+        with contextlib.suppress(OSError, EOFError):
+            self.connection.send_bytes(packed({"end": worker.number}))
+            while worker.number not in self.ended and self.connection.poll(PATIENCE):
+                heading, _ = unpacked(self.connection.recv_bytes())
+                self.ended[heading["ended"]] = Ending.heard(heading)
+        found = self.ended.pop(worker.number, None)
+        if found is None:
+            self.close()  # the system ends its workers with it
+        return found
+
+    def close(self) -> None:
+        """End it and every worker; in a process that was forked from its owner, only let go of it."""
+        self.connection.close()
+        self.last = _last_line(self.said)
+        self.said.close()
+        if self.owner == os.getpid() and self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+    @property
+    def gone(self) -> bool:
+        """Whether it has ended."""
+        return self.process.poll() is not None
+
+
+@dataclass(eq=False)
+class _Processes:
+    """What of a host is no value: its supervisor, workers and folder. It ends with the host."""
+
+    owner: int
+    folder: Folder
+    supervisor: _Supervisor | None = None
+    workers: dict[int, _Worker] = field(default_factory=dict)
+
+    def close(self) -> None:
+        """End all processes; remove the folder where no other process uses it."""
+        for worker in self.workers.values():
+            worker.close()
+        self.workers.clear()
+        if self.supervisor is not None:
+            self.supervisor.close()
+            self.supervisor = None
+        if self.owner == os.getpid():
+            self.folder.release()
+        else:
+            self.folder.disown()
 
 
 @dataclass(eq=False)
 class Host:
-    """The worker of one FMU. It travels to other processes without its worker and starts its own there."""
+    """The workers of one FMU. It travels to other processes without them and starts its own there."""
 
     description: Description
     limits: Limits = field(default_factory=Limits)
+    unpacked: Path | None = None  # the folder of the process it comes from, used again where it is still there
 
     def __post_init__(self) -> None:
         self._lock = Lock()
-        self._worker: _Worker | None = None
-        self._folder: Path | None = None
+        self._processes: _Processes | None = None
         self._useless: SimulationError | None = None
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"description": self.description, "limits": self.limits}
+        at = self._processes.folder.path if self._processes is not None else self.unpacked
+        return {"description": self.description, "limits": self.limits, "unpacked": at}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.__post_init__()
 
-    def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> tuple[dict[str, Any], dict[str, Array]]:
-        """The worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker.
+    def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+        """A worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker.
 
         An answer {"again": 1} says that a new process may do what this one, which was used before, cannot: the process
         is replaced and asked once more, and only its answer counts.
         """
         with self._lock:
-            worker = self._ready()
+            worker = self._ready(0)
             fresh = worker.runs == 0
             answer, out = self._asked(worker, heading, arrays)
             if answer.get("again") and not fresh:
                 self._end(worker)
-                worker = self._ready()
+                worker = self._ready(0)
                 answer, out = self._asked(worker, heading, arrays)
             if "failed" in answer:
-                raise self._failure(answer)
+                raise self._failure(worker, answer)
             if answer.get("again"):
                 raise self._error("the FMU's worker wants a new process, and had one")
-            self.memory = int(answer.get("memory", 0))
+            self.memory = worker.resident
             return answer, out
 
-    def _asked(
-        self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]
-    ) -> tuple[dict[str, Any], dict[str, Array]]:
-        worker.runs += 1
-        try:
-            worker.requests.send_bytes(packed(heading, arrays))
-        except OSError:
-            raise self._lost(worker, "before the run") from None
-        return self._heard(worker, self.limits.deadline, "run")
+    def close(self) -> None:
+        """End the processes; the next run starts others."""
+        with self._lock:
+            self._closed()
 
     # --- one answer ---
 
-    def _heard(self, worker: _Worker, deadline: float, what: str) -> tuple[dict[str, Any], dict[str, Array]]:
-        until = time.monotonic() + deadline
+    def _asked(self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+        worker.runs += 1
+        worker.progress[BEGAN] = time.monotonic()
+        try:
+            worker.connection.send_bytes(packed(heading, arrays))
+        except OSError:
+            return self._lost(worker, "before the run")
+        return self._heard(worker, "run")
+
+    def _heard(self, worker: _Worker, what: str) -> Answer:
+        """The answer of a worker. Raises SimulationError where it ends or hangs."""
+        deadline = self.limits.load if what == "loading" else self.limits.deadline
+        watch = _Watch(worker.progress, deadline)
         while True:
             try:
-                if not worker.answers.poll(max(until - time.monotonic(), 0.0)):
-                    self._end(worker)
-                    raise self._error(
-                        f"the FMU hangs: no result of the {what} after {deadline:g} s, its process was ended",
-                        hint="a longer deadline, if it is only slow",
-                    )
-                message = worker.answers.recv_bytes()
+                if not worker.connection.poll(watch.pause()):
+                    if watch.over():
+                        raise self._hung(worker, what, watch)
+                    continue
+                heading, arrays = unpacked(worker.connection.recv_bytes())
             except (EOFError, OSError):
-                raise self._lost(worker, f"in the {what}") from None
-            heading, arrays = unpacked(message)
+                return self._lost(worker, f"in the {what}")
+            worker.resident = int(heading.get("memory", worker.resident))
+            worker.space = int(heading.get("space", worker.space))
             if "more" in heading:
-                worker.resident = int(heading.get("resident", worker.resident))
-                worker.child = int(heading.get("child", worker.child))
-                until = time.monotonic() + deadline
+                worker.budget = Budget(self.limits.memory, int(heading["resident"]), int(heading["space"]))
                 continue
-            if "ended" in heading:
-                raise self._died(worker, f"in the {what}", int(heading["ended"]), int(heading["peak"]))
             if heading.get("fatal"):
                 self._end(worker)
             return heading, arrays
 
-    def _failure(self, heading: Mapping[str, Any]) -> SimulationError:
-        """The failure that a worker told."""
+    def _failure(self, worker: _Worker, heading: Mapping[str, Any]) -> SimulationError:
+        """The failure that a worker told, with its memory where that was used up."""
         t = heading.get("time")
         said = heading.get("said", "")
+        what, hint = heading["failed"], heading.get("hint", "")
+        taken = worker.budget.taken(worker.resident, worker.space)
+        if worker.budget.exhausted(taken):
+            what, hint = f"{what}; {worker.budget.told(taken)}", worker.budget.hint
         return self._error(
-            heading["failed"],
-            where="" if t is None else f"t = {t:.6g} s",
-            got=f"the FMU said: {said}" if said else "",
-            hint=heading.get("hint", ""),
+            what, where="" if t is None else f"t = {t:.6g} s", got=f"the FMU said: {said}" if said else "", hint=hint
         )
 
     def _error(self, what: str, where: str = "", got: str = "", hint: str = "") -> SimulationError:
         name = self.description.path.name
         return SimulationError(what, where=f"{name}, {where}" if where else name, got=got, hint=hint)
 
-    def _died(self, worker: _Worker, when: str, code: int, peak: int) -> SimulationError:
-        """How the FMU ended its process, in words. peak: the most bytes it had."""
-        how = _signal(-code) if code < 0 else f"it ended itself with exit code {code} and no result"
-        limit = self.limits.memory
-        if limit is not None and peak > worker.resident + 0.7 * limit:
-            how += f"; it had used all of its {limit / 2**20:.0f} MiB of memory"
-        said = self._said(worker)
-        self._end(worker)
-        return self._error(f"the FMU crashed {when}: {how}", got=f"the FMU said: {said}" if said else "")
+    def _hung(self, worker: _Worker, what: str, watch: _Watch) -> SimulationError:
+        """A worker that is past its deadline, which is ended."""
+        instants, still = watch.instants(), watch.still()
+        said = _last_line(worker.said)
+        end = self._end(worker) or Ending(-9)
+        limit = "load" if what == "loading" else "deadline"
+        text, hint = overdue(end, worker.budget, what, (limit, watch.deadline), instants, still)
+        return self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
 
-    def _lost(self, worker: _Worker, when: str) -> SimulationError:
-        """The worker itself is gone: it was killed from outside, or could not begin."""
-        said = self._said(worker)
-        self._end(worker)
-        code = worker.process.returncode
-        return self._error(f"the FMU's worker ended {when}, exit code {code}", got=f"it said: {said}" if said else "")
+    def _lost(self, worker: _Worker, when: str) -> Answer:
+        """The answer of a worker that is gone. Raises SimulationError where a new one cannot be expected to do better."""
+        supervisor = self._supervisor()
+        said = _last_line(worker.said)
+        end = self._end(worker)
+        if end is not None and worker.runs > 1 and "Instantiate" in end.call:
+            return {"again": 1}, {}  # some FMUs give one instance a process, and crash at the second
+        if end is None:
+            said = supervisor.last
+            code = supervisor.process.poll()
+            raise self._error(
+                f"the process that watches the FMU's workers ended {when}, exit code {code}",
+                got=f"it said: {said}" if said else "",
+            )
+        text, hint = crash(end, worker.budget, when)
+        raise self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
 
-    def _said(self, worker: _Worker) -> str:
-        """The last line the process wrote."""
-        worker.said.seek(0, os.SEEK_END)
-        worker.said.seek(max(0, worker.said.tell() - 2000))
-        lines = worker.said.read().decode("utf-8", "replace").strip().splitlines()
-        return " ".join(lines[-1].split())[:300] if lines else ""
+    # --- processes ---
 
-    # --- the process ---
-
-    def _ready(self) -> _Worker:
-        worker = self._worker
-        if worker is not None and worker.owner != os.getpid():  # this process was forked: the worker is another's
-            self._worker = worker = self._folder = None
+    def _ready(self, number: int) -> _Worker:
+        """A worker that waits for a request."""
+        if self._useless is not None:
+            raise self._useless
+        processes = self._mine()
+        worker = processes.workers.get(number)
         if worker is not None and (worker.runs >= self.limits.runs or self._leaks(worker)):
             self._end(worker)
             worker = None
-        if worker is None:
-            if self._useless is not None:
-                raise self._useless
-            worker = self._start()
-        return worker
+        return worker or self._start(number)
 
     def _leaks(self, worker: _Worker) -> bool:
         """Whether the worker kept so much memory that the next run may find too little."""
-        return self.limits.memory is not None and self.memory > worker.resident + 0.5 * self.limits.memory
+        return worker.budget.exhausted(worker.budget.taken(worker.resident, worker.space))
 
-    def _start(self) -> _Worker:
-        folder = self._unpacked()
-        inward, requests = os.pipe()
-        answers, outward = os.pipe()
-        said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the worker
-        root = str(Path(hvdc_ident.__file__).resolve().parents[1])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "hvdc_ident.fmu.worker", str(inward), str(outward)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-            pass_fds=(inward, outward),
-            env={**os.environ, **one, "PYTHONPATH": path},
-        )
-        os.close(inward)
-        os.close(outward)
-        worker = _Worker(
-            process, Connection(requests, readable=False), Connection(answers, writable=False), said, os.getpid()
-        )
-        self._worker, self.memory = worker, 0
-        self._finalizer = Finalize(self, _close, (worker,), exitpriority=20)
+    def _mine(self) -> _Processes:
+        """The processes of this one; those of a process that this was forked from are left to it."""
+        if self._processes is not None and self._processes.owner != os.getpid():
+            self.unpacked = self._processes.folder.path
+            self._closed()
+        if self._processes is None:
+            folder = joined(self.unpacked) if self.unpacked is not None else None
+            self._processes = _Processes(os.getpid(), folder or new_folder(self.description.path))
+            self._finalizer = Finalize(self, self._processes.close, exitpriority=20)
+        return self._processes
+
+    def _supervisor(self) -> _Supervisor:
+        processes = self._mine()
+        if processes.supervisor is None:
+            processes.supervisor = _Supervisor(self.description, self.limits, processes.folder)
+        return processes.supervisor
+
+    def _start(self, number: int) -> _Worker:
+        """A worker that has loaded the FMU."""
+        supervisor = self._supervisor()
+        self.memory = 0
         self.started += 1
+        worker: _Worker | None = None
         try:
-            heading = {"parent": os.getpid(), "memory": self.limits.memory, "folder": str(folder)}
-            worker.requests.send_bytes(packed(heading))
-            worker.requests.send_bytes(pickle.dumps(self.description))
-            answer, _ = self._heard(worker, self.limits.load, "loading")
+            worker = supervisor.start({})
+            self._mine().workers[number] = worker
+            answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
-                raise self._failure(answer)
+                raise self._failure(worker, answer)
         except OSError:
-            self._useless = self._lost(worker, "in the loading")
+            self._useless = self._error(
+                "the process that watches the FMU's workers ended before one began",
+                got=_last_line(supervisor.said),
+            )
+            self._closed()
             raise self._useless from None
         except SimulationError as e:
-            self._end(worker)
+            if worker is not None:
+                self._end(worker)
             self._useless = e
             raise
         return worker
 
-    def _unpacked(self) -> Path:
-        if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="hvdc_ident_fmu_"))
-            Finalize(self, shutil.rmtree, (self._folder, True), exitpriority=10)
-            unpack(self.description.path, self._folder)
-        return self._folder
+    def _end(self, worker: _Worker) -> Ending | None:
+        """End a worker; how it ended, or None where that is not known."""
+        processes = self._mine()
+        at = next((n for n, known in processes.workers.items() if known is worker), None)
+        if at is None or processes.supervisor is None:  # ended before
+            return None
+        del processes.workers[at]
+        end = processes.supervisor.end(worker)
+        worker.close()
+        if processes.supervisor.gone:
+            processes.supervisor = None
+        return end
 
-    def _end(self, worker: _Worker) -> None:
-        if self._worker is worker:
-            self._worker = None
+    def _closed(self) -> None:
+        if self._processes is not None:
             self._finalizer.cancel()
-        _close(worker)
-
-    def close(self) -> None:
-        """Nothing; the worker is gone. The next run starts another."""
-        with self._lock:
-            if self._worker is not None:
-                self._end(self._worker)
+            self._processes.close()
+            self._processes = None
 
 
-def _close(worker: _Worker) -> None:
-    """Nothing; the worker's process is gone."""
-    for end in (worker.requests, worker.answers, worker.said):
-        with contextlib.suppress(OSError):
-            end.close()
-    if worker.owner == os.getpid() and worker.process.poll() is None:
-        if worker.child:
-            with contextlib.suppress(OSError):
-                os.kill(worker.child, signal.SIGKILL)
-        worker.process.kill()
-        worker.process.wait()
+class _Watch:
+    """The deadline of one run, and whether the run moves. progress: shared with the worker."""
+
+    def __init__(self, progress: memoryview[float], deadline: float) -> None:
+        self.progress, self.deadline = progress, deadline
+        self.began = self.moved = time.monotonic()
+        self.at = (math.nan, math.nan)
+
+    def pause(self) -> float:
+        """For how long to wait before the next look, s."""
+        self._look()
+        return max(0.0, min(self.progress[BEGAN] + self.deadline - time.monotonic(), self.deadline / LOOKS))
+
+    def over(self) -> bool:
+        """Whether the run is past its deadline."""
+        self._look()
+        return time.monotonic() >= self.progress[BEGAN] + self.deadline
+
+    def instants(self) -> tuple[float, float, float]:
+        """First, last and present instant of the run, s, nan where not known."""
+        return self.progress[START], self.progress[STOP], self.progress[NOW]
+
+    def still(self) -> float | None:
+        """For how long the run has stood still, s; None where it moves, or was not watched for long enough."""
+        stood = time.monotonic() - self.moved
+        return stood if stood > 2 * self.deadline / LOOKS else None
+
+    def _look(self) -> None:
+        at = (self.progress[BEGAN], self.progress[NOW])
+        if at != self.at and not (math.isnan(at[1]) and at[0] == self.at[0]):
+            self.at, self.moved = at, time.monotonic()
 
 
-def _signal(number: int) -> str:
-    try:
-        return f"its process was ended by {signal.Signals(number).name}"
-    except ValueError:
-        return f"its process was ended by signal {number}"
+def cores() -> int:
+    """Processes that may work at once: one for each core, or one in a process that a pool has started for its own."""
+    if multiprocessing.parent_process() is not None:
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _last_line(said: IO[bytes]) -> str:
+    """The last line that a process wrote."""
+    with contextlib.suppress(ValueError, OSError):
+        said.seek(0, os.SEEK_END)
+        said.seek(max(0, said.tell() - 2000))
+        lines = said.read().decode("utf-8", "replace").strip().splitlines()
+        return " ".join(lines[-1].split())[:300] if lines else ""
+    return ""
+
+
+__all__ = ["Answer", "Host", "Limits", "cores"]

@@ -1,32 +1,60 @@
-"""What travels between a process and its worker: a JSON heading and arrays of doubles. Nothing in it can run code."""
+"""What travels between a process and its worker: a JSON heading and arrays of doubles, which cannot run code; and
+memory that both see, in which the worker notes how far it is."""
 
 from __future__ import annotations
 
 import json
+import math
+import mmap
+import tempfile
 from collections.abc import Mapping
-from typing import Any
+from math import prod
+from typing import IO, Any
 
 import numpy as np
 
 from hvdc_ident.trajectory import Array
 
+PROCESS, BEGAN, START, STOP, NOW = range(5)
+"""Places in `progress`: the process that has the FMU, when its run began (s of the monotonic clock), and of the run the
+first, last and present instant, s."""
+
 
 def packed(heading: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytes:
-    """The bytes of a message."""
+    """Return the bytes of a message."""
     parts = {n: np.ascontiguousarray(a, dtype="<f8") for n, a in (arrays or {}).items()}
     text = json.dumps({"heading": dict(heading), "arrays": {n: list(a.shape) for n, a in parts.items()}}).encode()
     return b"".join([len(text).to_bytes(8, "little"), text, *(a.tobytes() for a in parts.values())])
 
 
 def unpacked(message: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The heading and the arrays of a message. Raises ValueError where it is none."""
+    """Return the heading and the arrays of a message. Raises ValueError where it is none."""
     size = int.from_bytes(message[:8], "little")
     outer = json.loads(message[8 : 8 + size])
     arrays, at = {}, 8 + size
     for name, shape in outer["arrays"].items():
-        count = int(np.prod(shape, dtype=int))
+        count = prod(shape)
         if at + 8 * count > len(message):
             raise ValueError("the message is shorter than it says")
         arrays[name] = np.frombuffer(message, dtype="<f8", count=count, offset=at).reshape(shape).astype(float)
         at += 8 * count
     return outer["heading"], arrays
+
+
+def progress_file() -> IO[bytes]:
+    """Return a file without a name that holds a worker's progress."""
+    file = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the worker
+    file.truncate(mmap.PAGESIZE)
+    return file
+
+
+def progress_in(file: int) -> memoryview[float]:
+    """Return the doubles of a progress file, shared with every process that has it."""
+    return memoryview(mmap.mmap(file, mmap.PAGESIZE)).cast("d")
+
+
+def no_progress() -> memoryview[float]:
+    """Return a progress that nobody watches."""
+    view = memoryview(bytearray(8 * 5)).cast("d")
+    view[NOW] = math.nan
+    return view

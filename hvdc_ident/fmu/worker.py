@@ -1,90 +1,111 @@
-"""The processes that have to do with an FMU's machine code: `python -m hvdc_ident.fmu.worker IN OUT`, numbers of pipes.
+"""The process with an FMU's machine code in it, forked by `hvdc_ident.fmu.supervisor`: it answers the host's requests.
 
-The one that `hvdc_ident.fmu.host` starts forks: the child loads the FMU and answers, the parent waits for its end and
-tells it with the memory it had used, which the system says of a forked process alone. Whatever the FMU prints goes to
-stderr, whose end the host quotes where it dies.
+Whatever the FMU prints goes to a file, whose end the host quotes where it dies.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import faulthandler
+import math
 import os
 import signal
-import sys
-import threading
+import socket
 import time
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NoReturn
+
+from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_in, unpacked
+
+PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent ends
 
 
-def main() -> None:
-    """Nothing; requests are answered until the pipe closes or the FMU ends its process."""
-    inward, outward = int(sys.argv[1]), int(sys.argv[2])
-    requests = Connection(inward, writable=False)
-    answers = Connection(outward, readable=False)
-    os.dup2(2, 1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with contextlib.suppress(EOFError, OSError):
-        _begin(requests, answers)
-    os._exit(0)  # an FMU's library may hang in its own clean-up
-
-
-def _begin(requests: Connection, answers: Connection) -> None:
-    import pickle
-
-    from hvdc_ident.fmu.messages import packed, unpacked
-
-    heading, _ = unpacked(requests.recv_bytes())
-    description = pickle.loads(requests.recv_bytes())  # from the host, which is trusted
-    import hvdc_ident.fmu.jobs  # noqa: F401 - what is loaded later would count as the FMU's memory
+def prepare(description: Any) -> None:
+    """Load what workers need: what one of them loads later would count as the FMU's memory."""
+    import hvdc_ident.fmu.jobs  # noqa: F401
 
     if description.interface == "model-exchange":
         import scipy.integrate  # noqa: F401
-    child = os.fork()
-    if child == 0:
-        _limit(heading["memory"])
-        answers.send_bytes(packed({"more": 1, "resident": _resident()}))
-        _serve(requests, answers, description, heading["folder"])
-        return
-    requests.close()
-    threading.Thread(target=_watch, args=(heading["parent"], child), daemon=True).start()
-    answers.send_bytes(packed({"more": 1, "child": child}))
-    _, status, usage = os.wait4(child, 0)
-    answers.send_bytes(packed({"ended": os.waitstatus_to_exitcode(status), "peak": usage.ru_maxrss * 1024}))
 
 
-def _serve(requests: Connection, answers: Connection, description: Any, folder: str) -> None:
-    from hvdc_ident.fmu.messages import packed, unpacked
+def main(
+    parent: int,
+    description: Any,
+    folder: str,
+    memory: int | None,
+    begun: Mapping[str, Any],
+    descriptors: Sequence[int],
+    dumps: socket.socket,
+) -> NoReturn:
+    """Answer requests until the host closes the connection or the FMU ends the process.
 
-    jobs = _guarded(answers, lambda: _loaded(description, folder, lambda: answers.send_bytes(packed({"more": 1}))))
+    begun: the host's heading. descriptors: of the connection, of the progress file and of what is printed to.
+    dumps: takes the frames when it crashes.
+    """
+    try:
+        os.setpgid(0, 0)  # with what the FMU may start
+        _end_with(parent)
+        connection, progress, printed = descriptors
+        os.dup2(printed, 1)
+        os.dup2(printed, 2)
+        view = progress_in(progress)
+        view[PROCESS], view[NOW] = os.getpid(), math.nan
+        told = _dump_into(dumps)  # noqa: F841 - the system calls it at the end
+        _limit(memory)
+        host = Connection(connection)
+        host.send_bytes(packed({"more": 1, "resident": resident(), "space": space()}))
+        _serve(host, description, folder, begun, view)
+    except (EOFError, OSError):
+        pass  # the host is gone
+    finally:
+        os._exit(0)  # an FMU's library may hang in its own clean-up
+
+
+def _serve(host: Connection, description: Any, folder: str, begun: Mapping[str, Any], view: memoryview[float]) -> None:
+    """Load the FMU and answer requests. begun: what the host began with. view: where the progress is noted."""
+    tell = _teller(view)
+    jobs = _guarded(host, lambda: _loaded(description, folder, tell, view))
     if jobs is None:
         return
-    answers.send_bytes(packed({"done": 1}))
+    host.send_bytes(packed({"done": 1}))
     while True:
-        heading, arrays = unpacked(requests.recv_bytes())
-        answer = _guarded(answers, lambda h=heading, a=arrays: jobs.do(h, a), jobs)
+        heading, arrays = unpacked(host.recv_bytes())
+        tell()
+        answer = _guarded(host, lambda h=heading, a=arrays: jobs.do(h, a), jobs)
         if answer is not None:
             found, out = answer
-            answers.send_bytes(packed({**found, "done": 1, "memory": _resident()}, out))
+            host.send_bytes(packed({**found, "done": 1, "memory": resident(), "space": space()}, out))
 
 
-def _loaded(description: Any, folder: str, tell: Any) -> Any:
+def _teller(view: memoryview[float]) -> Callable[[], None]:
+    """Return what notes that a run begins: the deadline is that of one run."""
+
+    def tell() -> None:
+        view[BEGAN] = time.monotonic()
+        view[START] = view[STOP] = view[NOW] = math.nan
+
+    return tell
+
+
+def _loaded(description: Any, folder: str, tell: Any, view: memoryview[float]) -> Any:
     from hvdc_ident.fmu.jobs import Jobs
     from hvdc_ident.fmu.plant import Plant
 
     plant = Plant(description, folder)
+    plant.binding.progress = view
     plant.instantiate()
     return Jobs(plant, tell)
 
 
-def _guarded(answers: Connection, work: Any, jobs: Any = None) -> Any:
+def _guarded(host: Connection, work: Any, jobs: Any = None) -> Any:
     """What the work returns; None where it failed, which was told. A fatal failure ends the process.
 
     A failure with "again" may have come from what the process did before: the host asks once more in a new one.
     """
     from fmpy.fmi1 import FMICallException
 
-    from hvdc_ident.fmu.messages import packed
     from hvdc_ident.fmu.plant import NoInstance, RunFailed
 
     fatal = False
@@ -106,45 +127,53 @@ def _guarded(answers: Connection, work: Any, jobs: Any = None) -> Any:
         told["said"] = messages[-1] if messages else ""
         messages.clear()
         jobs.plant.abandon()
-    answers.send_bytes(packed({"fatal": fatal, **told}))
+    host.send_bytes(packed({"fatal": fatal, **told, "memory": resident(), "space": space()}))
     if fatal:
         os._exit(0)
     return None
 
 
+def _end_with(parent: int) -> None:
+    """Let the system end this process when its parent ends."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(0)
+
+
+def _dump_into(dumps: socket.socket) -> object:
+    """Dump the frames when this process crashes, gets SIGUSR1, or is ended by the FMU's exit. Return what to keep."""
+    where = dumps.detach()
+    faulthandler.enable(where)
+    faulthandler.register(signal.SIGUSR1, where, all_threads=True)
+    at_exit = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(lambda _: faulthandler.dump_traceback(where))
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).__cxa_atexit(at_exit, None, None)
+    return at_exit
+
+
 def _limit(memory: int | None) -> None:
-    """Nothing; the process may take so many bytes more than it has now, and leaves no core file."""
-    if memory is not None:
-        with contextlib.suppress(ImportError, OSError, ValueError):
-            import resource
+    """Let the process take so many bytes more than it has now, and leave no core file."""
+    import resource
 
-            with open("/proc/self/statm", encoding="ascii") as sizes:
-                now = int(sizes.read().split()[0]) * resource.getpagesize()
-            resource.setrlimit(resource.RLIMIT_AS, (now + memory, now + memory))
-    with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource
-
+    with contextlib.suppress(OSError, ValueError):
+        if memory is not None:
+            most = space() + memory
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _watch(parent: int, child: int) -> None:
-    """Nothing; both processes end soon after the host, even where the FMU hangs."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    with contextlib.suppress(OSError):
-        os.kill(child, signal.SIGKILL)
-    os._exit(0)
-
-
-def _resident() -> int:
+def resident() -> int:
     """Bytes of memory in use; 0 where the system does not tell."""
-    with contextlib.suppress(OSError, ValueError, ImportError):
-        import resource
+    return _statm(1)
 
-        with open("/proc/self/statm", encoding="ascii") as sizes:
-            return int(sizes.read().split()[1]) * resource.getpagesize()
+
+def space() -> int:
+    """Bytes of address space in use, on which the limit is; 0 where the system does not tell."""
+    return _statm(0)
+
+
+def _statm(place: int) -> int:
+    with contextlib.suppress(OSError), open("/proc/self/statm", encoding="ascii") as sizes:
+        return int(sizes.read().split()[place]) * os.sysconf("SC_PAGESIZE")
     return 0
-
-
-if __name__ == "__main__":
-    main()

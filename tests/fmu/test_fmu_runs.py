@@ -120,7 +120,7 @@ def test_a_model_travels_without_its_worker(fmu):
     model = fmu(spring())
     here = simulate(model, STEP)["y"]
     there = pickle.loads(pickle.dumps(model))
-    assert there.host._worker is None
+    assert there.host._processes is None
     assert np.array_equal(simulate(there, STEP)["y"], here)
     there.host.close()
 
