@@ -183,9 +183,31 @@ def new(
 @app.command()
 @guarded
 def check(
-    study: StudyFile, seed: Seed = 0, json: Json = False, quiet: Quiet = False, trust: Trust = False, out: Out = None
+    study: Annotated[
+        Path, typer.Argument(metavar="STUDY|FMU", help="A study file (TOML), or an FMU.", show_default=False)
+    ],
+    find: Annotated[
+        str, typer.Option("--find", metavar="TEXT", help="Of an FMU: variables with TEXT.", show_default=False)
+    ] = "",
+    all_: Annotated[bool, typer.Option("--all", help="Of an FMU: every variable.")] = False,
+    build: Annotated[
+        bool, typer.Option("--compile", help="Of an FMU: compile the C sources in it into a new file beside it.")
+    ] = False,
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+    trust: Trust = False,
+    out: Out = None,
 ) -> None:
-    """Validate study, model and data, and compare the levels before each event; run no stage."""
+    """Validate study, model and data, and compare the levels before each event; run no stage.
+
+    Of an FMU: list its variables, what it offers, and what a short run finds.
+    """
+    if study.suffix.lower() == ".fmu":
+        _check_fmu(study, find, every=all_ or bool(find), build=build, json=json, quiet=quiet)
+        return
+    if find or all_ or build:
+        raise InputError("--find, --all and --compile are about an FMU", where=str(study), expected="a path to an .fmu")
     from hvdc_ident.study.study import load_study
     from hvdc_ident.study.summary import summary, summary_text
 
@@ -193,6 +215,26 @@ def check(
     if json:
         _print_json(found)
     _say(summary_text(found), json=json, quiet=quiet)
+
+
+def _check_fmu(path: Path, find: str, *, every: bool, build: bool, json: bool, quiet: bool) -> None:
+    """Print what an FMU holds and offers; where it cannot run here, that is the error, after the list."""
+    from hvdc_ident.fmu.capabilities import read_capabilities, tried
+    from hvdc_ident.models import load_model
+
+    if build:
+        from hvdc_ident.fmu.compile import compile_fmu
+
+        path = compile_fmu(path)
+        _say(f"compiled: {path} is written; name it in the study's [model] source", json=json, quiet=quiet)
+    found = read_capabilities(path)
+    found = found if found.problem else tried(load_model(path), found)  # type: ignore[arg-type]
+    shown = found.matching(find) if find else found
+    if json:
+        _print_json(shown.to_dict())
+    _say(shown.text(None) if every else shown.text(), json=json, quiet=quiet)
+    if found.problem:
+        load_model(path)  # raises, with the way out
 
 
 @app.command("run")

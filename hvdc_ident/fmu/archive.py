@@ -11,8 +11,9 @@ import re
 import stat
 import zipfile
 import zlib
-from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
+from typing import Literal
 from xml.parsers import expat
 
 from hvdc_ident.errors import ModelError
@@ -58,10 +59,8 @@ def check_archive(path: Path) -> tuple[str, ...]:
                 f"at most {MOST_RATIO} times its size",
                 f"{total / packed:.0f} times",
             )
-        names = [e.filename for e in entries]
-        twice = next((n for n, count in Counter(names).items() if count > 1), None)
-        if twice is not None:
-            raise _refused(path, "the FMU has two files of one name", "one of each", twice)
+        names = list(dict.fromkeys(e.filename for e in entries))
+        _check_doubles(path, entries)
         if DESCRIPTION not in names:
             raise _refused(
                 path, "the archive is no FMU", f"a file {DESCRIPTION} in it", ", ".join(names[:5]) or "nothing"
@@ -79,6 +78,22 @@ def check_identifier(path: Path, identifier: str | None) -> str:
             path, "the model identifier is none", "letters, digits and _, the first no digit", repr(identifier)[:80]
         )
     return identifier
+
+
+def machine_of(library: bytes) -> str:
+    """Return for what a shared library's first bytes say it is made, "x86_64 Linux"; "" where they do not tell.
+
+    ELF: bytes 4 (1: 32 bits, 2: 64 bits) and 18 (the machine) of its header; Windows begins with MZ, macOS with Mach-O.
+    """
+    if library[:4] == b"\x7fELF" and len(library) >= 20:
+        bits = {1: 32, 2: 64}.get(library[4], 0)
+        order: Literal["little", "big"] = "big" if library[5] == 2 else "little"
+        number = int.from_bytes(library[18:20], order)
+        known = {3: "x86", 62: "x86_64", 40: "arm", 183: "aarch64", 243: "riscv"}
+        return f"{known.get(number, f'machine {number}')} Linux, {bits} bits"
+    if library[:2] == b"MZ":
+        return "Windows"
+    return "macOS" if library[:4] in (b"\xcf\xfa\xed\xfe", b"\xca\xfe\xba\xbe", b"\xce\xfa\xed\xfe") else ""
 
 
 def unpack(path: Path, folder: Path) -> None:
@@ -113,7 +128,10 @@ def _opened(path: Path) -> zipfile.ZipFile:
     except OSError as e:
         raise ModelError(f"the file cannot be read: {(e.strerror or str(e)).lower()}", where=str(path)) from None
     except DAMAGE as e:
-        raise ModelError(f"the file is no zip archive: {e}", where=str(path), expected="an FMU") from None
+        why = str(e).removeprefix("File is not a zip file")
+        raise ModelError(
+            f"the file is no zip archive{f': {why}' if why else ''}", where=str(path), expected="an FMU, which is one"
+        ) from None
 
 
 def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
@@ -129,6 +147,19 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
         raise _refused(path, f"'{entry.filename}' in the FMU is {what}", "plain files", "")
     if entry.flag_bits & 1:
         raise _refused(path, f"'{entry.filename}' in the FMU is encrypted", "plain files", "")
+
+
+def _check_doubles(path: Path, entries: Iterable[zipfile.ZipInfo]) -> None:
+    """Raises ModelError where two files of one name differ and one of them is run, read by the FMU, or parsed.
+
+    Anywhere else, as in `extra`, the last one counts, as it does for every unzip.
+    """
+    seen: dict[str, tuple[int, int]] = {}
+    for entry in entries:
+        name, content = _plain(entry.filename), (entry.file_size, entry.CRC)
+        used = name in PARSED or name.startswith(("binaries/", "resources/"))
+        if used and seen.setdefault(name, content) != content:
+            raise _refused(path, "the FMU has two different files of one name", "one of each", name)
 
 
 def _plain(name: str) -> str:

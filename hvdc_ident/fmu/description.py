@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+import sys
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier
+from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier, machine_of
 from hvdc_ident.frozen import FrozenMap
 
 Interface = Literal["model-exchange", "co-simulation"]
@@ -69,7 +70,7 @@ class Description:
     version: 2 or 3. token: the GUID or instantiation token. derivatives: value references in the order of the states.
     variables: every scalar number by name, aliases included. arrays: sizes in words of those that are arrays, which
     stay at their start and are not recorded. shown: names recorded where none are asked for, the outputs that it
-    declares or, without any, its states.
+    declares or, without any, its states. tool: what made it; needs_tool: whether it runs in that tool alone.
     completed_step: whether it wants to hear of finished integrator steps. directional: whether it offers directional
     derivatives. variable_step: whether communication steps may differ. interpolates: whether it takes the slope of
     inputs. step: communication step it suggests, s, or None.
@@ -93,6 +94,8 @@ class Description:
     interpolates: bool = False
     step: float | None = None
     text: str = ""
+    tool: str = ""
+    needs_tool: bool = False
     variables: FrozenMap[Variable] = field(default_factory=FrozenMap)
     arrays: FrozenMap[str] = field(default_factory=FrozenMap)
     shown: tuple[str, ...] = ()
@@ -103,20 +106,27 @@ class Description:
         return known[name]
 
 
-def read_description(path: Path, interface: Interface | None = None) -> Description:
-    """The description of a checked FMU; model exchange where it offers both and none is asked for.
+def read_description(path: Path, interface: Interface | None = None, *, binary: bool = True) -> Description:
+    """Return the description of a checked FMU; model exchange where it offers both and none is asked for.
 
-    Raises ModelError where the archive is refused, the XML makes no sense, or what is needed is not there.
+    binary: whether it must have one for this machine. Raises ModelError where the archive is refused, the XML makes no
+    sense, or what is needed is not there.
     """
     names = check_archive(path)
-    given = _parsed(path)
+    given = parsed(path)
     if given.fmiMajorVersion not in (2, 3):
         raise ModelError(
-            "this version of FMI is not read", where=str(path), expected="FMI 2.0 or 3.0", got=str(given.fmiVersion)
+            "this version of FMI is not read",
+            where=str(path),
+            expected="FMI 2.0 or 3.0",
+            got=f"FMI {given.fmiVersion}",
+            hint=f"export it again as FMI 2.0 {_tool_words(given)}; the results of another simulator of FMI 1.0, as a CSV "
+            "file, can be an experiment's data",
         )
     kind, chosen = _interface(path, given, interface)
     identifier = check_identifier(path, chosen.modelIdentifier)
-    _check_binary(path, names, given.fmiMajorVersion, identifier)
+    if binary:
+        check_binary(path, names, given.fmiMajorVersion, identifier)
     _refuse_clocks(path, given.modelVariables)
     states, derivatives = _states(path, given) if kind == "model-exchange" else (FrozenMap(), ())
     numbers = [v for v in given.modelVariables if v.type in (*REAL, *WHOLE)]
@@ -144,14 +154,16 @@ def read_description(path: Path, interface: Interface | None = None) -> Descript
         step=_number(getattr(chosen, "fixedInternalStepSize", None))
         or _number(experiment.stepSize if experiment else None),
         text=given.description or "",
+        tool=given.generationTool or "",
+        needs_tool=bool(getattr(chosen, "needsExecutionTool", False)),
         variables=variables,
         arrays=FrozenMap({v.name: _size(v) for v in numbers if v.dimensions}),
         shown=tuple(outputs) or _named_states(given, variables),
     )
 
 
-def _parsed(path: Path) -> Any:
-    """FMPy's reading of the XML. Its own validation is off: it refuses what can be worked with, as a missing start."""
+def parsed(path: Path) -> Any:
+    """Return FMPy's reading of the XML. Its own validation is off: it refuses what can be worked with, as a missing start."""
     from fmpy import read_model_description
     from lxml import etree
 
@@ -162,7 +174,17 @@ def _parsed(path: Path) -> Any:
     except Exception as e:  # FMPy raises bare Exceptions for what it does not support
         if type(e).__module__ not in ("builtins", "fmpy.model_description"):
             raise
-        raise ModelError(f"the model description cannot be used: {_said(e)}", where=str(path)) from None
+        why = _said(e).removeprefix("Exception: ").rstrip(".")
+        raise ModelError(
+            f"the model description cannot be used: {why}",
+            where=str(path),
+            hint=f"export it again from its tool, or mend its {DESCRIPTION}: the standard forbids what is said there",
+        ) from None
+
+
+def _tool_words(given: Any) -> str:
+    """Return the tool that made the FMU, for a sentence."""
+    return f"from {given.generationTool}" if given.generationTool else "from the tool it comes from"
 
 
 def _says_directional(path: Path, kind: Interface) -> bool:
@@ -198,23 +220,53 @@ def _interface(path: Path, given: Any, asked: Interface | None) -> tuple[Interfa
     return wanted, offered[wanted]
 
 
-def _check_binary(path: Path, names: Iterable[str], version: int, identifier: str) -> None:
+def has_sources(names: Iterable[str]) -> bool:
+    """Return whether an FMU of these files has C sources."""
+    return any(n.startswith("sources/") and n.endswith(".c") for n in names)
+
+
+def platforms(names: Iterable[str]) -> dict[str, list[str]]:
+    """Return the libraries in an FMU by the folder of their platform; empty folders too."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        parts = name.replace("\\", "/").split("/")
+        if parts[0] == "binaries" and len(parts) > 2:
+            libraries = found.setdefault(parts[1], [])
+            if len(parts) == 3 and parts[2].endswith((".so", ".dll", ".dylib")):
+                libraries.append(parts[2])
+    return {p: found[p] for p in sorted(found)}
+
+
+def check_binary(path: Path, names: Iterable[str], version: int, identifier: str) -> None:
+    """Raise ModelError where there is no binary that this machine can load: what is in its place, and the way out."""
     from fmpy import platform, platform_tuple, sharedLibraryExtension
 
-    folders = {n.split("/")[1] for n in names if n.startswith("binaries/") and n.count("/") > 1}
     folder = platform if version == 2 else platform_tuple
-    if f"binaries/{folder}/{identifier}{sharedLibraryExtension}" in set(names):
-        return
-    sources = any(n.startswith("sources/") and n.endswith(".c") for n in names)
-    have = ", ".join(sorted(folders)) or ("C sources only" if sources else "no binaries at all")
-    hint = "have its binary compiled for this machine, e.g. with FMPy's `fmpy compile`" if sources else ""
-    raise ModelError(
-        "the FMU has no binary for this machine",
-        where=str(path),
-        expected=f"binaries/{folder}/{identifier}{sharedLibraryExtension}",
-        got=have,
-        hint=hint,
-    )
+    file, have = f"{identifier}{sharedLibraryExtension}", platforms(names)
+    expected = f"binaries/{folder}/{file}"
+    hint = "have it exported for this machine by the tool it comes from"
+    if has_sources(names):
+        hint = f"`hvdc-ident check {path.name} --compile` compiles the C sources in it, into a new file; or {hint}"
+    if file in have.get(folder, ()):
+        with zipfile.ZipFile(path) as archive, archive.open(expected) as library:
+            made, here = machine_of(library.read(64)), machine_of(Path(sys.executable).read_bytes()[:64])
+        if not made or made == here:
+            return
+        what, expected, got = f"the FMU's binary {expected} is for another machine", here, made
+    else:
+        what, got = "the FMU has no binary for this machine", _in_its_place(folder, have, has_sources(names))
+    raise ModelError(what, where=str(path), expected=expected, got=got, hint=hint)
+
+
+def _in_its_place(folder: str, have: Mapping[str, list[str]], sources: bool) -> str:
+    """Return what an FMU has instead of a binary for this machine, in words."""
+    filled = [p for p, libraries in have.items() if libraries and p != folder]
+    others = f"; binaries for {', '.join(filled)}" if filled else ""
+    if folder not in have:
+        return others.removeprefix("; ") or ("C sources only" if sources else "no binaries at all")
+    if have[folder]:
+        return f"{', '.join(have[folder])} in that folder{others}"
+    return f"an empty folder binaries/{folder}{others}"
 
 
 def _refuse_clocks(path: Path, variables: Iterable[Any]) -> None:

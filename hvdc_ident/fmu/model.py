@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from hvdc_ident.model.definition import Output
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.result import Simulation
+
+if TYPE_CHECKING:
+    from hvdc_ident.fmu.capabilities import Capabilities
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,13 @@ class FmuModel:
     def fmu(self) -> Description:
         """What the FMU says of itself."""
         return self.host.description
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Return what the FMU says of itself and what short runs of it show; `print` gives a screen of it."""
+        from hvdc_ident.fmu.capabilities import tried
+
+        return tried(self)
 
     @property
     def has_equations(self) -> bool:

@@ -192,23 +192,72 @@ def test_files_that_are_no_fmu(tmp_path):
     (tmp_path / "cut.fmu").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ModelError, match="no zip archive"):
         load_model(tmp_path / "cut.fmu")
-    with pytest.raises(ModelError, match="two files of one name"), pytest.warns(UserWarning, match="Duplicate"):
-        load_model(written(tmp_path / "c.fmu", entries=[(binary(), b"again")]))
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_of_two_entries_of_one_name_the_last_counts_where_nothing_runs_or_reads_it(tmp_path):
+    twice = [("extra/tool/a.txt", b"first"), ("extra/tool/a.txt", b"second"), (binary(), b"no library")]
+    path = written(tmp_path / "a.fmu", entries=twice)
+    assert list(load_model(path).outputs) == ["y"]
+    checks.unpack(path, tmp_path / "there")
+    assert (tmp_path / "there" / "extra" / "tool" / "a.txt").read_bytes() == b"second"
+    other = description(PLAIN, 2).replace('name="T"', 'name="U"')
+    for entries in (
+        [(binary(), b"again")],
+        [("resources/a", b"1"), ("resources/a", b"2")],
+        [("resources/a", b"1"), ("resources\\a", b"2")],
+        [("modelDescription.xml", other)],
+    ):
+        with pytest.raises(ModelError, match="two different files of one name"):
+            load_model(written(tmp_path / "b.fmu", entries=entries))
 
 
 def test_binaries_that_are_not_there(tmp_path):
-    with pytest.raises(ModelError, match=r"no binary for this machine.*got win64"):
+    with pytest.raises(ModelError, match=r"no binary for this machine.*got binaries for win64"):
         path = tmp_path / "a.fmu"
         with zipfile.ZipFile(path, "w") as z:
             z.writestr("modelDescription.xml", description(PLAIN, 2))
             z.writestr("binaries/win64/lag.dll", b"")
         load_model(path)
-    with pytest.raises(ModelError, match=r"got C sources only.*compiled for this machine"):
+    with pytest.raises(ModelError, match=r"got C sources only.*--compile` compiles the C sources in it"):
         path = tmp_path / "b.fmu"
         with zipfile.ZipFile(path, "w") as z:
             z.writestr("modelDescription.xml", description(PLAIN, 2))
             z.writestr("sources/lag.c", b"")
         load_model(path)
+
+
+def library(bits, machine):
+    """The header of a shared library for Linux: ELF-32 or 64, and the machine by its number."""
+    kind = bytes([{32: 1, 64: 2}[bits], 1, 1])
+    return b"\x7fELF" + kind + bytes(9) + (3).to_bytes(2, "little") + machine.to_bytes(2, "little")
+
+
+@pytest.mark.skipif(platform != "linux64", reason="the folders and libraries are those of Linux on x86_64")
+@pytest.mark.parametrize(
+    ("entries", "got"),
+    [
+        (
+            [("binaries/linux64/", b""), ("binaries/win64/lag.dll", b"")],
+            "an empty folder binaries/linux64; binaries for win64",
+        ),
+        ([("binaries/linux64/lagME.so", b"")], "lagME.so in that folder"),
+        ([("binaries/linux32/lag.so", b"")], "binaries for linux32"),
+        ([("binaries/linux64/lag.so", library(32, 3))], "x86 Linux, 32 bits"),
+        ([("binaries/linux64/lag.so", library(64, 183))], "aarch64 Linux, 64 bits"),
+        ([("binaries/linux64/lag.so", b"MZ" + bytes(62))], "got Windows"),
+        ([], "no binaries at all"),
+    ],
+)
+def test_what_is_in_the_place_of_the_binary(tmp_path, entries, got):
+    path = tmp_path / "a.fmu"
+    with zipfile.ZipFile(path, "w") as z:
+        z.writestr("modelDescription.xml", description(PLAIN, 2))
+        for name, content in entries:
+            z.writestr(name, content)
+    with pytest.raises(ModelError) as caught:
+        load_model(path)
+    assert got in str(caught.value) and "binaries/linux64/lag.so" in str(caught.value)
 
 
 def test_what_fmi_has_and_this_has_not(tmp_path):

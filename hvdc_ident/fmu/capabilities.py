@@ -1,0 +1,284 @@
+"""A look at an FMU: its variables, what it offers, and what a short run of it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.errors import HvdcIdentError, ModelError
+from hvdc_ident.fmu.archive import check_archive
+from hvdc_ident.fmu.description import (
+    INTERFACES,
+    Description,
+    Variable,
+    check_binary,
+    has_sources,
+    parsed,
+    platforms,
+    read_description,
+)
+from hvdc_ident.frozen import FrozenMap
+
+if TYPE_CHECKING:
+    from hvdc_ident.fmu.model import FmuModel
+
+ROWS = 15
+"""Variables of one group that are shown where not all are asked for: the groups together stay about a screen."""
+SHARE = 0.1
+"""Of the default experiment's length that the short run takes."""
+GROUPS = {
+    "inputs": "inputs",
+    "outputs": "outputs, recorded where nothing else is named",
+    "parameters": "parameters, which can be estimated",
+    "states": "states, which can be recorded",
+    "others": "further variables, which can be recorded",
+}
+OFFERS = {
+    "variable communication steps": "canHandleVariableCommunicationStepSize",
+    "fixed internal step, s": "fixedInternalStepSize",
+    "directional derivatives": "providesDirectionalDerivative",
+    "interpolated inputs": "canInterpolateInputs",
+    "state access": "canGetAndSetFMUstate",
+    "serialised state": "canSerializeFMUstate",
+    "one instance a process": "canBeInstantiatedOnlyOncePerProcess",
+    "needs its tool": "needsExecutionTool",
+}
+"""By the words for it, the attribute of FMI that says it."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """An FMU as it describes itself, and as it was found.
+
+    interfaces: of each kind that it offers, what it says of OFFERS. platforms: libraries by folder. problem: why it
+    cannot be used here, "" where it can. experiment: start, stop, tolerance and step of its default, where it says
+    them. groups: variables by GROUPS; sizes: how many there are of each. arrays: sizes of variables that are arrays.
+    unused: variables that are no numbers. found: what runs of it showed, in words by subject.
+    """
+
+    path: Path
+    name: str
+    fmi: str
+    tool: str
+    date: str
+    description: str
+    interfaces: FrozenMap[FrozenMap[Any]]
+    platforms: FrozenMap[tuple[str, ...]]
+    sources: bool
+    problem: str
+    experiment: FrozenMap[float]
+    indicators: int
+    log_categories: tuple[str, ...]
+    groups: FrozenMap[FrozenMap[Variable]]
+    sizes: FrozenMap[int]
+    arrays: FrozenMap[str] = field(default_factory=FrozenMap)
+    unused: tuple[str, ...] = ()
+    found: FrozenMap[str] = field(default_factory=FrozenMap)
+
+    def matching(self, text: str) -> Capabilities:
+        """Return the same with only the variables that have the text in name, unit or description, in any case."""
+        part = text.casefold()
+
+        def holds(v: Variable) -> bool:
+            return any(part in t.casefold() for t in (v.name, v.unit, v.description, *v.also))
+
+        return replace(
+            self,
+            groups=FrozenMap(
+                {g: FrozenMap({n: v for n, v in vs.items() if holds(v)}) for g, vs in self.groups.items()}
+            ),
+            arrays=FrozenMap({n: s for n, s in self.arrays.items() if part in n.casefold()}),
+            unused=tuple(n for n in self.unused if part in n.casefold()),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything, all variables included, as JSON has it."""
+        plain = {k: v for k, v in self.__dict__.items() if k not in ("path", "interfaces", "groups", "platforms")}
+        return {
+            "schema": 1,
+            "file": self.path.name,
+            **{k: dict(v) if isinstance(v, FrozenMap) else v for k, v in plain.items()},
+            "interfaces": {k: dict(v) for k, v in self.interfaces.items()},
+            "platforms": {k: list(v) for k, v in self.platforms.items()},
+            "variables": {g: {n: _line(v) for n, v in vs.items()} for g, vs in self.groups.items()},
+        }
+
+    def text(self, rows: int | None = ROWS) -> str:
+        """Return a screen of it; rows: of each group that are shown, None for all."""
+        return "\n".join([*self._heading(), *self._abilities(), *self._listed(rows)])
+
+    def __str__(self) -> str:
+        return self.text()
+
+    def _heading(self) -> list[str]:
+        made = f", made by {self.tool}" if self.tool else ""
+        libraries = [f"{p}{'' if files else ' (empty)'}" for p, files in self.platforms.items()]
+        sizes = ", ".join(f"{n} {'other variables' if g == 'others' else g}" for g, n in self.sizes.items())
+        lines = [
+            f"{self.path.name}: model {self.name}, FMI {self.fmi}{made}{f', {self.date}' if self.date else ''}",
+            *([f"  {self.description}"] if self.description else []),
+            f"  offers {', '.join(self.interfaces) or 'neither model exchange nor co-simulation'}; binaries: "
+            f"{', '.join(libraries) or 'none'}{'; C sources' if self.sources else ''}",
+            f"  here: {self.problem or 'runs'}",
+            f"  {sizes}, {self.indicators} event indicators",
+        ]
+        if self.experiment:
+            lines.append("  default experiment: " + ", ".join(f"{k} {v:g}" for k, v in self.experiment.items()))
+        if self.log_categories:
+            lines.append(f"  log categories: {', '.join(self.log_categories)}")
+        return lines
+
+    def _abilities(self) -> list[str]:
+        lines = []
+        for kind, offers in self.interfaces.items():
+            words = [f"{k} {v if not isinstance(v, bool) else 'yes' if v else 'no'}" for k, v in offers.items()]
+            lines.append(f"  {kind} says: {', '.join(words)}")
+        return [*lines, *(f"  found: {subject}: {words}" for subject, words in self.found.items())]
+
+    def _listed(self, rows: int | None) -> list[str]:
+        lines = ["", "by name, causality, variability, unit, start, [min, max], description:"]
+        for group, variables in self.groups.items():
+            if not variables:
+                continue
+            shown = list(variables.values())[:rows]
+            table = [_cells(v) for v in shown]
+            widths = [min(max(len(row[k]) for row in table), 48) for k in range(len(table[0]) - 1)]
+            lines += ["", f"{GROUPS[group]} ({len(variables)})"]
+            for row in table:
+                padded = "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=False))
+                lines.append(f"  {padded}  {row[-1]}".rstrip())
+            if len(variables) > len(shown):
+                lines.append(
+                    f"  ... and {len(variables) - len(shown)} more: --all shows them, --find TEXT those with TEXT"
+                )
+        if self.arrays:
+            sizes = [f"{n} ({s})" for n, s in self.arrays.items()][:rows]
+            lines += [
+                "",
+                f"arrays, which stay at their start and are not recorded ({len(self.arrays)})",
+                f"  {', '.join(sizes)}",
+            ]
+        if self.unused:
+            lines += ["", f"no numbers, not used ({len(self.unused)})", f"  {', '.join(self.unused[:rows])}"]
+        return lines
+
+
+def _cells(v: Variable) -> tuple[str, ...]:
+    start = "" if v.start is None else f"{v.start:g}"
+    bounds = "" if not np.isfinite([v.min, v.max]).any() else f"[{v.min:g}, {v.max:g}]"
+    also = f" (also {', '.join(v.also)})" if v.also else ""
+    return v.name, v.causality, v.variability, v.unit, start, bounds, " ".join(f"{v.description}{also}".split())
+
+
+def _line(v: Variable) -> dict[str, Any]:
+    finite = {k: x if np.isfinite(x) else None for k, x in (("min", v.min), ("max", v.max))}
+    return {k: x for k, x in {**asdict(v), **finite, "also": list(v.also)}.items() if k not in ("name", "reference")}
+
+
+def read_capabilities(path: str | Path) -> Capabilities:
+    """Return what an FMU says of itself; nothing of it is run. Raises ModelError where it is no FMU of FMI 2.0 or 3.0."""
+    file = Path(path)
+    names = check_archive(file)
+    described = read_description(file, binary=False)
+    groups = _groups(described)
+    given = parsed(file)
+    try:
+        check_binary(file, names, described.version, described.identifier)
+        problem = ""
+    except ModelError as e:
+        problem = f"{e.what}, but {e.got}"
+    offered = zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True)
+    default = {"start": "startTime", "stop": "stopTime", "tolerance": "tolerance", "step": "stepSize"}
+    said = {words: getattr(given.defaultExperiment, attribute, None) for words, attribute in default.items()}
+    return Capabilities(
+        path=file,
+        name=given.modelName or file.stem,
+        fmi=str(given.fmiVersion),
+        tool=given.generationTool or "",
+        date=given.generationDateAndTime or "",
+        description=" ".join((given.description or "").split()),
+        interfaces=FrozenMap({str(k): _offers(i) for k, i in offered if i is not None}),
+        platforms=FrozenMap({k: tuple(v) for k, v in platforms(names).items()}),
+        sources=has_sources(names),
+        problem=problem,
+        experiment=FrozenMap({k: float(v) for k, v in said.items() if v is not None}),
+        indicators=int(given.numberOfEventIndicators or 0),
+        log_categories=tuple(c.name for c in given.logCategories),
+        groups=groups,
+        sizes=FrozenMap({g: len(vs) for g, vs in groups.items()}),
+        arrays=described.arrays,
+        unused=tuple(v.name for v in given.modelVariables if v.type in ("String", "Binary", "Clock")),
+    )
+
+
+def _offers(interface: Any) -> FrozenMap[Any]:
+    """Return what one interface says of itself, by the words of OFFERS; what its kind does not have is left out."""
+    said = {words: getattr(interface, attribute, None) for words, attribute in OFFERS.items()}
+    return FrozenMap({words: value for words, value in said.items() if value is not None})
+
+
+def _groups(d: Description) -> FrozenMap[FrozenMap[Variable]]:
+    """Return the variables by GROUPS, each in one; states under the names that the model structure has for them."""
+    outputs = {n: d.variable(n) for n in d.shown} if d.outputs else {}
+    states = d.states or ({} if d.outputs else {n: d.variable(n) for n in d.shown})
+    states = {n: v for n, v in states.items() if n not in outputs}
+    also = {n for table in (d.parameters, d.inputs) for v in table.values() for n in v.also}
+    taken = {*outputs, *states, *d.inputs, *d.parameters, *also}
+    others = {n: v for n, v in d.variables.items() if n not in taken and v.recordable}
+    tables = (d.inputs, outputs, d.parameters, states, others)
+    return FrozenMap({g: FrozenMap(t) for g, t in zip(GROUPS, tables, strict=True)})
+
+
+def tried(model: FmuModel, known: Capabilities | None = None) -> Capabilities:
+    """Return the capabilities of an FMU with what short runs of it show; what fails is told in the error's words."""
+    found = known or read_capabilities(model.fmu.path)
+    subjects = {"two short runs": _two_runs, "derivatives at the start": _derivatives}
+    words = {subject: _words(look, model, found) for subject, look in subjects.items()}
+    return replace(found, found=FrozenMap({k: v for k, v in words.items() if v}))
+
+
+def _words(look: Callable[[FmuModel, Capabilities], str], model: FmuModel, found: Capabilities) -> str:
+    try:
+        return look(model, found)
+    except HvdcIdentError as e:
+        return f"failed: {e.what}" + (f" ({e.got})" if e.got else "")
+
+
+def _two_runs(model: FmuModel, found: Capabilities) -> str:
+    """Return whether a second run equals the first."""
+    from hvdc_ident.experiment import experiment
+
+    if not model.outputs:
+        return ""
+    start = found.experiment.get("start", 0.0)
+    span = SHARE * max(found.experiment.get("stop", start + 1.0) - start, 0.0) or SHARE
+    short = experiment("short", np.linspace(start, start + span, 11), {})
+    first, second = (model.simulate(short).trajectory.values for _ in range(2))
+    off = np.abs(second - first).max(axis=0) / np.maximum(np.abs(first).max(axis=0), 1e-300)
+    names = [n for n, o in zip(model.outputs, off.tolist(), strict=True) if o > 0.0]
+    length = f"{span:g} s from {start:g} s"
+    if not names:
+        return f"equal, {length}"
+    return f"differ by up to {off.max():.2g} of their size in {', '.join(names[:3])}, {length}"
+
+
+def _derivatives(model: FmuModel, _: Capabilities) -> str:
+    """Return which derivatives the FMU computes itself, and whether these agree with differences."""
+    from hvdc_ident.fmu.point import at_point, smooth_inputs
+
+    if not model.has_equations or not model.states:
+        return ""
+    if not model.fmu.directional:
+        return "differences: directional ones are not offered"
+    real = [n for n, v in model.fmu.parameters.items() if not v.whole]
+    point = at_point(model, {}, None, tuple(model.outputs), real)
+    columns = [*model.states, *smooth_inputs(model), *real]
+    wrong = [n for n, own in zip(columns, point.directional.tolist(), strict=True) if not own]
+    if not wrong:
+        return f"directional ones agree with differences, for all {len(columns)} states, inputs and parameters"
+    some = ", ".join(wrong[:4]) + (" ..." if len(wrong) > 4 else "")
+    return f"directional ones are refused or differ from differences for {len(wrong)} of {len(columns)}: {some}"

@@ -1,0 +1,122 @@
+"""`check` of an FMU: its variables, what it offers, what a short run finds, and a binary compiled from its sources."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from c_fmu import SOURCE, Var, build, description, needs_compiler
+from c_models import BALL, response, spring
+from typer.testing import CliRunner
+
+from hvdc_ident import load_model, simulate
+from hvdc_ident.cli import app
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fmu.capabilities import read_capabilities
+
+pytestmark = needs_compiler
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["check", *map(str, arguments)])
+
+
+def test_the_list_of_variables_is_grouped_and_cut(tmp_path):
+    plain = spring()
+    many = tuple(Var(f"cell[{k}].i", 10, more=(("unit", "A"),)) for k in range(40))
+    path = build(replace(plain, variables=(*plain.variables, *many)), tmp_path)
+    whole = run(path).output
+    assert "4 parameters" in whole and "model-exchange, co-simulation" in whole
+    assert "cell[0].i" in whole and "cell[39].i" not in whole and "more: --all shows them, --find TEXT" in whole
+    row = next(line for line in whole.splitlines() if line.startswith("  m "))
+    assert row.split() == ["m", "parameter", "fixed", "kg", "2", "[0.1,", "inf]"]
+    found = read_capabilities(path)
+    assert "cell[39].i" in found.text(None) and "found:" in whole and "found:" not in str(found)
+    some = found.matching("CELL[3").text(None)
+    assert "cell[3].i" in some and "cell[39].i" in some and "cell[2].i" not in some and "4 parameters" in some
+
+
+def test_json_has_every_variable_and_what_was_found(tmp_path):
+    result = run(build(spring(), tmp_path), "--json")
+    found = json.loads(result.stdout)
+    assert list(found["variables"]["parameters"]) == ["m", "d", "k", "b"]
+    assert found["variables"]["parameters"]["k"]["also"] == ["stiffness"]
+    assert list(found["variables"]["states"]) == ["x", "v"] and found["sizes"]["outputs"] == 2
+    assert found["found"]["two short runs"].startswith("equal")
+    assert "agree with differences, for all 7" in found["found"]["derivatives at the start"]
+
+
+def test_derivatives_that_are_wrong_are_found(fmu):
+    words = fmu(spring("skew", wrong=1.5)).capabilities
+    assert "differ from differences for" in words.found["derivatives at the start"]
+    assert "skew2.fmu: model skew, FMI 2.0" in str(words)
+
+
+def test_an_fmu_without_outputs_lists_its_states_once(tmp_path):
+    quiet = replace(BALL, name="quiet", variables=tuple(v for v in BALL.variables if v.causality != "output"))
+    found = json.loads(run(build(quiet, tmp_path), "--json").stdout)
+    assert not found["variables"]["outputs"] and list(found["variables"]["states"]) == ["h", "v"]
+
+
+@pytest.fixture
+def foreign(tmp_path):
+    """The spring with its C sources, and a binary for another machine."""
+    model = replace(spring(), name="spring")
+    defines = "".join(f"#define {d.replace('=', ' ')}\n" for d in model.defines)
+    code = f'#define FMI 2\n#define NX 2\n#define NZ 0\n{defines}{model.code}\n#include "fmu.c"\n'
+    path = tmp_path / "foreign.fmu"
+    with zipfile.ZipFile(path, "w") as z:
+        z.writestr("modelDescription.xml", description(model, 2))
+        z.writestr("binaries/win64/spring.dll", b"MZ")
+        z.writestr("sources/model.c", code)
+        z.writestr("sources/fmu.c", SOURCE.read_text())
+        z.writestr("resources/table.txt", "1 2 3")
+    return path
+
+
+def test_what_cannot_run_here_is_listed_and_refused(foreign):
+    result = run(foreign)
+    assert result.exit_code == 2 and "parameters, which can be estimated (4)" in result.output
+    assert "`hvdc-ident check foreign.fmu --compile`" in result.output.replace("\n", " ")
+
+
+def test_sources_are_compiled_with_consent_into_a_new_file(foreign):
+    before = foreign.read_bytes()
+    result = run(foreign, "--compile")
+    assert result.exit_code == 0, result.output
+    new = foreign.with_name("foreign-compiled.fmu")
+    assert foreign.read_bytes() == before and sorted(p.name for p in foreign.parent.iterdir()) == [
+        new.name,
+        foreign.name,
+    ]
+    with zipfile.ZipFile(new) as z:
+        assert z.read("resources/table.txt") == b"1 2 3" and "binaries/win64/spring.dll" in z.namelist()
+    time = np.linspace(0.0, 4.0, 41)
+    step = experiment("step", time, {"u": InputSignal.step(1.0, 0.0, 1.0)})
+    assert simulate(load_model(new), step)["y"] == pytest.approx(response(time), abs=1e-4)
+    again = run(foreign, "--compile")
+    assert again.exit_code == 2 and "there already" in again.output
+
+
+def test_what_cannot_be_compiled_is_one_message(foreign, monkeypatch):
+    broken = foreign.with_name("broken.fmu")
+    with zipfile.ZipFile(foreign) as old, zipfile.ZipFile(broken, "w") as z:
+        for name in old.namelist():
+            z.writestr(name, old.read(name) if name != "sources/fmu.c" else b'#include "windows.h"')
+    result = run(broken, "--compile")
+    assert result.exit_code == 1 and "refuses the FMU's sources" in result.output and "windows.h" in result.output
+    monkeypatch.setenv("CC", "/no/compiler")
+    none = run(foreign, "--compile")
+    assert none.exit_code == 2 and "no C compiler is here" in none.output and "install gcc" in none.output
+    assert not list(Path(foreign.parent).glob("*compiled*"))
+
+
+def test_options_about_an_fmu_are_refused_for_a_study(tmp_path):
+    study = tmp_path / "study.toml"
+    study.write_text("schema = 1\n")
+    result = run(study, "--find", "x")
+    assert result.exit_code == 2 and "are about an FMU" in result.output
