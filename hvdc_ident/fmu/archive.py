@@ -96,6 +96,15 @@ def machine_of(library: bytes) -> str:
     return "macOS" if library[:4] in (b"\xcf\xfa\xed\xfe", b"\xca\xfe\xba\xbe", b"\xce\xfa\xed\xfe") else ""
 
 
+def first_bytes(path: Path, name: str, count: int = 64) -> bytes:
+    """Return the first bytes of a file in the archive. Raises ModelError where it is damaged."""
+    try:
+        with _opened(path) as archive, archive.open(name) as file:
+            return file.read(count)
+    except (*DAMAGE, KeyError) as e:
+        raise _damaged(path, name, e) from None
+
+
 def unpack(path: Path, folder: Path) -> None:
     """Nothing; the archive's files are in the folder. It was checked before; a file that is damaged is a ModelError."""
     with _opened(path) as archive:
@@ -110,9 +119,11 @@ def unpack(path: Path, folder: Path) -> None:
                     while block := source.read(1 << 20):
                         sink.write(block)
             except DAMAGE as e:
-                raise ModelError(
-                    f"'{entry.filename[:80]}' in the FMU cannot be unpacked: {_said(e)}", where=str(path)
-                ) from None
+                raise _damaged(path, entry.filename, e) from None
+
+
+def _damaged(path: Path, name: str, error: Exception) -> ModelError:
+    return ModelError(f"'{name[:80]}' in the FMU cannot be unpacked: {_said(error)}", where=str(path))
 
 
 def _said(error: Exception) -> str:

@@ -106,7 +106,7 @@ def _write(path: Path, new: Path, built: dict[str, bytes]) -> None:
             last = {e.filename: e for e in old.infolist()}  # of two entries of one name the last counts
             for entry in last.values():
                 if entry.filename not in built:
-                    archive.writestr(entry, old.read(entry))
+                    archive.writestr(entry, old.read(entry))  # whole: it was unpacked before
             for name, content in built.items():
                 archive.writestr(name, content)
         part.replace(new)

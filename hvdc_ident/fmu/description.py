@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier, machine_of
+from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier, first_bytes, machine_of
 from hvdc_ident.frozen import FrozenMap
 
 Interface = Literal["model-exchange", "co-simulation"]
@@ -248,8 +248,8 @@ def check_binary(path: Path, names: Iterable[str], version: int, identifier: str
     if has_sources(names):
         hint = f"`hvdc-ident check {path.name} --compile` compiles the C sources in it, into a new file; or {hint}"
     if file in have.get(folder, ()):
-        with zipfile.ZipFile(path) as archive, archive.open(expected) as library:
-            made, here = machine_of(library.read(64)), machine_of(Path(sys.executable).read_bytes()[:64])
+        with Path(sys.executable).open("rb") as own:
+            made, here = machine_of(first_bytes(path, expected)), machine_of(own.read(64))
         if not made or made == here:
             return
         what, expected, got = f"the FMU's binary {expected} is for another machine", here, made
