@@ -128,7 +128,7 @@ class Peer:
         rows = self.grid if rows is None else rows
         share = (rows - rows[0]) / (rows[-1] - rows[0])
         steps = [min((2 + k % 5) * STAIR, rows.size // 2) for k in range(len(self.inputs))]
-        jumps = rows[::STAIR][1:]
+        jumps = rows[STAIR:-1:STAIR]  # none at the end, where FMPy sees no more of it
         corners = np.sort(np.concatenate([rows, jumps]))
         place = np.searchsorted(rows, corners)
         after = np.ones(corners.size, dtype=bool)
@@ -140,7 +140,7 @@ class Peer:
                 move = 1.0 - 2.0 * self.start(v) if v.type == "Boolean" else 1.0
                 inputs[v.name] = self.start(v) + move * step
                 continue
-            stair = (place - np.where(after, 0, 1)) // STAIR * STAIR
+            stair = np.minimum(place - np.where(after, 0, 1), rows.size - 2) // STAIR * STAIR
             wave = np.sin(2 * np.pi * (2 + k) * share[stair])
             inputs[v.name] = self.start(v) + self.size(v) * (0.5 * step + 0.25 * wave)
         return Plan(rows, corners, inputs)

@@ -1,7 +1,7 @@
 """FMUs of other tools, against FMPy: runs, second runs, speed, a planted parameter, a hidden lag, delay and gain.
 
     python benchmarks/foreign_fmus.py FOLDER... [--json FILE] [--only NAME] [--parts simulation,...]
-                                      [--jobs 2] [--again] [--report]
+                                      [--jobs 2] [--limit S] [--again] [--report]
 
 Every FMU below the folders, every interface it offers, every part in a process of its own with a time limit: a crash or a
 hang costs one line. FILE gets a JSON line a part; a second run goes on where the first stopped (`--again` repeats what is
@@ -78,7 +78,7 @@ def offered(path: Path) -> list[str]:
     return sorted({tags[t] for t in found & set(tags)}, key=INTERFACES.index) or [INTERFACES[0]]
 
 
-def measured(row: Row, part: str) -> dict[str, Any]:
+def measured(row: Row, part: str, limit: float) -> dict[str, Any]:
     """What one process told, with its end."""
     with tempfile.TemporaryDirectory(prefix="foreign-") as folder:
         told, said = Path(folder) / "told", Path(folder) / "said"
@@ -90,7 +90,7 @@ def measured(row: Row, part: str) -> dict[str, Any]:
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, cwd=folder
             )
             try:
-                code = process.wait(LIMITS[part])
+                code = process.wait(limit)
             except subprocess.TimeoutExpired:
                 code = None
             with contextlib.suppress(ProcessLookupError):
@@ -101,7 +101,7 @@ def measured(row: Row, part: str) -> dict[str, Any]:
             found.update(json.loads(line))
         found["wall"] = time.perf_counter() - begin
         if code is None:
-            found["error"] = f"no end after {LIMITS[part]:g} s"
+            found["error"] = f"no end after {limit:g} s"
         elif code != 0:
             last = said.read_text("utf-8", "replace").strip()[-300:]
             found["error"] = f"the process ended with {code}: {' '.join(last.split())}"
@@ -113,11 +113,15 @@ def child(path: str, interface: str, part: str, told: str) -> None:
     import foreign_cases
     import foreign_studies
 
+    since = time.perf_counter()
+
     def tell(facts: Mapping[str, Any]) -> None:
+        nonlocal since
+        if facts.get("stage") in ("load", "run"):  # FMPy's time is none of ours
+            since = time.perf_counter()
         with open(told, "a", encoding="utf-8") as file:
             file.write(json.dumps(dict(facts), default=float) + "\n")
 
-    begin = time.perf_counter()
     try:
         getattr(foreign_studies if part in ("fit", *DIAGNOSE) else foreign_cases, part)(Path(path), interface, tell)
     except Exception as e:
@@ -125,7 +129,7 @@ def child(path: str, interface: str, part: str, told: str) -> None:
 
         own = isinstance(e, HvdcIdentError)
         text = str(e) if own else f"{type(e).__name__}: {e}"
-        tell({"error": text, "told": own, "after": time.perf_counter() - begin})
+        tell({"error": text, "told": own, "after": time.perf_counter() - since})
         if not own:
             tell({"traceback": traceback.format_exc()[-1500:]})
     sys.stdout.flush()
@@ -224,6 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--interface", choices=INTERFACES, help="this one alone")
     parser.add_argument("--parts", default=",".join(LIMITS))
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time; the speed of two disturbs both")
+    parser.add_argument("--limit", type=float, help="s for one part, instead of its own limit")
     parser.add_argument("--again", action="store_true", help="repeat what is chosen")
     parser.add_argument("--report", action="store_true", help="print what is kept")
     parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
@@ -250,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if part != "simulation" and ran.get("verdict") in ("FMPy fails", "refused"):
                 f = {**ran, "part": part, "not_applicable": ran["verdict"], "verdict": "-", "wall": 0.0}
             else:
-                f = measured(row, part)
+                f = measured(row, part, asked.limit or LIMITS[part])
             line = f"{f['wall']:6.1f} s  {part:10} {SHORT[row.interface]} {row.name}: {shown(f)}"
             with lock:
                 kept[row.name, row.interface, part] = f

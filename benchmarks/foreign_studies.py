@@ -65,7 +65,9 @@ def stairs(peer: Peer, seed: int | None) -> dict[str, Array]:
             length = plan.rows.size // 20
             levels = random.uniform(-0.5, 0.5, plan.rows.size // length + 1)
             levels[0] = 0.0  # the record begins at the start value
-            values[v.name] = peer.start(v) + peer.size(v) * np.repeat(levels, length)[: plan.rows.size]
+            u = peer.start(v) + peer.size(v) * np.repeat(levels, length)[: plan.rows.size]
+            u[-1] = u[-2]
+            values[v.name] = u
         else:
             values[v.name] = np.full(plan.rows.size, peer.start(v))
     return values
