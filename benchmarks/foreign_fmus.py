@@ -143,7 +143,7 @@ def judged(f: Mapping[str, Any]) -> dict[str, Any]:
     """verdict: ok, or what is wrong in a word or two; fmpy: whether FMPy itself ran the FMU."""
     ran = f.get("stage") != "fmpy"
     if "not_applicable" in f:
-        return {"verdict": "-", "fmpy": ran}
+        return {"verdict": "-", "fmpy": True}
     if not ran:
         return {"verdict": "FMPy fails", "fmpy": False}
     if "error" in f:
@@ -242,7 +242,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if asked.json and asked.json.is_file():
         for line in asked.json.read_text().splitlines():
             f = json.loads(line)
-            kept[f["fmu"], f["interface"], f["part"]] = f
+            if f["verdict"] != "-":
+                kept[f["fmu"], f["interface"], f["part"]] = f
     chosen = [r for r in rows(asked.folders, asked.only) if asked.interface in (None, r.interface)]
     lock = Lock()
 
@@ -252,7 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if not asked.again and (row.name, row.interface, part) in kept:
                 continue
             ran = kept.get((row.name, row.interface, "simulation"), {})
-            if part != "simulation" and ran.get("verdict") in ("FMPy fails", "refused"):
+            if part != "simulation" and ran.get("verdict") in ("FMPy fails", "refused", "-"):
                 f = {**ran, "part": part, "not_applicable": ran["verdict"], "verdict": "-", "wall": 0.0}
             else:
                 f = measured(row, part, asked.limit or LIMITS[part])
@@ -260,7 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             with lock:
                 kept[row.name, row.interface, part] = f
                 print(line if f["verdict"] in GOOD else f"{line}: {why(f)}", file=sys.stderr, flush=True)
-                if asked.json:
+                if asked.json and f["verdict"] != "-":  # what hangs on another part is told anew each time
                     with asked.json.open("a") as file:
                         file.write(json.dumps(f) + "\n")
 
