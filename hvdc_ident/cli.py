@@ -9,7 +9,7 @@ import functools
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -47,6 +47,22 @@ Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, max=2**31 - 1, 
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
 Trust = Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")]
+Deadline = Annotated[
+    float | None,
+    typer.Option(
+        "--deadline", metavar="S", help="Of an FMU: seconds one run may take; default 60.", show_default=False
+    ),
+]
+Load = Annotated[
+    float | None,
+    typer.Option(
+        "--load", metavar="S", help="Of an FMU: seconds it may take to begin; default 60.", show_default=False
+    ),
+]
+Memory = Annotated[
+    float | None,
+    typer.Option("--memory", metavar="MIB", help="Of an FMU: MiB it may take; default 2048.", show_default=False),
+]
 Force = Annotated[
     list[str] | None,
     typer.Option("--force", metavar="NAME", help="Fit this candidate whatever the verdict on it; may be repeated."),
@@ -104,6 +120,12 @@ def _pasteable(text: str, study: Path | None, out: Path | None, trust: bool) -> 
 
     options = [*(("--out", str(out)) if out else ()), *(("--trust",) if trust else ())]
     return text if study is None else with_study(text, str(study), *options)
+
+
+def _limits(deadline: float | None, load: float | None, memory: float | None) -> dict[str, float]:
+    """The limits of an FMU that the command line states, by the keys of a study."""
+    stated = {"deadline": deadline, "load": load, "memory": memory}
+    return {name: value for name, value in stated.items() if value is not None}
 
 
 def _say(text: str, *, json: bool, quiet: bool) -> None:
@@ -198,26 +220,32 @@ def check(
     quiet: Quiet = False,
     trust: Trust = False,
     out: Out = None,
+    deadline: Deadline = None,
+    load: Load = None,
+    memory: Memory = None,
 ) -> None:
     """Validate study, model and data, and compare the levels before each event; run no stage.
 
     Of an FMU: list its variables, what it offers, and what a short run finds.
     """
     if study.suffix.lower() == ".fmu":
-        _check_fmu(study, find, every=all_ or bool(find), build=build, json=json, quiet=quiet)
+        limits = _limits(deadline, load, memory)
+        _check_fmu(study, find, limits, every=all_ or bool(find), build=build, json=json, quiet=quiet)
         return
     if find or all_ or build:
         raise InputError("--find, --all and --compile are about an FMU", where=str(study), expected="a path to an .fmu")
     from hvdc_ident.study.study import load_study
     from hvdc_ident.study.summary import summary, summary_text
 
-    found = summary(load_study(study, trust), seed)
+    found = summary(load_study(study, trust, _limits(deadline, load, memory)), seed)
     if json:
         _print_json(found)
     _say(summary_text(found), json=json, quiet=quiet)
 
 
-def _check_fmu(path: Path, find: str, *, every: bool, build: bool, json: bool, quiet: bool) -> None:
+def _check_fmu(
+    path: Path, find: str, limits: Mapping[str, float], *, every: bool, build: bool, json: bool, quiet: bool
+) -> None:
     """Print what an FMU holds and offers; where it cannot run here, that is the error, after the list."""
     from hvdc_ident.fmu.capabilities import read_capabilities, tried
     from hvdc_ident.models import load_model
@@ -228,7 +256,7 @@ def _check_fmu(path: Path, find: str, *, every: bool, build: bool, json: bool, q
         path = compile_fmu(path)
         _say(f"compiled: {path} is written; name it in the study's [model] source", json=json, quiet=quiet)
     found = read_capabilities(path)
-    found = found if found.problem else tried(load_model(path), found)  # type: ignore[arg-type]
+    found = found if found.problem else tried(load_model(path, limits=limits), found)  # type: ignore[arg-type]
     shown = found.matching(find) if find else found
     if json:
         _print_json(shown.to_dict())
@@ -248,6 +276,9 @@ def run_(
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
+    deadline: Deadline = None,
+    load: Load = None,
+    memory: Memory = None,
 ) -> None:
     """Every stage the study asks for, then the report.
 
@@ -256,7 +287,7 @@ def run_(
     from hvdc_ident.study.progress import progress
     from hvdc_ident.study.study import load_study
 
-    loaded = load_study(study, trust)
+    loaded = load_study(study, trust, _limits(deadline, load, memory))
     folder = out or loaded.folder
     with progress(quiet or json) as told:
         announce = _announcer(json=json, quiet=quiet)
@@ -303,7 +334,15 @@ def _tell_run(
 
 
 def _run_one(
-    stage: Stage, study: Path, out: Path | None, options: Options, *, json: bool, quiet: bool, trust: bool
+    stage: Stage,
+    study: Path,
+    out: Path | None,
+    options: Options,
+    limits: Mapping[str, float],
+    *,
+    json: bool,
+    quiet: bool,
+    trust: bool,
 ) -> None:
     """Runs one stage of a study, and those it builds on, and tells how it went."""
     from dataclasses import replace
@@ -312,7 +351,7 @@ def _run_one(
     from hvdc_ident.study.progress import progress
     from hvdc_ident.study.study import load_study
 
-    loaded = load_study(study, trust)
+    loaded = load_study(study, trust, limits)
     folder = out or loaded.folder
     announce = _announcer(json=json, quiet=quiet)
     with progress(quiet or json) as told:
@@ -340,8 +379,13 @@ def _add_stage(stage: Stage) -> None:
         json: Json = False,
         quiet: Quiet = False,
         trust: Trust = False,
+        deadline: Deadline = None,
+        load: Load = None,
+        memory: Memory = None,
     ) -> None:
-        _run_one(stage, study, out, Options(workers, seed, executor=executor), json=json, quiet=quiet, trust=trust)
+        options = Options(workers, seed, executor=executor)
+        limits = _limits(deadline, load, memory)
+        _run_one(stage, study, out, options, limits, json=json, quiet=quiet, trust=trust)
 
     def forcing(
         study: StudyFile,
@@ -353,9 +397,13 @@ def _add_stage(stage: Stage) -> None:
         json: Json = False,
         quiet: Quiet = False,
         trust: Trust = False,
+        deadline: Deadline = None,
+        load: Load = None,
+        memory: Memory = None,
     ) -> None:
         options = Options(workers, seed, force=tuple(dict.fromkeys(force or ())), executor=executor)
-        _run_one(stage, study, out, options, json=json, quiet=quiet, trust=trust)
+        limits = _limits(deadline, load, memory)
+        _run_one(stage, study, out, options, limits, json=json, quiet=quiet, trust=trust)
 
     made = forcing if "force" in stage.takes else command
     made.__doc__ = stage.summary
@@ -377,13 +425,16 @@ def letter(
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
+    deadline: Deadline = None,
+    load: Load = None,
+    memory: Memory = None,
 ) -> None:
     """One page for the owner of the model: what it misses, why, and what is attached."""
     from hvdc_ident.study.letter import letter as write
     from hvdc_ident.study.progress import progress
     from hvdc_ident.study.study import load_study
 
-    loaded = load_study(study, trust)
+    loaded = load_study(study, trust, _limits(deadline, load, memory))
     folder = out or loaded.folder
     with progress(quiet or json) as told:
         announce = _announcer(json=json, quiet=quiet)
@@ -404,6 +455,9 @@ def report(
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
+    deadline: Deadline = None,
+    load: Load = None,
+    memory: Memory = None,
 ) -> None:
     """Build the page again from the results in DIR."""
     from hvdc_ident.report.page import write_report
@@ -420,7 +474,7 @@ def report(
     else:
         from hvdc_ident.study.study import load_study
 
-        folder = out or load_study(source, trust).folder
+        folder = out or load_study(source, trust, _limits(deadline, load, memory)).folder
     page = write_report(folder)
     if pdf:
         from hvdc_ident.report.pdf import write_pdf
@@ -473,13 +527,22 @@ def export(
     json: Json = False,
     quiet: Quiet = False,
     trust: Trust = False,
+    deadline: Deadline = None,
+    load: Load = None,
+    memory: Memory = None,
 ) -> None:
     """Write the model or its linear model in the format of FILE's ending."""
     from hvdc_ident.study.export import fmu_options, write
     from hvdc_ident.study.study import load_study
 
     written = write(
-        load_study(study, trust), to, linear, fmu_options(fmi, kind, source_only), values, out, reduced=reduced
+        load_study(study, trust, _limits(deadline, load, memory)),
+        to,
+        linear,
+        fmu_options(fmi, kind, source_only),
+        values,
+        out,
+        reduced=reduced,
     )
     size = written.path.stat().st_size
     if json:

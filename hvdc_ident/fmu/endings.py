@@ -67,12 +67,13 @@ class Budget:
         """How to give more."""
         assert self.most is not None
         more = math.ceil(2 * self.most / MIB)
-        return f"a larger limit, if it needs that much: {key('memory', more)}, in MiB"
+        return f"a larger limit in MiB, if it needs that much: {key('memory', more)}"
 
 
 def key(name: str, value: float) -> str:
     """How a limit is given: in the study, on the command line and in Python."""
-    return f"`{name} = {value:g}` in the study's [model], --{name} {value:g}"
+    text = f"{value:.10g}"
+    return f'`{name} = {text}` in the study\'s [model], --{name} {text}, or limits={{"{name}": {text}}} in Python'
 
 
 def where(traces: str) -> str:

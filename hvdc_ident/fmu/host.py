@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
@@ -25,9 +25,9 @@ from threading import Lock
 from typing import IO, Any
 
 import hvdc_ident
-from hvdc_ident.errors import InputError, SimulationError
+from hvdc_ident.errors import InputError, SimulationError, unknown_name
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.endings import Budget, Ending, crash, overdue
+from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
 from hvdc_ident.fmu.folder import Folder, joined
 from hvdc_ident.fmu.folder import unpacked as new_folder
 from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_file, progress_in, unpacked
@@ -36,6 +36,7 @@ from hvdc_ident.trajectory import Array
 Answer = tuple[dict[str, Any], dict[str, Array]]
 PATIENCE = 5.0  # s for the supervisor to tell how a worker ended, of which it needs a few milliseconds
 LOOKS = 20  # looks at the progress within a deadline: what has not moved over the last two of them stands still
+STALL = 0.5  # s that a run at least stands still for: a busy computer lets a process wait for less
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,20 @@ class Limits:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InputError("a limit is not above 0", where=f"limits of an FMU, {name}", got=f"{value:g}")
+
+    @classmethod
+    def of(cls, stated: Limits | Mapping[str, float] | None) -> Limits:
+        """The limits that are stated by the keys of a study: deadline and load in s, memory in MiB."""
+        if isinstance(stated, Limits):
+            return stated
+        found: dict[str, Any] = dict(stated or {})
+        known = [f.name for f in fields(cls)]
+        for name in found:
+            if name not in known:
+                raise unknown_name("limit", name, known, where="limits of an FMU")
+        if "memory" in found:
+            found["memory"] = round(found["memory"] * MIB)
+        return replace(cls(), **found)
 
 
 @dataclass(eq=False)
@@ -403,7 +418,7 @@ class _Watch:
     def still(self) -> float | None:
         """For how long the run has stood still, s; None where it moves, or was not watched for long enough."""
         stood = time.monotonic() - self.moved
-        return stood if stood > 2 * self.deadline / LOOKS else None
+        return stood if stood > max(2 * self.deadline / LOOKS, STALL) else None
 
     def _look(self) -> None:
         at = (self.progress[BEGAN], self.progress[NOW])

@@ -212,10 +212,16 @@ class FmuModel:
         return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
 
 
-def read_fmu(source: str | Path, *, interface: Interface | None = None, limits: Limits | None = None) -> FmuModel:
+def read_fmu(
+    source: str | Path,
+    *,
+    interface: Interface | None = None,
+    limits: Limits | Mapping[str, float] | None = None,
+) -> FmuModel:
     """The model of an FMU, 2.0 or 3.0. Load only FMUs you trust.
 
-    interface: model exchange where the FMU offers both and none is asked for. limits: of time, memory and runs.
+    interface: model exchange where the FMU offers both and none is asked for. limits: `Limits`, or by the keys
+    of a study, {"deadline": 300.0, "load": 60.0, "memory": 4096}: s for one run, s to begin, and MiB.
     The archive is checked before anything is unpacked; nothing of it is run before it is needed. Raises ModelError
     where it cannot be used, SimulationError where it has to be run (a parameter without start) and fails.
     """
@@ -223,7 +229,7 @@ def read_fmu(source: str | Path, *, interface: Interface | None = None, limits: 
     if not path.is_file():
         raise ModelError("the model file is not there", where=str(path))
     found = read_description(path.resolve(), interface)
-    host = Host(found, limits or Limits())
+    host = Host(found, Limits.of(limits))
     starts = {n: v.start for n, v in found.parameters.items()}
     if None in starts.values():
         read = host.ask({"do": "starts"}, {})[1]["parameters"].tolist()

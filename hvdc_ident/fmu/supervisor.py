@@ -103,8 +103,13 @@ class Supervisor:
             pass  # the host is gone
         for child in self.children.values():
             _kill(child)
-        if os.getppid() != self.parent:
-            self.folder.release()
+        for child in self.children.values():
+            os.waitpid(child.pid, 0)
+        while (
+            os.getppid() == self.parent
+        ):  # its connection ends before it; if it only closed that, it ends this process
+            wait(self.parents_end, None if self.parents_end else PATIENCE)
+        self.folder.release()
 
     def _serve(self, heading: Mapping[str, Any], _: Mapping[str, Any]) -> None:
         if "start" in heading:

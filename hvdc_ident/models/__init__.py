@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
+
+if TYPE_CHECKING:
+    from hvdc_ident.fmu.host import Limits
 
 __all__ = ["is_shipped", "load_model", "shipped_models", "summaries"]
 
@@ -70,11 +73,13 @@ def load_model(
     *,
     trust: bool = False,
     interface: Literal["model-exchange", "co-simulation"] | None = None,
+    limits: Limits | Mapping[str, float] | None = None,
 ) -> AnyModel:
     """A shipped model by name, or the model of a file: a model card (.toml), an FMU (.fmu), or Python (.py, needs trust).
 
     Python runs its code here; an FMU runs its own in a process of its own, which contains crashes, not malice: load
-    only FMUs you trust. interface: of an FMU that offers both (default: model exchange).
+    only FMUs you trust. interface: of an FMU that offers both (default: model exchange). limits: of an FMU's process, as
+    {"deadline": 300.0, "load": 60.0, "memory": 4096}: s for one run, s to begin, and MiB.
 
     Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
 
@@ -87,9 +92,13 @@ def load_model(
     """
     text = str(source)
     if is_shipped(text):
+        if limits is not None:
+            raise _unlimited(text)
         return _shipped(text)
     path = Path(text)
     suffix = path.suffix.lower()
+    if limits is not None and suffix != ".fmu":
+        raise _unlimited(text)
     if suffix == ".toml":
         from hvdc_ident.model.card import read_card
 
@@ -97,7 +106,7 @@ def load_model(
     if suffix == ".fmu":
         from hvdc_ident.fmu.model import read_fmu
 
-        return read_fmu(path, interface=interface)
+        return read_fmu(path, interface=interface, limits=limits)
     if suffix == ".py":
         return _from_python(path, trust)
     if suffix or path.exists():
@@ -107,6 +116,14 @@ def load_model(
             expected="a model card (.toml), an FMU (.fmu) or a Python file (.py)",
         )
     raise unknown_name("shipped model", text, shipped_models())
+
+
+def _unlimited(source: str) -> ModelError:
+    return ModelError(
+        "deadline, load and memory are limits of an FMU's process, and this model has none",
+        where=source,
+        expected="a path that ends in .fmu",
+    )
 
 
 def _from_python(path: Path, trust: bool) -> Model:

@@ -93,11 +93,17 @@ class Effect(Table):
 
 
 class Model(Table):
-    """[model]: where the model comes from and what differs from it."""
+    """[model]: where the model comes from and what differs from it.
+
+    Of an FMU: deadline: s that one run may take; load: s that it may take to begin; memory: MiB that it may take.
+    """
 
     source: Name
     parameterisation: Name | None = None
     interface: Literal["model-exchange", "co-simulation"] | None = None
+    deadline: Positive | None = None
+    load: Positive | None = None
+    memory: Positive | None = None
     values: dict[Name, FiniteFloat] = {}
     effect: list[Effect] = []
 

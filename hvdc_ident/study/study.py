@@ -72,14 +72,19 @@ class Study:
         return {n: line for n, line in self.settings.parameters.items() if line.tie is None}
 
 
-def load_study(path: str | Path, trust: bool = False) -> Study:
+def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float] | None = None) -> Study:
     """The study of a file. trust: whether a model that is Python code may be run.
+
+    limits: of an FMU, by their keys in [model], where they differ from what stands there: deadline and load in s, memory
+    in MiB.
 
     Raises InputError: StudyError, ModelError, UnknownNameError or WaveformError, with the place in the file.
     """
     file = Path(path)
     content = _read(file)
     settings = parse_study(content, file)
+    if limits:
+        settings = settings.model_copy(update={"model": settings.model.model_copy(update=dict(limits))})
     where = file.name
     model, model_sources = _model(settings, file, trust)
     other, other_sources = _compared_with(settings, file, trust)
@@ -136,7 +141,7 @@ def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyMode
     source, sources = _source(table.source, file, "model.source")
     place = "model.source"
     try:
-        model = load_model(source, trust=trust, interface=table.interface)
+        model = load_model(source, trust=trust, interface=table.interface, limits=_limits(table))
         if table.parameterisation is not None:
             place = "model.parameterisation"
             model = model.parameterised(table.parameterisation)
@@ -151,6 +156,12 @@ def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyMode
     except InputError as e:
         raise e.at(f"{file.name}, {place}") from None
     return model, sources
+
+
+def _limits(table: schema.Model) -> dict[str, float] | None:
+    """The limits of an FMU that are stated, by their keys."""
+    stated = {n: v for n in ("deadline", "load", "memory") if (v := getattr(table, n)) is not None}
+    return stated or None
 
 
 def _recorded(settings: schema.StudyFile) -> Iterable[tuple[str, Iterable[str]]]:
@@ -203,7 +214,7 @@ def _other_model(
     """A model that a study names beside its own, and its file's hash."""
     source, sources = _source(name, file, place)
     try:
-        model = load_model(source, trust=trust)
+        model = load_model(source, trust=trust, limits=_limits(settings.model) if name.endswith(".fmu") else None)
     except InputError as e:
         raise e.at(f"{file.name}, {place}") from None
     if not isinstance(model, Model):  # it is compared where it has the same variables
