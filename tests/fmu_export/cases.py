@@ -73,3 +73,30 @@ def remembering() -> Model:
             {"effect": "delay", "at": "outputs.Vdc1", "parameters": {"T": 0.0031}},
         ]
     )
+
+
+PUNCTUAL = """
+schema = 1
+name = "punctual"
+[parameters]
+level = {value = 0.5}
+Ts = {value = 0.03125, unit = "s"}
+[inputs]
+u = {value = 0.25}
+[states]
+x = {derivative = "20*(late - x)"}
+[delays]
+late = {of = "clip(u, -level, level)", time = "0.015625"}
+[sampled]
+held = {value = "x + u", period = "Ts", compute = "Ts/4"}
+[outputs]
+x = "x"
+late = "late"
+held = "held"
+through = "clip(u, -level, level) + held"
+"""
+
+
+def punctual() -> Model:
+    """A model whose delayed jumps and samples fall on multiples of 1/256 s, which have no rounding."""
+    return parse_card(PUNCTUAL)

@@ -19,7 +19,7 @@ from tests.fmu_export import cases
 
 ALL = {
     **{n: (lambda n=n: load_model(n)) for n in shipped_models()},
-    **{n: getattr(cases, n) for n in ("zoo", "augmented", "remembering")},
+    **{n: getattr(cases, n) for n in ("zoo", "augmented", "remembering", "punctual")},
 }
 
 
@@ -27,8 +27,9 @@ ALL = {
 def test_the_validator_finds_nothing(tmp_path: Path, name: str) -> None:
     program = Program(ALL[name]())  # the same for both versions
     for version in ("2.0", "3.0"):
-        path = export_fmu(program, tmp_path / "x.fmu", version=version, binary=False).path
-        assert validate_fmu(str(path)) == [], version
+        for kinds in (("model-exchange", "co-simulation"), ("model-exchange",), ("co-simulation",)):
+            path = export_fmu(program, tmp_path / "x.fmu", version=version, kinds=kinds, binary=False).path
+            assert validate_fmu(str(path)) == [], (version, kinds)
 
 
 @pytest.mark.parametrize("version", ["2.0", "3.0"])

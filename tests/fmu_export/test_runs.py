@@ -7,6 +7,7 @@ import pytest
 from fmpy import simulate_fmu
 
 from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fmu.model import read_fmu
 from hvdc_ident.simulate import simulate
 from tests.fmu_export.driver import cosimulate
 
@@ -50,6 +51,23 @@ def test_co_simulation_of_steps(fmu, name, version):
     outputs = list(f.model.outputs)
     found = cosimulate(f, TIME, STEPS[name], fmi_names(outputs), tolerance=1e-10)
     assert worst(found, engine_run(f.model, STEPS[name], outputs)) < 1e-6
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_row_at_a_jump_has_what_follows_it(fmu, version):
+    """A jump of an input, one that comes out of a delay, samples taken and published: as the engine has those rows."""
+    f = fmu("punctual", version)
+    outputs, rows = list(f.model.outputs), np.arange(65) / 256
+    inputs = {"u": InputSignal.corners([(16 / 256, 0.25), (16 / 256, 2.0), (40 / 256, 2.0), (40 / 256, -1.0)])}
+    run = simulate(f.model, experiment("rows", rows, inputs), outputs=outputs, rtol=1e-11)
+    expected = np.column_stack([run[o] for o in outputs])
+    jumps = np.abs(np.diff(expected, axis=0)) > 1e-3
+    assert jumps[:, 1].sum() == 2 and jumps[:, 2].sum() > 3 and jumps[:, 3].sum() > 5
+    assert worst(cosimulate(f, rows, inputs, outputs, tolerance=1e-10), expected) < 1e-8
+    loaded = read_fmu(f.path, interface="co-simulation")
+    found = loaded.simulate(experiment("rows", rows, inputs))
+    loaded.host.close()
+    assert worst(np.column_stack([found[o] for o in outputs]), expected) < 1e-6
 
 
 @pytest.mark.parametrize("name", sorted(RAMPS))

@@ -111,7 +111,7 @@ int get_indicators(Instance *i, double *values) {
     return 1;
 }
 
-int get_values(Instance *i, const unsigned int *refs, size_t n, double *values) {
+static int read_values(Instance *i, const unsigned int *refs, size_t n, double *values) {
     State *s = &i->s;
     Args a;
     double rate[SOME(NX)], output[SOME(NO)], indicator[SOME(NS)];
@@ -153,6 +153,30 @@ int get_values(Instance *i, const unsigned int *refs, size_t n, double *values) 
         }
     }
     return 1;
+}
+
+/* Whether a delayed jump arrives, or a sample is taken or published, at this communication point. */
+static int something_due(const Instance *i) {
+    const State *s = &i->s;
+    double now = s->t + 1e-13 * fmax(1.0, fabs(s->t)); /* rounding alone may keep a point off it */
+    for (size_t k = 0; k < s->echoes; k++)
+        if (i->echo[2 * k] <= now) return 1;
+    for (int k = 0; k < NQ; k++)
+        if (s->tick[k] <= now || s->publish[k] <= now) return 1;
+    return 0;
+}
+
+/* Outputs at a communication point are those after what happens there. It is done for the reader alone and undone: the next
+   step does it, for inputs may still be set before. Tables only grow in an event, so the state holds all there is to undo. */
+int get_values(Instance *i, const unsigned int *refs, size_t n, double *values) {
+    if (i->s.phase != STEP || !something_due(i)) return read_values(i, refs, n, values);
+    State *kept = malloc(sizeof *kept);
+    if (!kept) return explain(i, NO_MEMORY);
+    *kept = i->s;
+    int good = explain(i, event_update(i, 0.0)) && read_values(i, refs, n, values);
+    i->s = *kept;
+    free(kept);
+    return good;
 }
 
 static int set_input(Instance *i, int k, double value) {
