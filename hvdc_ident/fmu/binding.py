@@ -176,11 +176,15 @@ class Binding:
 
     # --- initialisation ---
 
-    def enter_initialization(self, start: float, stop: float | None, tolerance: float | None) -> None:
+    def set_up(self, start: float, stop: float | None, tolerance: float | None) -> None:
+        """Tell the experiment, FMI 2.0; before values are set, for some FMUs put their own values back here."""
         self.progress[START] = self.progress[NOW] = start
         self.progress[STOP] = nan if stop is None else stop
         if self.version == 2:
             self.fmu.setupExperiment(tolerance=tolerance, startTime=start, stopTime=stop)
+
+    def enter_initialization(self, start: float, stop: float | None, tolerance: float | None) -> None:
+        if self.version == 2:
             self.fmu.enterInitializationMode()
         else:
             self.fmu.enterInitializationMode(tolerance=tolerance, startTime=start, stopTime=stop)

@@ -74,6 +74,7 @@ class Description:
     completed_step: whether it wants to hear of finished integrator steps. directional: whether it offers directional
     derivatives. variable_step: whether communication steps may differ. interpolates: whether it takes the slope of
     inputs. step: communication step it suggests, s, or None.
+    once_per_process: whether a process may make one instance only.
     """
 
     path: Path
@@ -93,6 +94,7 @@ class Description:
     variable_step: bool = True
     interpolates: bool = False
     step: float | None = None
+    once_per_process: bool = False
     text: str = ""
     tool: str = ""
     needs_tool: bool = False
@@ -153,6 +155,7 @@ def read_description(path: Path, interface: Interface | None = None, *, binary: 
         interpolates=bool(getattr(chosen, "canInterpolateInputs", False)) and given.fmiMajorVersion == 2,
         step=_number(getattr(chosen, "fixedInternalStepSize", None))
         or _number(experiment.stepSize if experiment else None),
+        once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
         text=given.description or "",
         tool=given.generationTool or "",
         needs_tool=bool(getattr(chosen, "needsExecutionTool", False)),

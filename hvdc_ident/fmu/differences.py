@@ -1,7 +1,9 @@
-"""Derivatives of whole runs by central differences, with steps chosen against the noise of the runs.
+"""Derivatives of whole runs by differences, as many runs as the accuracy asks for and no more.
 
-The noise of a run (its integrator's, mostly) is what fourth differences over a tiny step leave, the truncation what two
-steps disagree by; the step makes their sum least. J. J. More and S. M. Wild, ACM TOMS 38 (2012) 19.
+A run has noise (its integrator's, mostly): third differences over tiny steps of all parameters at once leave it alone.
+A pair of runs around a parameter then gives its derivative, and the bend from which the best step of a one-sided
+difference follows: from the second time on, a derivative costs one run. Where one side cannot be accurate, the step of a
+central difference is chosen against the noise. J. J. More and S. M. Wild, ACM TOMS 38 (2012) 19.
 """
 
 from __future__ import annotations
@@ -13,9 +15,12 @@ import numpy as np
 
 from hvdc_ident.trajectory import Array
 
-TINY = 1e-6  # step of the fourth difference, in sizes of the parameter
-TRIED = (1e-2, 1e-3)  # steps that tell the truncation
-LEAST, MOST = 1e-6, 5e-2  # steps that are chosen from
+TINY = 1e-6  # step of the differences that show the noise, in sizes of the parameter: a bend leaves 1e-18 of them
+FARTHER = 4.0  # the second pair's step, in those of the first
+LEAST, MOST = 1e-6, 5e-2  # steps that are chosen from, in sizes of the parameter
+ENOUGH = 1e-3
+"""Relative error of a derivative that one-sided differences may leave. It turns a Gauss-Newton step by as much and
+changes a standard error by as much, a tenth of what the second figure of an interval shows."""
 
 Runs = Callable[[float], Array]
 """A run at a value of the parameter: (n, outputs)."""
@@ -23,60 +28,91 @@ Runs = Callable[[float], Array]
 
 @dataclass(frozen=True)
 class Step:
-    """A step in the parameter's unit, and the relative error it leaves in the derivative."""
+    """How a derivative is had. h: step in the parameter's unit. error: relative, that it leaves. sides: 1 or 2."""
 
     h: float
     error: float
+    sides: int = 2
 
 
-def choose(runs: Runs, at: float, size: float, low: float, high: float) -> Step:
-    """The step for a parameter that stands at `at`, within [low, high]; eight or so runs.
+def noise_of(runs: Runs, middle: Array) -> Array:
+    """Return the noise of each output, (outputs,) rms over rows, from three runs.
 
-    size: a typical size of the parameter. The error is that of the whole derivative, output by output in their ranges.
+    runs: runs at a number of tiny steps, all parameters moved at once: one that changes nothing shows no noise.
+    """
+    third = runs(3.0) - 3.0 * runs(2.0) + 3.0 * runs(1.0) - middle
+    rounding = np.finfo(float).eps * np.abs(middle).max(axis=0, initial=0.0)
+    found = np.sqrt(np.mean(third**2, axis=0)) / np.sqrt(20.0)  # 1 + 9 + 9 + 1 variances of one run
+    return np.asarray(np.maximum(found, rounding))
+
+
+def first(
+    runs: Runs, at: float, size: float, low: float, high: float, middle: Array, noise: Array
+) -> tuple[Array, Step]:
+    """Return the derivative (n, outputs) at `at` within [low, high], from two runs or four, and the step for later.
+
+    size: a typical size of the parameter. middle: the run at `at`. noise: (outputs,). Errors are those of the output
+    that is worst off, rms over rows and in its range.
     """
     room = max(at - low, high - at)
     size = min(size, 10.0 * room) if np.isfinite(room) and room > 0 else size
-    middle = runs(at)
     scale = _scale(middle)
-    tiny = TINY * size
-    noise = _norm(_fourth(runs, at, tiny, low, high, middle), scale) / np.sqrt(70.0)
-    noise = max(noise, 4.0 * np.finfo(float).eps * float(np.abs(middle / scale).max(initial=0.0)))
-    first, second = (slope(runs, at, t * size, low, high, middle) for t in TRIED)
-    bend = _norm(first - second, scale) / ((TRIED[0] ** 2 - TRIED[1] ** 2) * size**2)
-    best = MOST * size if bend <= 0.0 else float(np.cbrt(noise / (2.0 * bend)))
-    h = float(np.clip(best, LEAST * size, MOST * size))
-    strength = _norm(second, scale)
-    error = (bend * h * h + noise / h) / strength if strength > 0.0 else 0.0
-    return Step(h, float(error))
+    level = float((noise / scale).max(initial=0.0))
+    # The best step of a pair where the third derivative is of the order that the parameter's size makes it.
+    close = _clipped(float(np.cbrt(3.0 * level)) * size, size)
+    near, bend = pair(runs, at, close, low, high, middle)
+    strength, curve = _norm(near, scale), _norm(bend, scale)
+    if strength == 0.0:
+        return near, Step(close, 0.0, 1)
+    h = _clipped(2.0 * float(np.sqrt(level / curve)) if curve > 0.0 else MOST * size, size)
+    error = (0.5 * curve * h + 2.0 * level / h) / strength
+    own = level / (close * strength) + (close / size) ** 2 / 6.0
+    if max(error, own) <= ENOUGH:
+        return near, Step(h, float(max(error, own)), 1)
+    far, _ = pair(runs, at, FARTHER * close, low, high, middle)
+    twist = _norm(near - far, scale) / ((FARTHER**2 - 1.0) * close**2)
+    h = _clipped(float(np.cbrt(level / (2.0 * twist))) if twist > 0.0 else MOST * size, size)
+    step = Step(h, float((twist * h * h + level / h) / strength))
+    apart = [abs(float(np.log(h / c))) for c in (close, FARTHER * close)]
+    if min(apart) < np.log(2.0):  # within a factor of two of the best step the error is within twice the least
+        return (near if apart[0] < apart[1] else far), step
+    return derivative(runs, at, step, low, high, middle), step
 
 
-def slope(runs: Runs, at: float, h: float, low: float, high: float, middle: Array | None = None) -> Array:
-    """(n, outputs) the derivative at `at`: central, or of second order to one side where a bound is near."""
+def derivative(runs: Runs, at: float, step: Step, low: float, high: float, middle: Array) -> Array:
+    """Return the derivative (n, outputs) at `at`, to the order of the step: from one run, or from two."""
+    h = step.h
+    if step.sides == 1:
+        side = h if at + h <= high else -h
+        return np.asarray((runs(at + side) - middle) / side)
+    return pair(runs, at, h, low, high, middle)[0]
+
+
+def pair(runs: Runs, at: float, h: float, low: float, high: float, middle: Array) -> tuple[Array, Array]:
+    """Return first and second derivative from two more runs: on both sides, or on one where a bound is near."""
     if at - h >= low and at + h <= high:
-        return np.asarray((runs(at + h) - runs(at - h)) / (2.0 * h))
+        up, down = runs(at + h), runs(at - h)
+        return np.asarray((up - down) / (2.0 * h)), np.asarray((up - 2.0 * middle + down) / h**2)
     side = h if at + 2.0 * h <= high else -h
-    here = runs(at) if middle is None else middle
-    return np.asarray((-3.0 * here + 4.0 * runs(at + side) - runs(at + 2.0 * side)) / (2.0 * side))
+    one, two = runs(at + side), runs(at + 2.0 * side)
+    return np.asarray((-3.0 * middle + 4.0 * one - two) / (2.0 * side)), np.asarray(
+        (middle - 2.0 * one + two) / side**2
+    )
 
 
-def _fourth(runs: Runs, at: float, h: float, low: float, high: float, middle: Array) -> Array:
-    """Fourth differences around `at`, or beside it at a bound."""
-    if at - 2 * h >= low and at + 2 * h <= high:
-        return np.asarray(runs(at - 2 * h) - 4 * runs(at - h) + 6 * middle - 4 * runs(at + h) + runs(at + 2 * h))
-    side = h if at + 4 * h <= high else -h
-    a, b, c, d = (runs(at + k * side) for k in range(1, 5))
-    return np.asarray(middle - 4 * a + 6 * b - 4 * c + d)
+def _clipped(h: float, size: float) -> float:
+    return float(np.clip(h, LEAST * size, MOST * size))
 
 
 def _scale(runs: Array) -> Array:
-    """(outputs,) the range of each output, or its size where it stands still, or 1."""
+    """Return the range of each output, (outputs,), or its size where it stands still, or 1."""
     spread = np.ptp(runs, axis=0)
     size = np.abs(runs).max(axis=0, initial=0.0)
     return np.where(spread > 1e-9 * size, spread, np.where(size > 0.0, size, 1.0))
 
 
 def _norm(change: Array, scale: Array) -> float:
-    """The root mean square over rows of the output that changes most, in its range."""
+    """Return the root mean square over rows of the output that changes most, in its range."""
     if not change.size:
         return 0.0
     return float(np.sqrt(np.mean((change / scale) ** 2, axis=0)).max())

@@ -44,6 +44,8 @@ class Counts:
 class Run:
     """One run. names: what is read. tangent: the derivatives for sensitivities, or None. start: (nx, np) dx0/dp.
 
+    most: steps after which the run is given up.
+
     outputs (n, names) and gradients (n, names, np) are filled row by row.
     """
 
@@ -55,6 +57,7 @@ class Run:
     tangent: Tangent | None = None
     start: Array | None = None
     counts: Counts = field(default_factory=Counts)
+    most: int = MOST_STEPS
 
     def __post_init__(self) -> None:
         self.b = self.plant.binding
@@ -73,6 +76,7 @@ class Run:
         self.end = float(self.time[-1])
         self.segment_end = self.end
         self.close: list[float] = []
+        self.before = self.counts.accepted
 
     def go(self, values: Mapping[str, float]) -> None:
         """Nothing; every row is filled. Raises RunFailed, Failure or SensitivitiesLost."""
@@ -163,8 +167,8 @@ class Run:
             raise RunFailed(
                 f"the integrator gave up: {' '.join(text.split())[:200]}", float(solver.t), "check parameter values"
             )
-        if self.counts.accepted > MOST_STEPS:
-            raise RunFailed(f"more than {MOST_STEPS} steps", float(solver.t), "look for a very fast part of the model")
+        if self.counts.accepted - self.before > self.most:
+            raise RunFailed(f"more than {self.most} steps", float(solver.t), "look for a very fast part of the model")
 
     def _place(self, t: float, x: Array, *, before_jump: bool = False) -> None:
         """Nothing; the FMU stands at an instant and a state, its continuous inputs with it."""

@@ -190,10 +190,16 @@ class _Processes:
 
 @dataclass(eq=False)
 class Host:
-    """The workers of one FMU. It travels to other processes without them and starts its own there."""
+    """The workers of one FMU. It travels to other processes without them and starts its own there.
+
+    learned: what was found out about the FMU in its first runs, kept for later workers: "restart", how it is brought
+    back to its start (see `hvdc_ident.fmu.restart`); "derivatives", by parameter whether a run confirmed its own.
+    started: processes so far. runs: whole runs of the FMU so far, those that derivatives took among them.
+    """
 
     description: Description
     limits: Limits = field(default_factory=Limits)
+    learned: dict[str, Any] = field(default_factory=dict)
     unpacked: Path | None = None  # the folder of the process it comes from, used again where it is still there
 
     def __post_init__(self) -> None:
@@ -203,10 +209,11 @@ class Host:
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
+        self.runs = 0
 
     def __getstate__(self) -> dict[str, Any]:
         at = self._processes.folder.path if self._processes is not None else self.unpacked
-        return {"description": self.description, "limits": self.limits, "unpacked": at}
+        return {"description": self.description, "limits": self.limits, "learned": self.learned, "unpacked": at}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -231,6 +238,8 @@ class Host:
             if answer.get("again"):
                 raise self._error("the FMU's worker wants a new process, and had one")
             self.memory = worker.resident
+            self.learned |= answer.get("learned", {})
+            self.runs += int(answer.get("whole runs", 0))
             return answer, out
 
     def close(self) -> None:
@@ -354,7 +363,7 @@ class Host:
         self.started += 1
         worker: _Worker | None = None
         try:
-            worker = supervisor.start({})
+            worker = supervisor.start({"learned": self.learned})
             self._mine().workers[number] = worker
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:

@@ -1,18 +1,21 @@
-"""What a worker does when asked: whole runs with their derivatives, and points. Runs in the worker alone."""
+"""Whole runs with their derivatives, and points, as a worker makes them when asked. Runs in the worker alone."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from hvdc_ident.fmu import co_simulation, exchange
-from hvdc_ident.fmu.binding import Failure
-from hvdc_ident.fmu.differences import Step, choose, slope
-from hvdc_ident.fmu.plant import Plant, RunFailed
+from hvdc_ident.fmu.binding import Block, Failure
+from hvdc_ident.fmu.description import Description
+from hvdc_ident.fmu.differences import ENOUGH, TINY, Step, derivative, first, noise_of, pair
+from hvdc_ident.fmu.isolation import result
+from hvdc_ident.fmu.plant import Plant, RunFailed, failure
+from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moves
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.fmu.tangent import Point, Tangent
 from hvdc_ident.trajectory import Array
@@ -21,28 +24,74 @@ KEPT_STEPS = 1000
 Answer = tuple[dict[str, Any], dict[str, Array]]
 LOST = 0.5  # relative error from which a derivative is not told from noise
 START_STEP = 1e-3  # of differences of the start by a parameter, in its sizes
+STIRRED = 0.1  # step of an input that shows whether a run is repeated, in sizes of the input
+NEAR = 1e-3  # step of the differences that confirm derivatives, in sizes of the parameter
+TOLD = 0.1  # relative doubt of a difference of runs above which it confirms nothing
+EXCESS = 20  # times the steps of a plain run that one with sensitivities may take before it is given up
+REPEATED = {
+    "reset": "",
+    "instance": "a reset does not bring the FMU back to its start: each run has a new instance",
+    "process": "neither a reset nor a new instance brings the FMU back to its start: each run has a new process",
+}
 
 
 @dataclass
 class Jobs:
-    """A plant with what was learned of it. tell: called between runs of one job, so that nobody waits in vain."""
+    """An FMU with what was learned of it.
 
-    plant: Plant
+    make: loads it into this process. tell: called between runs of one job, so that nobody waits in vain. learned: kept
+    by the host over workers, see `hvdc_ident.fmu.host`.
+    """
+
+    description: Description
+    make: Make
     tell: Callable[[], None]
+    learned: dict[str, Any] = field(default_factory=dict)
     steps: dict[bytes, Step] = field(default_factory=dict)
-    trusted: dict[str, bool] = field(default_factory=dict)
+    noise: dict[bytes, Array] = field(default_factory=dict)
+    last: tuple[bytes, Array] | None = None
+    made: Plant | None = None
     runs: int = 0
 
+    @property
+    def plant(self) -> Plant:
+        """The FMU in this process; it is loaded where it was not."""
+        if self.made is None:
+            self.made = self.make(self.learned)
+        return self.made
+
+    @property
+    def isolated(self) -> bool:
+        """Whether the FMU is kept out of this process: each of its runs has one, or how it restarts is not known yet."""
+        return self.learned.get("restart", "process") == "process"
+
+    def load(self) -> Answer:
+        """Make an instance, or a first one in a process of its own, so that what cannot be loaded says so."""
+        return result(self._loaded) if self.isolated else self._loaded()
+
+    def _loaded(self) -> Answer:
+        self.plant.instantiate()
+        return {}, {}
+
+    def failed(self, error: Exception) -> RunFailed:
+        """Return what an error amounts to; the instance is given up, for it cannot be trusted even to free itself."""
+        found = failure(error, self.made.binding.messages if self.made else ())
+        if self.made:
+            self.made.abandon()
+        return found
+
     def do(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
-        """The answer to a request."""
-        kind = heading["do"]
-        if kind == "simulate":
-            return _Simulation(self, heading, arrays).answer()
-        if kind == "point":
-            return self._point(heading, arrays)
-        if kind == "starts":
-            return self._starts()
-        raise ValueError(f"no job '{kind}'")
+        """Return the answer to a request, with what was learned."""
+        self.runs = 0
+        work = {"simulate": self._simulate, "point": self._point, "starts": self._starts}[heading["do"]]
+        if heading["do"] != "simulate" and self.isolated:
+            found, out = result(lambda: work(heading, arrays))
+        else:
+            found, out = work(heading, arrays)
+        return {**found, "learned": self.learned, "whole runs": self.runs}, out
+
+    def _simulate(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+        return _Simulation(self, heading, arrays).answer()
 
     def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
         point = Point(
@@ -57,11 +106,9 @@ class Jobs:
             **found, "jacobian": d.matrix, "directional": d.directional.astype(float), "nominals": self.plant.nominals()
         }  # fmt: skip
 
-    def _starts(self) -> Answer:
-        """What the parameters stand at where nobody sets them."""
-        from hvdc_ident.fmu.binding import Block
-
-        d = self.plant.description
+    def _starts(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+        """Return what the parameters stand at where nobody sets them."""
+        d = self.description
         u = np.array([v.start or 0.0 for v in d.inputs.values()])
         self.plant.begin({}, u, 0.0, None, None)
         return {}, {"parameters": Block(self.plant.binding, tuple(d.parameters.values())).get().copy()}
@@ -71,32 +118,38 @@ class _Simulation:
     """One experiment: a run, and derivatives by the best way there is for each parameter."""
 
     def __init__(self, jobs: Jobs, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-        self.jobs, self.plant = jobs, jobs.plant
+        self.jobs, self.description, self.learned = jobs, jobs.description, jobs.learned
         self.values: dict[str, float] = heading["values"]
         self.names = tuple(heading["outputs"])
         self.parameters: list[str] = heading["parameters"]
+        self.wanted: list[str] = heading.get("wanted", self.parameters)  # the other columns are made elsewhere
         self.sizes = dict(zip(self.parameters, heading["sizes"], strict=True))
         self.bounds = dict(zip(self.parameters, heading["bounds"], strict=True))
         self.starts: dict[str, float] = dict(zip(self.parameters, heading["starts"], strict=True))
         self.tolerance: float = heading["tolerance"]
         self.time = arrays["time"]
         self.signals = Signals(arrays["sizes"], arrays["times"], arrays["points"], arrays["breaks"])
-        self.inputs = list(self.plant.description.inputs)
+        self.inputs = list(self.description.inputs)
         key = b"".join(arrays[n].tobytes() for n in ("time", "times", "points"))
         self.key = hashlib.sha256(key + repr((self.names, self.tolerance)).encode()).digest()
         self.notes: dict[str, str] = {}
         self.counts = exchange.Counts()
 
     def answer(self) -> Answer:
+        if "restart" not in self.learned:
+            self._find_restart()
+        if REPEATED[self.learned["restart"]]:
+            self.notes["restart"] = REPEATED[self.learned["restart"]]
         gradients = np.zeros((self.time.size, len(self.names), len(self.parameters)))
         errors = np.zeros(len(self.parameters))
-        smooth = self._trusted() if self.parameters and self.plant.binding.exchange else []
+        smooth = self._trusted()
         found = self._with_tangent(smooth, gradients) if smooth else None
-        rest = self.parameters if found is None else [n for n in self.parameters if n not in smooth]
+        rest = [n for n in self.parameters if found is None or n not in smooth]
         outputs = self._run(self.values) if found is None else found
         for name in rest:
-            j = self.parameters.index(name)
-            gradients[:, :, j], errors[j] = self._by_differences(name)
+            if name in self.wanted:
+                j = self.parameters.index(name)
+                gradients[:, :, j], errors[j] = self._by_differences(name, outputs)
         unseen = [n for n, e in zip(self.parameters, errors.tolist(), strict=True) if e > LOST]
         for name in unseen:  # a column of noise would pass for a direction
             j = self.parameters.index(name)
@@ -104,9 +157,7 @@ class _Simulation:
         if unseen:
             self.notes["not seen above the noise of the runs"] = ", ".join(unseen)
         if self.parameters:
-            ways = {
-                n: "central differences of runs" if n in rest else "directional derivatives" for n in self.parameters
-            }
+            ways = {n: "differences of runs" if n in rest else "directional derivatives" for n in self.parameters}
             self.notes["sensitivities"] = "; ".join(
                 f"{way}: {', '.join(n for n in ways if ways[n] == way)}" for way in dict.fromkeys(ways.values())
             )
@@ -114,29 +165,57 @@ class _Simulation:
         counts = [c.accepted, c.events, c.evaluations, c.segments]
         return {"notes": self.notes, "counts": counts}, {"outputs": outputs, "gradients": gradients, "errors": errors}
 
+    def _find_restart(self) -> None:
+        """Learn how the FMU is brought back to its start, from runs of this experiment in processes of their own."""
+        d = self.description
+        names = tuple(dict.fromkeys([*self.names, *d.outputs, *d.states]))
+
+        def run(signals: Signals) -> Callable[[Plant], Array]:
+            def made(plant: Plant) -> Array:
+                self.jobs.tell()
+                return self._rows(plant, self.values, signals, names, exchange.Counts())
+
+            return made
+
+        way, rows = find_restart(self.jobs.make, run(self.signals))
+        steps = [STIRRED * max(abs(v.start or 0.0), v.nominal) * v.continuous for v in d.inputs.values()]
+        if any(steps) and not moves(rows):  # at rest throughout: the start of a run is its end
+            third = float(self.time[0] + (self.time[-1] - self.time[0]) / 3.0)
+            way = self._stirred(run(self.signals.stirred(steps, third)), way)
+        self.learned["restart"] = way
+
+    def _stirred(self, run: Callable[[Plant], Array], way: Way) -> Way:
+        """Return the way as a run with inputs that move has it; the one found before where that run fails."""
+        try:
+            return find_restart(self.jobs.make, run)[0]
+        except RunFailed:
+            return way
+
     # --- runs ---
 
     def _now(self, name: str) -> float:
         """Where a parameter stands; for an input the constant that is added to it, 0."""
         return 0.0 if name in self.inputs else self.values.get(name, self.starts[name])
 
-    def _with(self, name: str, value: float) -> tuple[dict[str, float], Signals]:
-        """Values and signals of a run with a parameter elsewhere, or a constant added to an input."""
-        if name in self.inputs:
-            return self.values, self.signals.raised(self.inputs.index(name), value)
-        return {**self.values, name: value}, self.signals
+    def _with(self, moved: Mapping[str, float]) -> tuple[dict[str, float], Signals]:
+        """Values and signals of a run with parameters elsewhere, or constants added to inputs."""
+        signals = self.signals
+        for name in moved.keys() & set(self.inputs):
+            signals = signals.raised(self.inputs.index(name), moved[name])
+        return {**self.values, **{n: v for n, v in moved.items() if n not in self.inputs}}, signals
 
     def _run(self, values: Mapping[str, float], signals: Signals | None = None) -> Array:
-        """(n, outputs) of a run without derivatives, checked to be finite."""
+        """(n, outputs) of a run without derivatives, checked to be finite; the last one is kept for whoever asks again."""
         moved = self.signals if signals is None else signals
-        counts = self.counts if values is self.values and moved is self.signals else exchange.Counts()
-        if self.plant.binding.exchange:
-            run = exchange.Run(self.plant, moved, self.time, self.names, self.tolerance, counts=counts)
-            run.go(values)
-            outputs = run.outputs
+        own = values is self.values and moved is self.signals
+        key = self.key + moved.values.tobytes() + repr(sorted(values.items())).encode()
+        if own and self.jobs.last is not None and self.jobs.last[0] == key:
+            return self.jobs.last[1]
+        counts = self.counts if own else exchange.Counts()
+        if self.jobs.isolated:
+            outputs = self._in_its_own_process(values, moved, counts)
         else:
-            outputs = co_simulation.run(self.plant, values, moved, self.time, self.names, self.tolerance)
-            counts.segments += 1
+            outputs = self._rows(self.jobs.plant, values, moved, self.names, counts)
         bad = ~np.isfinite(outputs).all(axis=0)
         if bad.any():
             row = int(np.flatnonzero(~np.isfinite(outputs).all(axis=1))[0])
@@ -144,25 +223,113 @@ class _Simulation:
             raise RunFailed(
                 f"output '{name}' is not finite", float(self.time[row]), "check parameter values and limits"
             )
-        self.jobs.runs += 1
+        if own:
+            self.jobs.last = (key, outputs)
         return outputs
+
+    def _in_its_own_process(self, values: Mapping[str, float], signals: Signals, counts: exchange.Counts) -> Array:
+        """(n, outputs) of a run in a process made for it; what it finds out of the FMU is kept."""
+
+        def work() -> Answer:
+            plant = self.jobs.make({k: v for k, v in self.learned.items() if k != "restart"})
+            rows = self._rows(plant, values, signals, self.names, counts)
+            return {"learned": plant.learned, "counts": asdict(counts)}, {"rows": rows}
+
+        heading, arrays = result(work)
+        self.jobs.runs += 1
+        self.learned |= heading["learned"]
+        vars(counts).update(heading["counts"])
+        return arrays["rows"]
+
+    def _rows(
+        self,
+        plant: Plant,
+        values: Mapping[str, float],
+        signals: Signals,
+        names: tuple[str, ...],
+        counts: exchange.Counts,
+        finer: float = 1.0,
+    ) -> Array:
+        """(n, names) of a run as the FMU gives them. finer: factor on the integrator's tolerance."""
+        self.jobs.runs += 1
+        if plant.binding.exchange:
+            run = exchange.Run(plant, signals, self.time, names, finer * self.tolerance, counts=counts)
+            run.go(values)
+            return run.outputs
+        counts.segments += 1
+        return co_simulation.run(plant, values, signals, self.time, names, self.tolerance)
+
+    # --- derivatives that ride along ---
+
+    def _trusted(self) -> list[str]:
+        """The parameters, and inputs, whose directional derivatives a whole run has confirmed."""
+        d = self.description
+        if not self.parameters or self.jobs.isolated or not (d.directional and d.states):
+            return []
+        known = {**d.parameters, **{n: v for n, v in d.inputs.items() if v.continuous}}
+        fit = [n for n in self.parameters if n in known and known[n].kind in ("Real", "Float64")]
+        confirmed: dict[str, bool] = self.learned.setdefault("derivatives", {})
+        new = [n for n in fit if n not in confirmed]
+        if new:
+            confirmed |= self._confirmed(new)
+        return [n for n in self.parameters if confirmed.get(n)]
+
+    def _confirmed(self, names: list[str]) -> dict[str, bool]:
+        """Return which directional derivatives hold over this whole run.
+
+        The FMI standard takes states and inputs as knowns of a directional derivative. By parameters some FMUs give
+        other figures, and some move the parameter: so the run with sensitivities has to be the run without, the
+        parameters have to stand after it as before, and each column has to be the difference of runs.
+        """
+        plant = self.jobs.plant
+        plain = exchange.Counts()
+        outputs = self._rows(plant, self.values, self.signals, self.names, plain)
+        noise = _rms(outputs - self._rows(plant, self.values, self.signals, self.names, exchange.Counts(), 0.5))
+        parameters = Block(plant.binding, tuple(self.description.parameters.values()))
+        before = parameters.get().copy()
+        try:
+            run = self._tangent_run(names, exchange.Counts(), EXCESS * plain.accepted + 1000)
+            moved = not np.array_equal(before, parameters.get(), equal_nan=True)
+        except (RunFailed, Failure, exchange.SensitivitiesLost):
+            moved = True
+        plant.renew()
+        size = np.abs(outputs).max(axis=0, initial=0.0)
+        if moved or (_rms(run.outputs - outputs) > SPREAD * (noise + self.tolerance * size)).any():
+            return {n: len(names) > 1 and self._confirmed([n])[n] for n in names}
+        return {n: self._agrees(n, run.gradients[:, :, j], outputs, noise) for j, n in enumerate(names)}
+
+    def _agrees(self, name: str, column: Array, outputs: Array, noise: Array) -> bool:
+        """Return whether a column is the difference of two runs, as far as their bend and noise let it be told."""
+        low, high = self.bounds[name]
+        size = self.sizes[name]
+        runs = self._moving(name)
+        found, bend = pair(runs, self._now(name), NEAR * size, low, high, outputs)
+        strength = _rms(found)
+        doubt = _rms(bend) * NEAR * size + 2.0 * noise / (NEAR * size)
+        told = (doubt <= TOLD * strength) | (strength <= 2.0 * noise / (NEAR * size))
+        return bool((told & (_rms(column - found) <= doubt + ENOUGH * strength)).all())
+
+    def _tangent_run(
+        self, names: Sequence[str], counts: exchange.Counts, most: int = exchange.MOST_STEPS
+    ) -> exchange.Run:
+        """Return the run with sensitivities. Raises SensitivitiesLost where an event makes them wrong."""
+        plant = self.jobs.plant
+        start = np.column_stack([self._start_slope(n) for n in names])
+        tangent = Tangent(plant, names, [self.sizes[n] for n in names], self.names)
+        run = exchange.Run(
+            plant, self.signals, self.time, self.names, self.tolerance, tangent, start, counts=counts, most=most
+        )
+        run.go(self.values)
+        return run
 
     def _with_tangent(self, names: Sequence[str], gradients: Array) -> Array | None:
         """(n, outputs) with the gradients filled in; None where an event makes the columns wrong."""
-        sizes = [self.sizes[n] for n in names]
-        start = np.column_stack([self._start_slope(n) for n in names])
-        tangent = Tangent(self.plant, names, sizes, self.names)
-        run = exchange.Run(
-            self.plant, self.signals, self.time, self.names, self.tolerance, tangent, start, counts=self.counts
-        )
         try:
-            run.go(self.values)
+            run = self._tangent_run(names, self.counts)
         except exchange.SensitivitiesLost as e:
             self.notes["events"] = f"{e}: derivatives come from differences of runs"
             return None
-        self.jobs.runs += 1
-        places = [self.parameters.index(n) for n in names]
-        gradients[:, :, places] = run.gradients
+        gradients[:, :, [self.parameters.index(n) for n in names]] = run.gradients
         if not (np.isfinite(run.outputs).all() and np.isfinite(run.gradients).all()):
             raise RunFailed("an output or its sensitivity is not finite", hint="check parameter values and limits")
         return run.outputs
@@ -171,61 +338,66 @@ class _Simulation:
         """(nx,) dx0/dp, from initialisations at two steps, extrapolated."""
         t = float(self.time[0])
         low, high = self.bounds[name]
+        plant = self.jobs.plant
 
         def start(value: float) -> Array:
-            values, signals = self._with(name, value)
-            self.plant.begin(values, signals.at(self.time[:1], "left")[0], t, None, self.tolerance)
-            return self.plant.binding.get_states()[:, None]
+            values, signals = self._with({name: value})
+            plant.begin(values, signals.at(self.time[:1], "left")[0], t, None, self.tolerance)
+            return plant.binding.get_states()[:, None]
 
         at = self._now(name)
         h = START_STEP * self.sizes[name]
-        coarse, fine = (slope(start, at, s, low, high)[:, 0] for s in (h, 0.5 * h))
+        middle = start(at)
+        coarse, fine = (pair(start, at, s, low, high, middle)[0][:, 0] for s in (h, 0.5 * h))
         return np.asarray((4.0 * fine - coarse) / 3.0)
 
-    def _trusted(self) -> list[str]:
-        """The parameters whose directional derivatives agree with differences, beside the start."""
-        d = self.plant.description
-        if not d.directional or not d.states:
-            return []
-        known = {**d.parameters, **{n: v for n, v in d.inputs.items() if v.continuous}}
-        fit = [n for n in self.parameters if n in known and known[n].kind in ("Real", "Float64")]
-        new = [n for n in fit if n not in self.jobs.trusted]
-        if new:
-            asked = [n for n in new if n in d.parameters]
-            found = self._agreeing(asked)
-            main = bool(found[: found.size - len(asked)].all())
-            own = dict(zip(asked, found[found.size - len(asked) :].tolist(), strict=True))
-            self.jobs.trusted |= {n: main and bool(own.get(n, True)) for n in new}
-        return [n for n in self.parameters if self.jobs.trusted.get(n)]
+    # --- derivatives from runs ---
 
-    def _agreeing(self, names: list[str]) -> Array:
-        """Which columns of states, inputs and parameters agree, a little beside the start, where no term is at rest."""
-        u, t = self.signals.at(self.time[:1], "left")[0], float(self.time[0])
-        start = Point(self.plant, self.values, None, u, t, self.names)
-        moved = start.x + 1e-3 * self.plant.nominals() * (-1.0) ** np.arange(start.x.size)
-        try:
-            point = Point(self.plant, self.values, moved, u, t, self.names)
-        except RunFailed:  # an event resets the states there: the start itself has to do
-            point = Point(self.plant, self.values, None, u, t, self.names)
-        return point.derivatives(names, [self.sizes[n] for n in names]).directional
+    def _moving(self, name: str) -> Callable[[float], Array]:
+        """Return the run as a function of one parameter."""
 
-    def _by_differences(self, name: str) -> tuple[Array, float]:
+        def run(value: float) -> Array:
+            self.jobs.tell()
+            return self._run(*self._with({name: value}))
+
+        return run
+
+    def _by_differences(self, name: str, outputs: Array) -> tuple[Array, float]:
         """(n, outputs) derivatives by one parameter, and their relative error."""
         low, high = self.bounds[name]
         at = self._now(name)
-
-        def runs(value: float) -> Array:
-            self.jobs.tell()
-            return self._run(*self._with(name, value))
-
         octave = round(float(np.log2(abs(at)))) if at else 0  # a step chosen at half the value is chosen anew
         key = self.key + f"{name} {octave}".encode()
         step = self.jobs.steps.get(key)
-        if step is None:
-            step = choose(runs, at, self.sizes[name], low, high)
-            if len(self.jobs.steps) < KEPT_STEPS:
-                self.jobs.steps[key] = step
-        return slope(runs, at, step.h, low, high), step.error
+        if step is not None:
+            return derivative(self._moving(name), at, step, low, high, outputs), step.error
+        column, step = first(self._moving(name), at, self.sizes[name], low, high, outputs, self._noise(outputs))
+        if len(self.jobs.steps) < KEPT_STEPS:
+            self.jobs.steps[key] = step
+        return column, step.error
+
+    def _noise(self, outputs: Array) -> Array:
+        """(outputs,) noise of a run of this experiment."""
+        found = self.jobs.noise.get(self.key)
+        if found is None:
+            found = noise_of(self._tiny, outputs)
+            if len(self.jobs.noise) < KEPT_STEPS:
+                self.jobs.noise[self.key] = found
+        return found
+
+    def _tiny(self, steps: float) -> Array:
+        """(n, outputs) of a run with every parameter so many tiny steps away, to the side where there is room."""
+        self.jobs.tell()
+        moved = {}
+        for name in self.parameters:
+            at, (low, high) = self._now(name), self.bounds[name]
+            moved[name] = at + (steps if high - at >= at - low else -steps) * TINY * self.sizes[name]
+        return self._run(*self._with(moved))
+
+
+def _rms(rows: Array) -> Array:
+    """(outputs,) root mean square over rows."""
+    return np.asarray(np.sqrt(np.mean(rows**2, axis=0)))
 
 
 __all__ = ["Failure", "Jobs"]

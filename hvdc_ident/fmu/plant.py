@@ -2,43 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from hvdc_ident.fmu.binding import Binding, Block, Failure, Update
+from hvdc_ident.fmu.binding import DISCARD, ERROR, FATAL, Binding, Block, Failure, Update
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.trajectory import Array
 
+TAKEN = 1e-6  # share by which a value may change as it is set: an FMU may keep it in single precision
 ITERATIONS = 1000  # of the discrete part at one instant
 
 
 class RunFailed(Exception):
-    """A run that did not reach its end: what happened, at which instant, and what to try."""
+    """A run that did not reach its end.
 
-    def __init__(self, what: str, t: float | None = None, hint: str = "") -> None:
+    what: what happened. t: the instant, s. hint: what to try. said: the FMU's own last message. fatal: the process is of
+    no more use. again: a new process may do better, where this one has made an instance before.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        t: float | None = None,
+        hint: str = "",
+        *,
+        said: str = "",
+        fatal: bool = False,
+        again: bool = False,
+    ) -> None:
         super().__init__(what)
-        self.what, self.t, self.hint = what, t, hint
+        self.what, self.t, self.hint, self.said, self.fatal, self.again = what, t, hint, said, fatal, again
+
+    def told(self) -> dict[str, Any]:
+        """Return the heading that tells it to another process."""
+        return {
+            "failed": self.what, "time": self.t, "hint": self.hint, "said": self.said, "fatal": self.fatal,
+            "again": int(self.again),
+        }  # fmt: skip
+
+    @classmethod
+    def heard(cls, told: Mapping[str, Any]) -> RunFailed:
+        """Return the failure that a heading tells."""
+        again, fatal = bool(told["again"]), bool(told["fatal"])
+        return cls(told["failed"], told["time"], told["hint"], said=told["said"], fatal=fatal, again=again)
 
 
-class NoInstance(RunFailed):
-    """The FMU gave no instance. In a process that had one before, a new process is worth a try: some give only one."""
+def failure(error: Exception, messages: Sequence[str] = ()) -> RunFailed:
+    """Return the failure that an error amounts to. messages: those of the FMU in this run, told where a call failed."""
+    said = messages[-1] if messages else ""
+    if isinstance(error, RunFailed):
+        return error
+    if isinstance(error, Failure):
+        words = {DISCARD: "discard", ERROR: "error", FATAL: "fatal"}.get(error.status, f"status {error.status}")
+        fatal = error.status not in (DISCARD, ERROR)
+        return RunFailed(f"{error.function} returned {words}", said=said, fatal=fatal)
+    if isinstance(error, MemoryError):
+        return RunFailed("not enough memory", fatal=True)
+    # A library that cannot be loaded or lacks a function; or a bug here.
+    return RunFailed(" ".join(f"{type(error).__name__}: {error}".split())[:500], said=said)
 
 
 class Plant:
     """An FMU with an instance, brought to the start of a run again and again.
 
-    A kept instance is reset; where that does not bring the same start back as the first time, each run has its own.
+    learned: what was found out about the FMU, see `hvdc_ident.fmu.restart`; a restart that is not learned yet is by a
+    new instance.
     """
 
-    def __init__(self, description: Description, folder: str) -> None:
-        self.description = description
+    def __init__(self, description: Description, folder: str, learned: dict[str, Any]) -> None:
+        self.description, self.learned = description, learned
         self.binding = Binding(description, folder)
         self.inputs = Block(self.binding, tuple(description.inputs.values()))
-        self.all_outputs = Block(self.binding, tuple(description.outputs.values()))
         self._running = False
-        self._first: tuple[dict[str, float], Array, float, Array] | None = None
-        self.keeps: bool | None = None
+        self._made = 0  # instances in this process so far
+        self._set: set[str] = set()  # parameters that this instance was given a value of
         self.agreed = False  # whether directional derivatives agreed with differences where last compared
         self.next_time: float | None = None
 
@@ -49,70 +89,82 @@ class Plant:
     def begin(
         self, values: Mapping[str, float], inputs: Array, start: float, stop: float | None, tolerance: float | None
     ) -> None:
-        """Nothing; the instance is initialised: parameters that differ from their start, inputs, instant in s.
+        """Initialise the instance: parameters that differ from their start, inputs, instant in s.
 
         Model exchange: events at the start are settled and the instance is in continuous-time mode.
         """
-        if self.keeps is None and self._first is not None:
-            self._try_keeping(stop, tolerance)
-        self._begin(values, inputs, start, stop, tolerance)
-        if self._first is None:
-            self._first = (dict(values), np.array(inputs), start, self._signature())
-
-    def _try_keeping(self, stop: float | None, tolerance: float | None) -> None:
-        """Nothing; it is known whether a reset brings the first start back."""
-        assert self._first is not None
-        values, inputs, start, seen = self._first
-        self.keeps = True
-        self._begin(values, inputs, start, stop, tolerance)
-        self.keeps = bool(np.allclose(self._signature(), seen, rtol=1e-12, atol=1e-14, equal_nan=True))
-
-    def _signature(self) -> Array:
-        states = self.binding.get_states() if self.binding.exchange else np.empty(0)
-        return np.concatenate([states, self.all_outputs.get()])
-
-    def _begin(
-        self, values: Mapping[str, float], inputs: Array, start: float, stop: float | None, tolerance: float | None
-    ) -> None:
-        b = self.binding
+        b, known = self.binding, self.description.parameters
         self._rest()
-        parameters = [self.description.parameters[n] for n in values]
-        Block(b, parameters).set(list(values.values()))
+        b.messages.clear()
+        until = None if stop is None or stop <= start else stop  # some FMUs refuse an experiment of no length
+        b.set_up(start, until, tolerance)
+        # A reset that keeps what was set would carry a value of one run into the next.
+        back = {n: s for n in self._set - values.keys() if (s := known[n].start) is not None}
+        given = {**back, **values}
+        Block(b, [known[n] for n in given]).set(list(given.values()))
+        self._set |= given.keys()
         self.inputs.set(inputs)
-        b.enter_initialization(start, stop, tolerance)
+        b.enter_initialization(start, until, tolerance)
         self._running = True
         self.inputs.set(inputs)
         b.exit_initialization()
+        self._check_taken(values, start)
         if b.exchange:
             self.iterate(start)
             b.enter_continuous()
 
+    def _check_taken(self, values: Mapping[str, float], start: float) -> None:
+        """Raise RunFailed where a parameter does not read as it was set: its run would be that of another value."""
+        known = self.description.parameters
+        block = Block(self.binding, [known[n] for n in values])
+        try:
+            read = block.get().tolist()
+        except Failure:  # an FMU that does not show its parameters can still be run
+            return
+        for (name, value), now in zip(values.items(), read, strict=True):
+            if abs(now - value) > TAKEN * abs(value):
+                what = f"parameter '{name}' was set to {value:.9g} and reads {now:.9g}: the FMU does not take the value"
+                raise RunFailed(what, start, "leave it at its start value, or export it as tunable")
+
     def _rest(self) -> None:
-        """Nothing; there is an instance that was not initialised since it was made or reset."""
+        """Have an instance that was not initialised since it was made or reset."""
         b = self.binding
         if b.component is not None and self._running:
             self._running = False
-            if self.keeps is False:
+            with contextlib.suppress(Failure):  # an FMU that has ended by itself refuses; the next call decides
                 b.terminate()
-                b.free()
-            else:
+            if self._resets:
                 try:
-                    b.terminate()
                     b.reset()
                 except Failure:
-                    self.keeps = False
+                    self.learned["restart"] = "instance"
                     b.free()
+            else:
+                b.free()
         if b.component is None:
             self.instantiate()
 
+    @property
+    def _resets(self) -> bool:
+        """Whether the instance is kept over a reset; before that was tried, only where a second one cannot be made."""
+        way = self.learned.get("restart")
+        return way == "reset" or (way is None and self.description.once_per_process)
+
+    def renew(self) -> None:
+        """Give the instance up: the next run begins with a new one."""
+        self.binding.free()
+        self._running = False
+
     def instantiate(self) -> None:
-        """Nothing; there is an instance."""
+        """Make an instance. Raises RunFailed where the FMU gives none."""
+        self._set.clear()
         try:
             self.binding.instantiate()
         except RuntimeError:
             said = f": {self.binding.messages[-1]}" if self.binding.messages else ""
             hint = "a wrong GUID, a missing licence or resource make an FMU refuse"
-            raise NoInstance(f"the FMU gave no instance{said}", hint=hint) from None
+            raise RunFailed(f"the FMU gave no instance{said}", hint=hint, again=self._made > 0) from None
+        self._made += 1
 
     def abandon(self) -> None:
         """Nothing; the instance is forgotten, for after a failure it cannot be trusted even to free itself."""

@@ -49,6 +49,18 @@ class Signals:
         values[ends[k] - int(self.sizes[k]) : ends[k]] += by
         return Signals(self.sizes, self.times, values, self.breaks)
 
+    def stirred(self, by: Sequence[float], at: float) -> Signals:
+        """Return the signals with a step added to each at an instant, s."""
+        times, values = [], []
+        for (t, v), step in zip(self.each(), by, strict=True):
+            k = int(np.searchsorted(t, at, side="right"))
+            here = float(np.interp(at, t, v))
+            times.append(np.concatenate([t[:k], [at, at], t[k:]]))
+            values.append(np.concatenate([v[:k], [here, here + step], v[k:] + step]))
+        return Signals(
+            self.sizes + 2.0, np.concatenate(times), np.concatenate(values), np.union1d(self.breaks, np.array([at]))
+        )
+
     def at(self, t: Array, side: str = "right") -> Array:
         """(n, nu) values at the instants, after the jumps ("right") or before them ("left")."""
         found = np.empty((t.size, self.sizes.size))

@@ -151,6 +151,8 @@ class Point:
         columns = [self._difference(k, STEP * s) for k, s in enumerate(scale)]
         finer = [self._difference(k, 0.25 * STEP * s) for k, s in enumerate(scale)]
         own = self._directional(list(parameters))
+        if parameters:  # some FMUs move a parameter as they give a derivative by it
+            self.plant.renew()
         for name, size in zip(parameters, sizes, strict=True):
             columns.append(self._by_parameter(name, STEP * size))
             finer.append(self._by_parameter(name, 4.0 * STEP * size))

@@ -17,9 +17,8 @@ from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
+from hvdc_ident.fmu.isolation import end_with
 from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_in, unpacked
-
-PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent ends
 
 
 def prepare(description: Any) -> None:
@@ -46,7 +45,7 @@ def main(
     """
     try:
         os.setpgid(0, 0)  # with what the FMU may start
-        _end_with(parent)
+        end_with(parent)
         connection, progress, printed = descriptors
         os.dup2(printed, 1)
         os.dup2(printed, 2)
@@ -64,19 +63,24 @@ def main(
 
 
 def _serve(host: Connection, description: Any, folder: str, begun: Mapping[str, Any], view: memoryview[float]) -> None:
-    """Load the FMU and answer requests. begun: what the host began with. view: where the progress is noted."""
+    """Answer requests until the connection closes. begun: what the host began with. view: where the progress is noted."""
+    from hvdc_ident.fmu.jobs import Jobs
+    from hvdc_ident.fmu.plant import Plant
+
+    def make(learned: dict[str, Any]) -> Plant:
+        plant = Plant(description, folder, learned)
+        plant.binding.progress = view
+        view[PROCESS] = os.getpid()
+        return plant
+
     tell = _teller(view)
-    jobs = _guarded(host, lambda: _loaded(description, folder, tell, view))
-    if jobs is None:
+    jobs = Jobs(description, make, tell, begun["learned"])
+    if not _guarded(host, jobs, jobs.load, view):
         return
-    host.send_bytes(packed({"done": 1}))
     while True:
         heading, arrays = unpacked(host.recv_bytes())
         tell()
-        answer = _guarded(host, lambda h=heading, a=arrays: jobs.do(h, a), jobs)
-        if answer is not None:
-            found, out = answer
-            host.send_bytes(packed({**found, "done": 1, "memory": resident(), "space": space()}, out))
+        _guarded(host, jobs, lambda h=heading, a=arrays: jobs.do(h, a), view)
 
 
 def _teller(view: memoryview[float]) -> Callable[[], None]:
@@ -89,56 +93,23 @@ def _teller(view: memoryview[float]) -> Callable[[], None]:
     return tell
 
 
-def _loaded(description: Any, folder: str, tell: Any, view: memoryview[float]) -> Any:
-    from hvdc_ident.fmu.jobs import Jobs
-    from hvdc_ident.fmu.plant import Plant
+def _guarded(host: Connection, jobs: Any, work: Callable[[], Any], view: memoryview[float]) -> bool:
+    """Answer with what the work returns or with its failure; return whether it did not fail.
 
-    plant = Plant(description, folder)
-    plant.binding.progress = view
-    plant.instantiate()
-    return Jobs(plant, tell)
-
-
-def _guarded(host: Connection, work: Any, jobs: Any = None) -> Any:
-    """What the work returns; None where it failed, which was told. A fatal failure ends the process.
-
-    A failure with "again" may have come from what the process did before: the host asks once more in a new one.
+    A fatal failure ends the process. One with "again" may have come from what the process did before: the host asks once
+    more in a new one.
     """
-    from fmpy.fmi1 import FMICallException
-
-    from hvdc_ident.fmu.plant import NoInstance, RunFailed
-
-    fatal = False
     try:
-        return work()
-    except RunFailed as e:
-        told: dict[str, Any] = {"failed": e.what, "hint": e.hint, "time": e.t}
-        if isinstance(e, NoInstance) and jobs is not None:  # there was an instance: a process may give only one
-            told["again"] = 1
-    except FMICallException as e:
-        words = {2: "discard", 3: "error", 4: "fatal"}.get(e.status, f"status {e.status}")
-        told, fatal = {"failed": f"{e.function} returned {words}"}, e.status not in (2, 3)
-    except MemoryError:
-        told, fatal = {"failed": "not enough memory"}, True
-    except Exception as e:  # a library that cannot be loaded or lacks a function; or a bug here
-        told = {"failed": " ".join(f"{type(e).__name__}: {e}".split())[:500]}
-    if jobs is not None:
-        messages = jobs.plant.binding.messages
-        told["said"] = messages[-1] if messages else ""
-        messages.clear()
-        jobs.plant.abandon()
-    host.send_bytes(packed({"fatal": fatal, **told, "memory": resident(), "space": space()}))
+        found, out = work()
+        told, fatal = {**found, "done": 1}, False
+    except Exception as e:
+        failed = jobs.failed(e)
+        told, out, fatal = failed.told(), {}, failed.fatal
+    view[PROCESS] = os.getpid()  # of those that the work was done in
+    host.send_bytes(packed({**told, "memory": resident(), "space": space()}, out))
     if fatal:
         os._exit(0)
-    return None
-
-
-def _end_with(parent: int) -> None:
-    """Let the system end this process when its parent ends."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(0)
+    return "done" in told
 
 
 def _dump_into(dumps: socket.socket) -> object:

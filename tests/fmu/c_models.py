@@ -36,6 +36,12 @@ static int spring_along(void *c, const unsigned *un, unsigned long nu, const uns
     s[3] = (d[6] * r[8] + r[6] * d[8] - d[5] * r[1] - r[5] * d[1] - d[6] * r[0] - r[6] * d[0]) / r[4]
          - force / (r[4] * r[4]) * d[4];
     s[9] = 2 * d[1] + d[7];
+#ifdef SHIFTS
+    for (unsigned long i = 0; i < nk; i++) if (kn[i] == 4) r[4] *= 1 + SHIFTS;
+#endif
+#ifdef LATER
+    for (unsigned long i = 0; i < nk; i++) if (kn[i] == 4 && fabs(r[0]) > 0.5) s[3] *= LATER;
+#endif
     for (unsigned long i = 0; i < nu; i++) out[i] = s[un[i]] * WRONG;
     return 0;
 }
@@ -58,9 +64,11 @@ SPRING_VARIABLES = (
 )
 
 
-def spring(name: str = "spring", own: bool = True, wrong: float = 1.0, nominal: str = "1.0") -> CModel:
-    """The spring, with directional derivatives of its own, wrong ones, or none."""
-    defines = (f"NOMINAL={nominal}", *(["OWN_DERIVATIVES", f"WRONG={wrong}"] if own else []))
+def spring(
+    name: str = "spring", own: bool = True, wrong: float = 1.0, nominal: str = "1.0", more: tuple[str, ...] = ()
+) -> CModel:
+    """The spring, with directional derivatives of its own, wrong ones, or none. more: what else goes wrong with them."""
+    defines = (f"NOMINAL={nominal}", *(["OWN_DERIVATIVES", f"WRONG={wrong}", *more] if own else []))
     return CModel(name, SPRING_CODE, SPRING_VARIABLES, 2, 0, directional=own, defines=defines)
 
 
@@ -177,6 +185,42 @@ def broken(name: str, instantiate: str = "", token: str = "{token}", defines: tu
     """The lag whose instantiation does something else."""
     code = FAULTY_CODE + (f"#define AT_INSTANTIATE {instantiate}\n" if instantiate else "")
     return CModel(name, code, FAULTY_VARIABLES, 1, token=token, defines=defines)
+
+
+# A lag that moves from 1 to 0 by itself, with what its tool does wrong as it is begun again.
+BEGUN_CODE = (
+    HEAD
+    + """
+#include <time.h>
+#define NR 8
+static int runs, frozen;
+#ifndef SPOILT
+#define SPOILT 0
+#endif
+#ifndef INITIALIZE
+#define INITIALIZE(r) (runs++)
+#endif
+static void start(double *r) { r[0] = 1; r[2] = 0.1; }
+static void equations(double *r, double t) {
+    r[1] = frozen ? 0 : (r[3] - r[0]) / r[2] * (1 + SPOILT * (runs - 1));
+    r[4] = r[0]; r[5] = clock();
+}
+"""
+)
+BEGUN_VARIABLES = (
+    Var("y", 0, more=(("start", "1"),)),
+    Var("der(y)", 1, more=(("derivative", "y"),)),
+    Var("T", 2, "parameter", "fixed", (("start", "0.1"), ("min", "0.001"))),
+    Var("u", 3, "input", "continuous", (("start", "0"),)),
+    Var("out", 4, "output"),
+)
+CLOCK = Var("cpu", 5, "output")
+
+
+def begun(name: str, *defines: str, more: tuple[Var, ...] = ()) -> CModel:
+    """The lag that begins at 1, with some of its tool's faults."""
+    code = "".join(f"#define {d}\n" for d in defines) + BEGUN_CODE
+    return CModel(name, code, (*BEGUN_VARIABLES, *more), 1)
 
 
 TWIN = Model(

@@ -1,6 +1,6 @@
 /* The calls of FMI 2.0 or 3.0 around a small model. The model defines, before this file is included:
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
-   faults AT_INSTANTIATE, AT_STEP, AT_SLOPES, AT_RESET. States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
+   faults AT_INSTANTIATE, AT_SETUP, AT_STEP, AT_SLOPES, AT_RESET. States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -79,7 +79,12 @@ Instance fmi2Instantiate(const char *name, int type, const char *guid, const cha
     Model *m = malloc(sizeof *m); m->log = f->logger; m->env = f->env; fresh(m); return m;
 }
 void fmi2FreeInstance(Instance c) { free(c); }
-int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double end) { M->t = t; return 0; }
+int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double end) {
+#ifdef AT_SETUP
+    AT_SETUP(M->r, t, e, end);
+#endif
+    M->t = t; return 0;
+}
 int fmi2EnterInitializationMode(Instance c) { return 0; }
 int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi2Terminate(Instance c) { return 0; }

@@ -1,0 +1,116 @@
+"""The first use of an FMU: how it is begun again, and which of its derivatives a whole run confirms."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from c_fmu import build, needs_compiler
+from c_models import CLOCK, begun, response, spring
+from fmu_limits import PATIENT
+
+from hvdc_ident import simulate
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.fmu.model import read_fmu
+
+pytestmark = needs_compiler
+
+BOTH = ["model-exchange", "co-simulation"]
+TIME = np.linspace(0.0, 0.5, 51)
+FREE = experiment("free", TIME)
+STEP = experiment("step", np.linspace(0.0, 5.0, 251), {"u": InputSignal.step(1.0, 0.0, 1.0)})
+FROZEN = ("AT_RESET frozen = 1", "AT_INSTANTIATE frozen = 0")
+"""A reset that brings the values at the start back, and a second run in which nothing moves."""
+
+
+@pytest.mark.parametrize("interface", BOTH)
+@pytest.mark.parametrize(
+    ("way", "model", "note"),
+    [
+        ("reset", begun("plain"), None),
+        ("reset", begun("timed", more=(CLOCK,)), None),  # an output that no two runs repeat judges nothing
+        ("instance", begun("frozen", *FROZEN), "each run has a new instance"),
+        ("instance", begun("refusing", "AT_RESET return 3"), "each run has a new instance"),
+        ("instance", begun("fatal", "AT_RESET abort()"), "each run has a new instance"),
+        ("process", begun("spoilt", "SPOILT 0.1"), "each run has a new process"),
+        ("process", begun("both", *FROZEN, "SPOILT 0.1", more=(CLOCK,)), "each run has a new process"),
+    ],
+    ids=lambda x: getattr(x, "name", None),
+)
+def test_the_cheapest_restart_that_repeats_a_run_is_taken(tmp_path, way, model, note, interface):
+    """Runs at other values between equal ones, each against the closed form."""
+    found = read_fmu(build(model, tmp_path), interface=interface, limits=PATIENT)
+    for lag in (0.1, 0.05, 0.1, 0.1):
+        run = simulate(found, FREE, {"T": lag}, outputs=["out"])
+        assert np.abs(run["out"] - np.exp(-TIME / lag)).max() < 1e-6
+        assert found.host.learned["restart"] == way and (note or "") in run.notes.get("restart", "")
+    moved = simulate(found, FREE, {"T": 0.1}, ["T"], outputs=["out"])
+    assert np.abs(moved.gradient("out")[:, 0] - TIME / 0.01 * np.exp(-TIME / 0.1)).max() < 2e-3
+    assert found.host.started == 1
+    there = pickle.loads(pickle.dumps(found))
+    assert there.host.learned["restart"] == way  # nobody tries it a second time
+    found.host.close()
+
+
+def test_a_run_at_rest_does_not_judge_a_reset(tmp_path):
+    """At 0 with no input the frozen lag repeats itself: an input that moves tells it."""
+    model = begun("rest", "INITIALIZE(r) (r[0] = 0)", *FROZEN)
+    found = read_fmu(build(model, tmp_path), interface="co-simulation", limits=PATIENT)
+    assert np.abs(simulate(found, FREE)["out"]).max() == 0.0
+    assert found.host.learned["restart"] == "instance"
+    step = experiment("step", TIME, {"u": InputSignal.step(0.1, 0.0, 1.0)})
+    wanted = np.where(TIME < 0.1, 0.0, 1.0 - np.exp(-(TIME - 0.1) / 0.1))
+    assert np.abs(simulate(found, step)["out"] - wanted).max() < 1e-6
+    found.host.close()
+
+
+def test_values_are_set_after_the_experiment_is_told(tmp_path):
+    """Some FMUs put their own values back as the experiment is set up."""
+    found = read_fmu(build(begun("setup", "AT_SETUP(r, t, e, end) start(r)"), tmp_path), interface="co-simulation")
+    assert np.abs(simulate(found, FREE, {"T": 0.2})["out"] - np.exp(-TIME / 0.2)).max() < 1e-6
+    found.host.close()
+
+
+def test_a_value_that_the_fmu_does_not_take_is_an_error(tmp_path):
+    found = read_fmu(build(begun("deaf", "INITIALIZE(r) (r[2] = 0.1)"), tmp_path), interface="co-simulation")
+    assert np.abs(simulate(found, FREE)["out"] - np.exp(-TIME / 0.1)).max() < 1e-6
+    with pytest.raises(SimulationError, match=r"parameter 'T' was set to 0.2 and reads 0.1"):
+        simulate(found, FREE, {"T": 0.2})
+    found.host.close()
+
+
+def test_an_experiment_of_one_instant_has_no_end(tmp_path):
+    found = read_fmu(
+        build(begun("ends", "AT_SETUP(r, t, e, end) if (e && end <= t) return 3"), tmp_path), interface="co-simulation"
+    )
+    assert simulate(found, experiment("now", np.array([0.0])))["out"].tolist() == [1.0]
+    found.host.close()
+
+
+@pytest.mark.parametrize("fault", ["SHIFTS=1e-3", "SHIFTS=10", "LATER=1.2"])
+def test_derivatives_by_a_parameter_are_those_of_runs_where_the_fmu_gets_them_wrong(fmu, fault):
+    """The mass moves with each question for its derivative, or its derivative is wrong once the spring has moved."""
+    name = "spring" + "".join(c for c in fault if c.isalnum())
+    found = fmu(spring(name, more=(fault,)), 2, "model-exchange")
+    run = simulate(found, STEP, {}, ["m", "k"])
+    assert run.notes["sensitivities"] == "differences of runs: m; directional derivatives: k"
+    assert np.abs(run["y"] - response(STEP.time)).max() < 2e-7
+    h = 1e-5
+    wanted = (response(STEP.time, m=2.0 + h) - response(STEP.time, m=2.0 - h)) / (2 * h)
+    assert np.abs(run.gradient("y")[:, 0] - wanted).max() < 1e-4
+    assert np.array_equal(simulate(found, STEP)["y"], simulate(found, STEP)["y"])
+
+
+def test_an_iteration_of_a_fit_takes_one_run_and_one_a_parameter(fmu):
+    """A trial, then a gradient at the same values: the trial is not run again."""
+    model = fmu(spring("counted", own=False), 2, "co-simulation")
+    names = ["m", "d", "k", "b"]
+    simulate(model, STEP, {}, names)
+    before = model.host.runs
+    for step in range(1, 5):
+        values = {"m": 2.0 + 0.01 * step, "k": 8.0 - 0.01 * step}
+        simulate(model, STEP, values)
+        simulate(model, STEP, values, names)
+    assert model.host.runs - before == 4 * (len(names) + 1)
