@@ -14,6 +14,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
@@ -80,7 +81,7 @@ def _serve(host: Connection, description: Any, folder: str, begun: Mapping[str, 
     while True:
         heading, arrays = unpacked(host.recv_bytes())
         tell()
-        _guarded(host, jobs, lambda h=heading, a=arrays: jobs.do(h, a), view)
+        _guarded(host, jobs, partial(jobs.do, heading, arrays), view)
 
 
 def _teller(view: memoryview[float]) -> Callable[[], None]:
