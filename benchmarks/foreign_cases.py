@@ -34,6 +34,7 @@ MOST_ROWS = 500
 STAIR = 10  # rows between the jumps of an input
 RTOL = Tolerance().rtol
 FINE = 0.1 * RTOL  # of FMPy's solver
+MOST_VALUES, CHANGED = 4, 1e-3  # parameters set, and of the range, the least that one has to move an output by
 LOCALS = 5  # recorded where there are neither outputs nor states
 
 Array = np.ndarray
@@ -283,7 +284,7 @@ def simulation(path: Path, interface: str, told: Told) -> None:
     truth = peer.run(plan)
     fresh = gaps(truth, peer.run(plan), ranges(truth))
     told({"fmpy_seconds": time.perf_counter() - begin, "outputs": len(peer.names), "inputs": len(peer.inputs)})
-    other = peer.run(plan, tolerance=10 * FINE) if interface == "model-exchange" else peer.run(plan, divide=2)
+    other = peer.run(plan, **_other(interface))
     scale = ranges(truth[rows])
     own = gaps(other[rows], truth[rows], scale)
     # An output that differs between two fresh instances (a clock, a counter of runs) has no right value.
@@ -317,7 +318,7 @@ def uneven(path: Path, interface: str, told: Told) -> None:
     truth = peer.run(plan)
     scale = ranges(truth[rows])
     fresh = gaps(peer.run(plan), truth, ranges(truth)) <= 1e-12
-    other = peer.run(plan, tolerance=10 * FINE) if interface == "model-exchange" else peer.run(plan, divide=2)
+    other = peer.run(plan, **_other(interface))
     own = both_gaps(other[rows], truth[rows], scale)
     told({"stage": "load"})
     model = ours(path, interface)
@@ -328,6 +329,49 @@ def uneven(path: Path, interface: str, told: Told) -> None:
     told({"reached": float(reached.mean()), **beyond(peer.names, off, own), "stage": "done"})
     model.host.close()
     peer.close()
+
+
+def values(path: Path, interface: str, told: Told) -> None:
+    """Runs with one parameter 10 % off, first to last, against FMPy's own: what is set has to reach the model."""
+    told({"stage": "fmpy"})
+    peer = Peer(path, interface)
+    plan = peer.plan()
+    rows = peer.compared(plan)
+    there: dict[str, tuple[float, Array, Array]] = {}
+    refused = []
+    plain = peer.run(plan)
+    for v in peer.parameters:
+        if peer.start(v) == 0.0 or len(there) == MOST_VALUES:
+            continue
+        value = 1.1 * peer.start(v)
+        try:
+            y = peer.run(plan, {v.name: value})
+            other = peer.run(plan, {v.name: value}, **_other(interface))
+        except Exception as e:  # FMPy's: a value that the FMU refuses
+            refused.append(f"{v.name}: {e}")
+            continue
+        if gaps(y, plain, ranges(plain)).max(initial=0.0) > CHANGED:
+            there[v.name] = (value, y, other)
+    if not there:
+        told({"not_applicable": "no parameter moves an output", "refused": refused, "stage": "done"})
+        return
+    told({"stage": "load", "parameters": list(there)})
+    model = ours(path, interface)
+    told({"stage": "run"})
+    found: list[dict[str, Any]] = []
+    for name, (value, y, other) in there.items():
+        scale = ranges(y[rows])
+        off = gaps(run_ours(model, plan, peer.names, {name: value})[rows], y[rows], scale)
+        gap = beyond(peer.names, off, gaps(other[rows], y[rows], scale))
+        found.append({**gap, "output": f"{gap['output']} with {name}", "beyond": f"{gap['beyond']} with {name}"})
+    told({**max(found, key=lambda f: float(f["beyond_gap"])), "stage": "done"})
+    model.host.close()
+    peer.close()
+
+
+def _other(interface: str) -> dict[str, Any]:
+    """Another tolerance or step, by which FMPy differs from itself."""
+    return {"tolerance": 10 * FINE} if interface == "model-exchange" else {"divide": 2}
 
 
 def second(path: Path, interface: str, told: Told) -> None:

@@ -34,6 +34,7 @@ from typing import Any
 LIMITS = {
     "simulation": 150.0,
     "uneven": 150.0,
+    "values": 150.0,
     "second": 150.0,
     "speed": 150.0,
     "fit": 600.0,
@@ -149,9 +150,9 @@ def judged(f: Mapping[str, Any]) -> dict[str, Any]:
     if "error" in f:
         kind = "refused" if f.get("told") and f["stage"] == "load" else "failed" if f.get("told") else "crash"
         return {"verdict": "timeout" if "no end after" in f["error"] else kind, "fmpy": True}
-    return {"verdict": {
-        "simulation": _simulation, "uneven": _simulation, "second": _second, "speed": _speed, **dict.fromkeys(("fit", *DIAGNOSE), _told)
-    }[f["part"]](f), "fmpy": True}  # fmt: skip
+    near = dict.fromkeys(("simulation", "uneven", "values"), _simulation)
+    judge = {**near, "second": _second, "speed": _speed, **dict.fromkeys(("fit", *DIAGNOSE), _told)}[f["part"]]
+    return {"verdict": judge(f), "fmpy": True}
 
 
 def _simulation(f: Mapping[str, Any]) -> str:
@@ -180,7 +181,7 @@ def shown(f: Mapping[str, Any]) -> str:
     verdict = f["verdict"]
     if verdict == "explained":
         return f"{f['beyond_gap']:.0e} (self {f['beyond_self']:.0e})"
-    if f["part"] in ("simulation", "uneven", "second") and "largest" in f and "error" not in f:
+    if f["part"] in ("simulation", "uneven", "values", "second") and "largest" in f and "error" not in f:
         return f"{f['largest']:.0e}" + ("" if verdict in GOOD else f" {verdict}")
     if f["part"] == "speed" and "ratio" in f:
         return f"{f['ratio']:.2f}" + ("" if verdict in GOOD else " slow")
@@ -191,7 +192,7 @@ def why(f: Mapping[str, Any]) -> str:
     """What misses, in one line."""
     if "error" in f:
         return str(f["error"])
-    if f["part"] in ("simulation", "uneven"):
+    if f["part"] in ("simulation", "uneven", "values"):
         at = f" ('{f['output']}' by {f['largest']:.2g} at {f['at']:.6g} s)" if "at" in f else ""
         return f"'{f['beyond']}' is off by {f['beyond_gap']:.2g} of its range, FMPy from itself by {f['beyond_self']:.2g}{at}"
     if f["part"] == "second":

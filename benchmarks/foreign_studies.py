@@ -209,7 +209,7 @@ def asked(study: Path, verb: str, told: Told) -> dict[str, Any] | None:
     )
     told({"code": done.returncode, "seconds": time.perf_counter() - begin})
     said = [line for line in done.stderr.strip().splitlines() if line.strip()]
-    crashed = "Traceback" in done.stderr or done.returncode not in (0, 1, 2)
+    crashed = "Traceback" in done.stderr or "a bug in hvdc-ident" in done.stderr or done.returncode not in (0, 1, 2)
     if done.stdout.strip():
         found: dict[str, Any] = json.loads(done.stdout)
         if not crashed and done.returncode == 0:
@@ -234,7 +234,7 @@ def fit(path: Path, interface: str, told: Told) -> None:
     record = recorded(peer, inputs, {planted.name: truth})
     told({"stage": "run", "parameter": planted.name, "truth": truth})
     with tempfile.TemporaryDirectory() as folder:
-        study = write_study(Path(folder), peer, [record], scale, [planted], "[fit]\nstarts = 1")
+        study = write_study(Path(folder), peer, [record], scale, [planted], "[fit]")
         found = asked(study, "fit", told)
     if found is None:
         return
@@ -245,8 +245,11 @@ def fit(path: Path, interface: str, told: Told) -> None:
         return
     low, high = estimate["ci95"] or (None, None)
     inside = low is not None and high is not None and low <= truth <= high
-    off = (estimate["value"] - truth) / (0.25 * (high - low)) if low is not None and high is not None else None
+    wide = high - low if low is not None and high is not None else 0.0
+    off = (estimate["value"] - truth) / (0.25 * wide) if wide > 0.0 else None
     detail = f"{planted.name} = {estimate['value']:.8g}, true {truth:.8g}, 95 % {estimate['ci95']}, {found['status']}"
+    judged = (found["adequacy"] or {}).get("text")
+    detail += f"; {judged}" if judged and not inside else ""
     told({"outcome": "ok" if inside else "outside", "sigmas": off, "detail": detail, "stage": "done"})
 
 
