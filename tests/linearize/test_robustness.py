@@ -246,3 +246,29 @@ def test_a_trim_that_several_inputs_could_make_asks_which():
         find_operating_point(link, outputs={"P1": 0.3})
     with pytest.raises(UnknownNameError):
         find_operating_point(link, inputs={"P2": 0.5})
+
+
+@pytest.mark.parametrize(
+    "asked, rule", [(("torque", "w"), "d(w) = 0.4 d(torque)"), (("w", "i", "sum"), "d(sum) = d(w) - d(i)")]
+)
+def test_outputs_that_one_input_moves_together_are_named_with_what_to_leave_out(asked, rule):
+    """At rest b w = torque, whatever the voltage; and `sum` is made of two others that two inputs set freely."""
+    from hvdc_ident import Model
+    from hvdc_ident.errors import SteadyStateError
+
+    motor = Model(
+        name="motor",
+        parameters={"b": 2.5, "k": 0.5, "R": 1.0},
+        inputs={"v": 1.0, "load": 0.0},
+        states={"w": "k*i - b*w - load"},
+        signals={"i": "(v - k*w)/R"},
+        outputs={"w": "w", "i": "i", "torque": "k*i - load", "sum": "w - i"},
+    )
+    with pytest.raises(SteadyStateError) as refused:
+        find_operating_point(motor, outputs=dict.fromkeys(asked, 0.1))
+    message = str(refused.value)
+    assert rule in message.replace("1 d(", "d(") and "cannot all be set" in message
+    assert "leave out " in message and all(name in message.split("leave out ")[1] for name in asked)
+    # What is left can be set.
+    found = find_operating_point(motor, outputs={"w": 0.1, "i": 0.3})
+    assert (found.outputs["w"], found.outputs["i"]) == pytest.approx((0.1, 0.3))
