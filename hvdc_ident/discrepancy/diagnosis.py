@@ -10,7 +10,7 @@ import numpy as np
 from hvdc_ident.discrepancy.findings.ambiguity import separating
 from hvdc_ident.discrepancy.findings.bode import responses
 from hvdc_ident.discrepancy.findings.explain import found_of
-from hvdc_ident.discrepancy.findings.gap import gap, with_given
+from hvdc_ident.discrepancy.findings.gap import at_given, gap
 from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
@@ -148,7 +148,7 @@ def _assembled(
         last = other.refit
         tests = tests_of(search, last)
     augmented = None if last is first else last.model.with_values(_own(last))
-    given = with_given(first, {f.name: f.given for f in free})
+    given = at_given(first, {f.name: f.given for f in free})
     responses_found = responses(model, first, augmented, last)
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
     return Diagnosis(

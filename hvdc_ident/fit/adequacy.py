@@ -16,13 +16,12 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtri
 
-from hvdc_ident.fit.noise import ESTIMATED, FLOOR, GIVEN, MISFIT, from_misfit
+from hvdc_ident.fit.noise import ESTIMATED, FLOOR, GIVEN, MISFIT, from_misfit, scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.weights import MAD
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
-from hvdc_ident.waveform import row_scatter
 
 LEVEL = 1e-3
 """Chance of a verdict against the model or the noise where both are right, over all outputs together."""
@@ -136,7 +135,7 @@ def _size(
         noise: float | None = float(np.sqrt(sum(b.sigma**2 * b.residual.size for b in blocks) / residual.size))
         ratio, behind = _power(problem, residual) / share, problem.noise_dof
     else:
-        scatter = _scatter(problem, output)
+        scatter = scatter_of(problem.fitted_experiments, output)
         if scatter is None:
             return Size(None, 0.0, np.inf, None, white, "not-judged")
         noise, rows = scatter
@@ -166,22 +165,6 @@ def _independent(rows: int, independence: tuple[float, float]) -> float:
 def _quantile(dof: float, behind: float, chance: float) -> float:
     """The F quantile of dof and `behind` degrees of freedom; an infinite number of them is a large one."""
     return float(fdtri(dof, min(behind, 1e9), chance))
-
-
-def _scatter(problem: Problem, output: str) -> tuple[float, float] | None:
-    """The white noise that the rows of an output show by themselves, and how many rows that rests on."""
-    found = []
-    for e in problem.fitted_experiments:
-        if output in e.outputs and e.measured is not None:
-            if e.domain != "time":  # a response is as rough as the plant makes it
-                return None
-            keep = e.compared & np.isfinite(e.measured[output])
-            one = row_scatter(e.time[keep], e.measured[output][keep])
-            if one is None:
-                return None
-            found.append((one, int(keep.sum())))
-    rows = sum(n for _, n in found)
-    return (float(np.sqrt(sum(s * s * n for s, n in found) / rows)), rows) if rows else None
 
 
 def _together(sizes: Mapping[str, Size]) -> Verdict:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.waveform import noise_estimate, noise_floor
+from hvdc_ident.waveform import noise_estimate, noise_floor, row_scatter
 
 FLOOR = 1e-6
 """No standard deviation is below this share of an output's range."""
@@ -64,6 +64,26 @@ def _moves_before(experiments: Sequence[Experiment], output: str) -> bool:
             if noise_estimate(e.time[keep], v[keep], e.event) > noise_floor(v[np.isfinite(v)]):
                 return True
     return False
+
+
+def scatter_of(experiments: Sequence[Experiment], output: str) -> tuple[float, int] | None:
+    """Return the white noise that an output's compared rows show from one to the next, and the number of rows behind it.
+
+    In the output's unit, over all its records, each by its rows; None where one of them does not show it (`row_scatter`), or
+    is a frequency response, which is as rough as the plant makes it.
+    """
+    found = []
+    for e in experiments:
+        if output in e.outputs and e.measured is not None:
+            if e.domain != "time":
+                return None
+            keep = e.compared & np.isfinite(e.measured[output])
+            one = row_scatter(e.time[keep], e.measured[output][keep])
+            if one is None:
+                return None
+            found.append((one, int(keep.sum())))
+    rows = sum(n for _, n in found)
+    return (float(np.sqrt(sum(s * s * n for s, n in found) / rows)), rows) if rows else None
 
 
 def source_text(experiments: Sequence[Experiment], output: str, floor: bool) -> str:

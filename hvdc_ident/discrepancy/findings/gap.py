@@ -52,10 +52,7 @@ def _held(refit: Refit) -> float | None:
     return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks])))) if blocks else None
 
 
-def with_given(refitted: Refit, given: Mapping[str, float]) -> Refit:
-    """The nominal model at the given gains, nuisances as they were found."""
-    theta = refitted.theta.copy()
-    for k, f in enumerate(refitted.problem.free):
-        theta[k] = given.get(f.name, theta[k])
+def at_given(refitted: Refit, given: Mapping[str, float]) -> Refit:
+    """The nominal model at the given values, nuisances as they were found. given: of all candidates, held ones too."""
     held = refitted.problem.held | {n: v for n, v in given.items() if n in refitted.problem.held}
-    return replace(refitted, problem=replace(refitted.problem, held=held), theta=theta)
+    return replace(refitted, problem=replace(refitted.problem, held=held), theta=refitted.theta_at_given)

@@ -14,13 +14,14 @@ import numpy as np
 from hvdc_ident.discrepancy.noise.colour import TANH, Colour, Likelihood, likelihood, together, without_common
 from hvdc_ident.errors import StudyError
 from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit.noise import scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.whitening import AR, autoregression, segments
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
-from hvdc_ident.waveform import event_time, noise_floor, row_scatter
+from hvdc_ident.waveform import event_time, noise_floor
 
 FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
@@ -128,6 +129,7 @@ def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
     scale = max((float(np.abs(r).max()) for r in whole if r.size), default=1.0)
     std = float(np.sqrt(power / max(rows - 2 * len(records), 1))) if rows else 0.0
     moves = std > 1e-12 * scale and (given is None or std >= 1e-3 * given) and (given is not None or std > floor)
+    scatter = scatter_of(experiments, output)
     longer = autoregression(records) if moves and even and rows >= LONG * len(records) else ()
     return Quiet(
         records,
@@ -137,17 +139,10 @@ def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
         step,
         rounded,
         floor,
-        _scatter(experiments, output),
+        scatter[0] if scatter else None,
         longer if len(longer) > 1 else (),
         even,
     )
-
-
-def _scatter(experiments: Sequence[Experiment], output: str) -> float | None:
-    """The white noise from row to row over all records of an output; None where one of them does not show it."""
-    found = [row_scatter(e.time, e.measured[output]) for e in experiments if e.measured is not None]
-    known = [s for s in found if s is not None]
-    return float(np.sqrt(np.mean(np.square(known)))) if known and len(known) == len(found) else None
 
 
 def _colours(quiet: Mapping[str, Quiet], short: Mapping[str, Likelihood]) -> dict[str, Colour]:

@@ -91,6 +91,19 @@ class Refit:
         rho = min(max(self.correlation, 0.0), 0.999)
         return max(self.rows * (1.0 - rho) / (1.0 + rho), 4.0)
 
+    @property
+    def gains(self) -> list[int]:
+        """The places in theta of the nominal model's own free parameters."""
+        added = {n for p in self.placed for n in p.names.values()}
+        return [k for k, f in enumerate(self.problem.free) if f.name not in added]
+
+    @property
+    def theta_at_given(self) -> Array:
+        """(p,) theta with the gains at their given values, which may lie outside their bounds; the rest as it is."""
+        theta = self.theta.copy()
+        theta[self.gains] = [self.problem.free[k].given for k in self.gains]
+        return theta
+
     def sizes(self, placed: Placed) -> dict[str, float]:
         """The effect's own parameters at the optimum."""
         at = self.values

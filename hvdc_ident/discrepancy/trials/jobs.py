@@ -69,12 +69,10 @@ def _begin(before: Refit, theta: Array, sizes: Array) -> Array:
 
 def as_given(refit: Refit) -> Array | None:
     """The unknowns with the gains at their given values, as near as the bounds let; None where none of them has moved far."""
-    added_here = {n for p in refit.placed for n in p.names.values()}
-    gains = [k for k, f in enumerate(refit.problem.free) if f.name not in added_here]
-    theta, far = refit.theta.copy(), False
-    for k in gains:
-        f = refit.problem.free[k]
-        far = far or abs(theta[k] - f.given) > BIASED * abs(f.given) or f.on_bound(theta[k])
+    theta, far = refit.theta_at_given, False
+    for k in refit.gains:
+        f, value = refit.problem.free[k], refit.theta[k]
+        far = far or abs(value - f.given) > BIASED * abs(f.given) or f.on_bound(value)
         theta[k] = min(max(f.given, f.min), f.max)
     return theta if far else None
 
