@@ -18,6 +18,14 @@ def quantity(value: float, unit: str = "", digits: int = 4) -> str:
     return f"{value:.{digits}g} {unit}".rstrip()
 
 
+def duration(seconds: float) -> str:
+    """A time that somebody waits, in s, min or h: two figures."""
+    for above, unit in ((3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * above:
+            return f"{seconds / above:.2g} {unit}"
+    return f"{seconds:.2g} s" if seconds < 100.0 else f"{seconds:.0f} s"
+
+
 def span(low: float, high: float, unit: str = "", digits: int = 4) -> str:
     """Two ends with one unit, that of the upper one."""
     for below, factor, smaller in _SMALLER:

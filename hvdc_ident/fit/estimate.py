@@ -137,12 +137,15 @@ def _run_all(
 ) -> list[OptimiserResult]:
     """The optimiser's outcome from each start, in the starts' order, whatever runs them."""
     jobs: Iterator[OptimiserResult] = mapped(executor, partial(method.run, problem), begins)
-    runs = []
+    runs: list[OptimiserResult] = []
+    if progress:
+        progress(0, len(begins), f"search for the optimum, start 1 of {len(begins)}")
     for run in jobs:
         runs.append(run)
         if progress:
-            cost = "-" if run.cost is None else f"{run.cost:.6g}"
-            progress(len(runs), len(begins), f"start {len(runs)}: {run.status}, cost {cost}")
+            cost = "no cost" if run.cost is None else f"cost {run.cost:.6g}"
+            told = f"start {len(runs)} {run.status} after {run.evaluations} evaluations, {cost}"
+            progress(len(runs), len(begins), f"search for the optimum, {told}")
     return runs
 
 

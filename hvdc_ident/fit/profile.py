@@ -188,12 +188,15 @@ def _walked(walkers: Mapping[Asked, Walker], take: _Taken, progress: Progress | 
 
     for asked in walks:
         go_on(asked, None)
+    taken = 0
     while waiting:
-        if progress:
-            progress(len(sides), len(walks), f"profile of {next(iter(waiting))[0]}")
         steps, waiting = waiting, {}
-        for asked, end in zip(steps, take(list(steps.values())), strict=True):
-            go_on(asked, end)
+        ends = take(list(steps.values()))
+        for asked in steps:
+            if progress:
+                taken += 1
+                progress(len(sides), len(walks), f"profile of {asked[0]}, step {taken} of all profiles together")
+            go_on(asked, next(ends))
     return sides
 
 

@@ -20,6 +20,8 @@ from hvdc_ident.study.store import exclusive, source_hash
 from hvdc_ident.study.study import Study
 
 SCHEMA = 1
+FIRST = "first-answer"
+"""Status of a result that an interrupted stage left: it stands under `first`, and the stage has not come to its end."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,14 @@ def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options, re
 
 def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any], rest: Rest) -> Done:
     levels = rest()
+
+    def keep(first: Mapping[str, Any]) -> None:
+        """Write a first answer, marked as such, unless the folder holds the whole one from before."""
+        if _kept(study, wanted, folder, options) is None:
+            _written(study, wanted, folder, options, Outcome({"status": FIRST, **first}, failed=FIRST), levels)
+
     try:
-        outcome = wanted.run(study, replace(options, folder=folder), earlier)
+        outcome = wanted.run(study, replace(options, folder=folder, keep=keep), earlier)
     except ComputationError as error:
         outcome = _failed(error)
     return _written(study, wanted, folder, options, outcome, levels)

@@ -65,6 +65,9 @@ class _Bar:
             TimeRemainingColumn(),
             TextColumn("{task.description}", markup=False),
         )
-        self._bar = Progress(*columns, console=Console(file=sys.stderr), transient=True)
+        # What is told meanwhile goes above the bar on a terminal; elsewhere stdout stays what it is.
+        shared = sys.stdout.isatty()
+        console = Console(file=sys.stderr)
+        self._bar = Progress(*columns, console=console, transient=True, redirect_stdout=shared)
         self._task = self._bar.add_task("", total=None)
         self._bar.start()

@@ -27,6 +27,10 @@ def silent(done: int, total: int, text: str) -> None:
     """Nothing: progress that nobody watches."""
 
 
+def unkept(data: Mapping[str, Any]) -> None:
+    """Drop a first answer, where nothing is written."""
+
+
 def unheard(lines: Sequence[str]) -> None:
     """Drop lines that nobody reads."""
 
@@ -35,7 +39,8 @@ def unheard(lines: Sequence[str]) -> None:
 class Options:
     """How stages run. workers: processes; seed: of every random number; progress: who is told.
 
-    announce: who is told, in lines, what to know before the work begins.
+    announce: who is told, in lines, what to know before the work begins, or while a long one goes on.
+    keep: who writes a first answer, so that it stands where the work is interrupted; the stage runner sets it.
     force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
     None: nothing is kept. executor: where the work is done, "" for this machine.
     """
@@ -47,6 +52,7 @@ class Options:
     folder: Path | None = None
     executor: str = ""
     announce: Callable[[Sequence[str]], None] = unheard
+    keep: Callable[[Mapping[str, Any]], None] = unkept
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ SHOWN = 5e-4
 def _render(results: Results) -> str:
     found = results.get("identifiability")
     parameters = found.get("parameters") or {}
+    if found.get("first"):
+        return _first(found, found["first"])
     if not parameters:
         return ""
     parts = [
@@ -30,6 +32,23 @@ def _render(results: Results) -> str:
     ]
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
     return "".join(parts) + notes
+
+
+def _first(found: dict[str, Any], first: dict[str, Any]) -> str:
+    """The first answer of a stage that was interrupted."""
+    rows = [
+        [
+            f"<strong>{text(n)}</strong>",
+            number(p["value"]),
+            number(p["std"], 2),
+            text(p["unit"]),
+            text(listed(p["conditional_on"])),
+        ]
+        for n, p in first["parameters"].items()
+    ]
+    said = "".join(f"<p>{text(_capital(words))}.</p>" for words in first["combinations"])
+    header = ["parameter", "given", "std at first order", "unit", "with held"]
+    return f"<p><strong>{text(_capital(found['message']))}.</strong></p>{said}" + table(header, rows, words=(0, 3, 4))
 
 
 def _lead(found: dict[str, Any]) -> str:
