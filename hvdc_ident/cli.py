@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import functools
 import os
+import signal
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -45,6 +47,16 @@ Where = Annotated[
 ]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, max=2**31 - 1, help="Seed of every random number.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")]
+Budget = Annotated[
+    float | None,
+    typer.Option(
+        "--budget",
+        metavar="SECONDS",
+        min=0.001,
+        help="Stop after so long; what was finished by then is kept, and the same command goes on.",
+        show_default=False,
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")]
 Trust = Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")]
 Deadline = Annotated[
@@ -73,6 +85,31 @@ class _Failed(Exception):
     """The work ran and failed; what it found is written."""
 
 
+class _BudgetSpent(KeyboardInterrupt):
+    """The time that the work may take is over; it ends as by an interrupt."""
+
+
+@contextmanager
+def _within(budget: float | None) -> Iterator[None]:
+    """Interrupt what is inside after so many seconds. Raises InputError where the system has no such timer."""
+    if budget is None:
+        yield
+        return
+    if not hasattr(signal, "setitimer"):
+        raise InputError("this system has no timer for --budget", hint="leave it out, and interrupt the command")
+
+    def stop(*_: object) -> NoReturn:
+        raise _BudgetSpent(f"the {budget:g} s of --budget are over")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, budget)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
     """The command with every exception turned into one message and an exit code, never a traceback."""
 
@@ -90,6 +127,8 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             end(2 if isinstance(e, InputError) else 1, str(e))
         except _Failed as e:
             end(1, str(e))
+        except _BudgetSpent as e:
+            end(1, f"{e}; what was finished is kept, and the same command goes on from there")
         except KeyboardInterrupt:
             _end(130, "interrupted; what was finished is kept, and the same command goes on from there")
         except BrokenPipeError:
@@ -340,11 +379,12 @@ def _run_one(
     options: Options,
     limits: Mapping[str, float],
     *,
+    budget: float | None,
     json: bool,
     quiet: bool,
     trust: bool,
 ) -> None:
-    """Runs one stage of a study, and those it builds on, and tells how it went."""
+    """Run one stage of a study, and those it builds on, and tell how it went. budget: s, for the work."""
     from dataclasses import replace
 
     from hvdc_ident.study.pipeline import run_stage
@@ -354,7 +394,7 @@ def _run_one(
     loaded = load_study(study, trust, limits)
     folder = out or loaded.folder
     announce = _announcer(json=json, quiet=quiet)
-    with progress(quiet or json) as told:
+    with _within(budget), progress(quiet or json) as told:
         done = run_stage(loaded, stage.name, folder, replace(options, progress=told, announce=announce))
     if json:
         _print_json(done.data)
@@ -376,6 +416,7 @@ def _add_stage(stage: Stage) -> None:
         workers: Workers = 1,
         executor: Where = "",
         seed: Seed = 0,
+        budget: Budget = None,
         json: Json = False,
         quiet: Quiet = False,
         trust: Trust = False,
@@ -385,7 +426,7 @@ def _add_stage(stage: Stage) -> None:
     ) -> None:
         options = Options(workers, seed, executor=executor)
         limits = _limits(deadline, load, memory)
-        _run_one(stage, study, out, options, limits, json=json, quiet=quiet, trust=trust)
+        _run_one(stage, study, out, options, limits, budget=budget, json=json, quiet=quiet, trust=trust)
 
     def forcing(
         study: StudyFile,
@@ -394,6 +435,7 @@ def _add_stage(stage: Stage) -> None:
         workers: Workers = 1,
         executor: Where = "",
         seed: Seed = 0,
+        budget: Budget = None,
         json: Json = False,
         quiet: Quiet = False,
         trust: Trust = False,
@@ -403,7 +445,7 @@ def _add_stage(stage: Stage) -> None:
     ) -> None:
         options = Options(workers, seed, force=tuple(dict.fromkeys(force or ())), executor=executor)
         limits = _limits(deadline, load, memory)
-        _run_one(stage, study, out, options, limits, json=json, quiet=quiet, trust=trust)
+        _run_one(stage, study, out, options, limits, budget=budget, json=json, quiet=quiet, trust=trust)
 
     made = forcing if "force" in stage.takes else command
     made.__doc__ = stage.summary

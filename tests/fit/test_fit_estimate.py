@@ -209,7 +209,7 @@ def test_the_seed_fixes_the_starts_and_an_executor_changes_nothing():
     with ThreadPoolExecutor(2) as pool:
         two = fit(decaying(), seed=4, executor=pool)
     assert one.to_dict() == two.to_dict()
-    assert lines == [(i + 1, 8) for i in range(8)]
+    assert lines == [(i, 8) for i in range(9)]
     assert one.starts[0].start == {"a": 1.0, "k": 1.0}
     assert one.starts[1].start != fit(decaying(), seed=5).starts[1].start
 

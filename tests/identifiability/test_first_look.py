@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,8 @@ def test_an_interrupt_leaves_the_first_answer_marked_as_such_and_never_instead_o
     study = tmp_path / "s.toml"
     study.write_text(STUDY)
 
-    def run(command: str) -> Any:
-        return CliRunner().invoke(app, [command, str(study)])
+    def run(command: str, *options: str) -> Any:
+        return CliRunner().invoke(app, [command, str(study), *options])
 
     def stands() -> dict[str, Any]:
         found: dict[str, Any] = json.loads((tmp_path / "s-results" / "identifiability.json").read_text())
@@ -106,6 +107,10 @@ def test_an_interrupt_leaves_the_first_answer_marked_as_such_and_never_instead_o
         assert left["first"]["parameters"]["T"]["value"] == 0.3 and left["first"]["parameters"]["T"]["std"] > 0.0
         assert run("report").exit_code == 0
         assert "irst answer" in (tmp_path / "s-results" / "report.html").read_text()
+        patch.setattr(identifiability, "identifiability", lambda *_, **__: signal.pause())
+        result = run("identify", "--budget", "1")
+        assert result.exit_code == 1 and "the 1 s of --budget are over" in result.output
+        assert stands() == left
     assert run("identify").exit_code == 0
     whole = stands()
     assert whole["parameters"]["T"]["verdict"] == "identifiable" and "first" not in whole
