@@ -294,16 +294,44 @@ class Binding:
 
     # --- co-simulation ---
 
-    def step(self, t: float, h: float) -> float:
-        """The time reached. Raises RuntimeError where the FMU asks for the end of the run."""
+    def step(self, t: float, h: float) -> tuple[float, float]:
+        """Return the instant from which to go on, and the one that outputs belong to.
+
+        They differ for an FMU of FMI 3.0 whose own steps do not end at t + h: it goes on from there all the same, and
+        early return alone moves the communication point. Raises RuntimeError where the FMU asks for the end of the run.
+        """
         self.progress[NOW] = t
         if self.version == 2:
-            self.fmu.fmi2DoStep(self.component, t, h, 1)
-            return t + h
-        _, end, _, reached = self.fmu.doStep(t, h)
+            try:
+                self.fmu.fmi2DoStep(self.component, t, h, 1)
+            except FMICallException as e:
+                if e.status != DISCARD:
+                    raise
+                reached = self._discarded(t, e)
+                return reached, reached
+            return t + h, t + h
+        _, end, early, reached = self.fmu.doStep(t, h)
         if end:
             raise RuntimeError("the FMU asked for the end of the run")
-        return float(reached)
+        return float(reached) if early else t + h, float(reached)
+
+    def _discarded(self, t: float, discard: FMICallException) -> float:
+        """Return the time that a discarded step of FMI 2.0 reached. Raises the discard where that is not beyond t."""
+        from fmpy.fmi2 import fmi2LastSuccessfulTime, fmi2Terminated
+
+        try:
+            end = self.fmu.getBooleanStatus(fmi2Terminated)
+        except FMICallException:  # the FMU does not say
+            end = False
+        if end:
+            raise RuntimeError("the FMU asked for the end of the run")
+        try:
+            reached = float(self.fmu.getRealStatus(fmi2LastSuccessfulTime))
+        except FMICallException:
+            raise discard from None
+        if not reached > t:
+            raise discard
+        return reached
 
     def set_slopes_of_inputs(self, references: Any, orders: Any, slopes: Vector) -> None:
         """FMI 2.0 only: the time derivatives of inputs over the next step."""

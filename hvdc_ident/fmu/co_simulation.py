@@ -1,75 +1,295 @@
-"""A run of a co-simulation FMU: communication steps from row to row. Runs in the worker alone."""
+"""A run of a co-simulation FMU: communication steps from row to row. Runs in the worker alone.
+
+Reading outputs can harm a run. An FMU may restart its solver at a step only where an input was set to another value
+since it last computed its equations, and reading an output computes them: read between the setting and the step, a jump
+goes by unseen until the solver's own next step, which may be many rows later (FMUs of Dymola do so). Outputs right
+after a jump can be had all the same: once they are read, inputs go back to what the last step had and then to their new
+values, with no reading before the step, which is what the FMU would have seen without the reading. Whether that is
+harmless is tried once for each FMU, against a run that reads right after steps alone, as any importer may.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from ctypes import c_int
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.fmu.binding import Vector
+from hvdc_ident.fmu.binding import DISCARD, ERROR, Failure, Vector
+from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.plant import Plant, RunFailed
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.trajectory import Array
 
 EARLY = 10_000  # early returns in one communication step
+TRIAL = 300  # rows of a trial from the first change of an input on: solvers' own steps may be tens of rows long
+PARTS = 4  # of a communication step, in the trial of held inputs on finer steps
+SAME = 1e-9  # share of an output's range that rounding alone may change in a repeated run
+
+Reading = Literal["restored", "recomputed", "never"]
+READINGS: tuple[Reading, ...] = ("restored", "recomputed", "never")
+"""How a step is prepared after outputs were read with inputs that the last step had not: the inputs of that step are set
+again; they are set again and outputs computed with them; or no such reading is made."""
+Slopes = Literal["followed", "ignored", "needless"]
+"""Whether slopes of inputs are followed; needless: held inputs were as good where it was tried."""
+
+
+@dataclass(frozen=True)
+class Calls:
+    """How an FMU is called.
+
+    reading: see `READINGS`. sloping: moving inputs are set with their slopes; else they are held at their mean over a
+    step. parts: of each step with a moving input. plain: rows are as read right after each step, with its inputs.
+    """
+
+    reading: Reading = "restored"
+    sloping: bool = False
+    parts: int = 1
+    plain: bool = False
+
+    @classmethod
+    def learned(cls, learned: Mapping[str, Any]) -> Calls:
+        """Return the calls that trials have shown to be right, where there were any."""
+        return cls(learned.get("reading", "restored"), learned.get("sloping") == "followed")
 
 
 def run(
-    plant: Plant, values: Mapping[str, float], signals: Signals, time: Array, names: tuple[str, ...], tolerance: float
+    plant: Plant,
+    values: Mapping[str, float],
+    signals: Signals,
+    time: Array,
+    names: tuple[str, ...],
+    tolerance: float,
+    calls: Calls | None = None,
 ) -> Array:
-    """(n, outputs) at the instants. Two equal instants are before and after a jump.
+    """Return the outputs at the instants, shape (n, outputs). Two equal instants are before and after a jump.
 
-    Inputs are held at their mean over a step, or follow their slope where the FMU can, and stand at their own value
-    where outputs are read. Only FMI 2.0 has such slopes: FMI 3.0 gives an input during a step only to FMUs that ask for
-    it by intermediate updates, which are not used here, so a ramp is stairs of the rows' width there. Steps end at every
-    row and every break of an input; an FMU of fixed steps takes its own step (where it states none, the shortest
-    interval), a jump within one enters as the mean over it, and rows between are joined by lines.
+    Inputs follow their slope where the FMU was found to follow it, else they are held at their mean over a step; they
+    stand at their own value where outputs are read. FMI 3.0 gives an input during a step only to FMUs that ask for it by
+    intermediate updates, which are not used here, so a ramp is stairs of the rows' width there. Steps end at every row
+    and every break of an input. An FMU of fixed steps, and one that refuses others, takes its own step (where it states
+    none, the shortest interval): a jump within one enters as the mean over it, and rows between are joined by lines.
+
+    calls: default, those that are learned of the FMU. Raises RunFailed, or what a failing call of FMI raises.
     """
-    stops = _stops(plant, signals, time)
-    plant.begin(values, signals.at(stops[:1], "left")[0], float(time[0]), float(stops[-1]), tolerance)
+    chosen = calls or Calls.learned(plant.learned)
+    even = not plant.description.variable_step or plant.learned.get("steps") == "even"
+    stops = _stops(plant.description, signals, time, even)
+    uneven = not _is_even(stops)
+    try:
+        rows = _go(plant, values, signals, time, stops, names, tolerance, chosen)
+    except Failure as e:
+        retry = uneven and not even and "steps" not in plant.learned
+        if not retry or not e.function.endswith("DoStep") or e.status not in (DISCARD, ERROR):
+            raise
+        plant.abandon()
+        try:
+            stops = _stops(plant.description, signals, time, even=True)
+            rows = _go(plant, values, signals, time, stops, names, tolerance, chosen)
+        except (Failure, RunFailed):
+            raise e from None
+        plant.learned["steps"] = "even"
+        return rows
+    if uneven and not even:
+        plant.learned["steps"] = "any"
+    return rows
+
+
+def find_calls(
+    learned: dict[str, Any],
+    description: Description,
+    signals: Signals,
+    time: Array,
+    tolerance: float,
+    run: Callable[[Calls, Array], Array],
+) -> None:
+    """Learn how the FMU has to be called for this experiment, where that is not known yet, from short runs of it.
+
+    run: called with the calls and the instants, returns outputs, (n, outputs). learned: gets "reading" where inputs
+    change during the run and outputs move, and "sloping" where inputs move and the FMU offers to follow their slopes.
+    """
+    if time[0] == time[-1]:
+        return
+    stops = _stops(description, signals, time, even=False)
     before, after = signals.at(stops, "left"), signals.at(stops, "right")
+    moves = (after[:-1] != before[1:]).any(axis=1)
+    changes = moves | (before[:-1] != after[:-1]).any(axis=1)  # a jump at the end is followed by no step
+    sloping = "sloping" not in learned and _offers_slopes(description) and bool(moves.any())
+    reading = "reading" not in learned and bool(changes.any())
+    if not (sloping or reading):
+        return
+    last = int(np.searchsorted(time, stops[np.argmax(changes)], side="right")) + TRIAL
+    span, allowed = time[:last], max(tolerance, SAME)
+    if reading:
+        found = _harmless_reading(span, allowed, run)
+        if found is not None:
+            learned["reading"] = found
+    if sloping:
+        held = Calls(learned.get("reading", "restored"))
+        learned["sloping"] = _tried_slopes(span, allowed, held, run)
+
+
+def notes(learned: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a user has to know of how the FMU was called, by subject."""
+    found = {}
+    if learned.get("reading") == "never":
+        found["outputs at jumps"] = (
+            "the FMU loses jumps of its inputs where outputs are read right after them: rows at jumps are before them"
+        )
+    if learned.get("sloping") == "ignored":
+        found["ramps of inputs"] = (
+            "the FMU offers to take slopes of its inputs, but was further off with them than with inputs held at their "
+            "mean over each step: they are held"
+        )
+    if learned.get("steps") == "even":
+        found["steps"] = (
+            "the FMU refuses steps of different lengths: it took even ones, rows between are joined by lines"
+        )
+    if learned.get("behind", 0.0) > 0.0:
+        found["internal steps"] = (
+            f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "
+            f"{learned['behind']:.3g} s earlier"
+        )
+    return found
+
+
+# --- trials ---
+
+
+def _offers_slopes(d: Description) -> bool:
+    return d.interpolates and d.variable_step and bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
+
+
+def _harmless_reading(time: Array, allowed: float, run: Callable[[Calls, Array], Array]) -> Reading | None:
+    """Return the first way to read outputs after a change that leaves the run as it is; None where nothing moves."""
+    undisturbed = run(Calls("never", plain=True), time)
+    size = np.nan_to_num(np.ptp(undisturbed, axis=0))
+    if not (size > SAME * np.nan_to_num(np.abs(undisturbed)).max(axis=0, initial=0.0)).any():
+        return None
+    steady: NDArray[np.bool_] = np.ones(size.size, dtype=bool)
+    for attempt in range(2):
+        for reading in READINGS[:-1]:
+            try:
+                read = run(Calls(reading, plain=True), time)
+            except (Failure, RunFailed):
+                continue
+            if (_apart(read, undisturbed) <= allowed * size)[steady].all():
+                return reading
+        if attempt == 0:  # an output such as the time that the computation took is never repeated, and does not judge
+            steady = _apart(run(Calls("never", plain=True), time), undisturbed) <= allowed * size
+            if not steady.any():
+                return None
+            if steady.all():
+                break
+    return "never"
+
+
+def _tried_slopes(time: Array, allowed: float, held: Calls, run: Callable[[Calls, Array], Array]) -> Slopes:
+    """Return whether slopes of inputs give outputs as near to those of held inputs on finer steps as held inputs do.
+
+    Held at their mean over a step, inputs are off by the square of its length: with PARTS as many steps the error left
+    is a small part of that, and slopes that are followed are nearer still. Slopes that are not are off by the length
+    itself. A factor of 2 leaves room for the solver's noise.
+    """
+    finer, coarse = run(replace(held, parts=PARTS), time), run(held, time)
+    off, allowance = _apart(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
+    try:
+        sloped = _apart(run(replace(held, sloping=True), time), finer)
+    except (Failure, RunFailed):
+        return "ignored"
+    if (sloped > 2.0 * off + allowance).any():
+        return "ignored"
+    return "followed" if (off > allowance).any() else "needless"
+
+
+def _apart(run: Array, other: Array) -> Array:
+    """(outputs,) the largest difference over rows; infinite where only one of them is not a number."""
+    apart = np.abs(run - other)
+    apart[np.isnan(run) & np.isnan(other)] = 0.0
+    return np.nan_to_num(apart, nan=np.inf).max(axis=0, initial=0.0)
+
+
+# --- one run ---
+
+
+def _go(
+    plant: Plant,
+    values: Mapping[str, float],
+    signals: Signals,
+    time: Array,
+    stops: Array,
+    names: tuple[str, ...],
+    tolerance: float,
+    calls: Calls,
+) -> Array:
+    before, after = signals.at(stops, "left"), signals.at(stops, "right")
+    plant.begin(values, before[0], float(time[0]), float(stops[-1]), tolerance)
     seen = plant.block(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
-    stepper = _Stepper(plant)
-    jumps = (before != after).any(axis=1).tolist()
-    moves = [False, *(before[1:] != after[:-1]).any(axis=1).tolist()]
-    instants = stops.tolist()
-    for k, t in enumerate(instants):
+    stepper = _Stepper(plant, calls, before[0], seen.get)
+    shows = calls.reading != "never"
+    for k, t in enumerate(stops.tolist()):
         if k:
-            stepper.step(instants[k - 1], t, after[k - 1], before[k], moves[k])
-        if k == 0 or moves[k]:
-            stepper.hold(before[k])
-        left[k] = seen.get()
-        if jumps[k]:
-            stepper.hold(after[k])
-            right[k] = seen.get()
-        else:
-            right[k] = left[k]
+            stepper.step(float(stops[k - 1]), t, after[k - 1], before[k])
+        plain = calls.plain or not shows or stepper.stands_at(before[k])
+        left[k] = right[k] = seen.get() if plain else stepper.show(before[k])
+        if calls.plain and shows and not stepper.stands_at(before[k]):
+            stepper.show(before[k])
+        if shows and (before[k] != after[k]).any():
+            shown = stepper.show(after[k])
+            if not calls.plain:
+                right[k] = shown
+    if stepper.behind > plant.learned.get("behind", 0.0):
+        plant.learned["behind"] = stepper.behind
     return _rows(time, stops, left, right)
 
 
-def _stops(plant: Plant, signals: Signals, time: Array) -> Array:
-    """Where communication steps end."""
+def _is_even(stops: Array) -> bool:
+    gaps = np.diff(stops)
+    return gaps.size < 2 or bool(np.allclose(gaps, gaps[0], rtol=1e-9, atol=0.0))
+
+
+def _stops(description: Description, signals: Signals, time: Array, even: bool) -> Array:
+    """Return the instants at which communication steps end. even: whether they have to be of one length."""
     begin, end = float(time[0]), float(time[-1])
-    wanted = np.unique(np.concatenate([time, signals.breaks[(signals.breaks > begin) & (signals.breaks < end)]]))
-    if plant.description.variable_step or wanted.size < 2:
+    breaks = signals.breaks[(signals.breaks > begin) & (signals.breaks < end)]
+    rows = np.unique(time)
+    rows[1:-1] = _moved_to(rows[1:-1], breaks, _rounding(time))
+    wanted = np.unique(np.concatenate([rows, breaks[breaks < end - _rounding(time)]]))
+    if not even or wanted.size < 2:
         return wanted
     gaps = np.diff(wanted)
-    even = bool(np.allclose(gaps, gaps[0], rtol=1e-9, atol=0.0))
-    step = plant.description.step or float(gaps.min())
-    if even and (plant.description.step is None or np.isclose(gaps[0], step, rtol=1e-9)):
+    step = description.step or float(gaps.min())
+    if _is_even(wanted) and (description.step is None or np.isclose(gaps[0], step, rtol=1e-9)):
         return wanted
     count = int(np.ceil((end - begin) / step - 1e-9))
-    grid = begin + step * np.arange(count + 1)
+    grid: Array = begin + step * np.arange(count + 1, dtype=float)
     # A row or jump that rounding alone keeps off a step's end is at it: a jump just before it would be averaged away.
-    near = wanted[np.clip(np.searchsorted(wanted, grid - 1e-6 * step), 0, wanted.size - 1)]
-    return np.asarray(np.where(np.abs(near - grid) <= 1e-6 * step, near, grid), dtype=float)
+    return _moved_to(grid, wanted, 1e-6 * step)
+
+
+def _moved_to(instants: Array, places: Array, near: float) -> Array:
+    """Return the instants, those that have one of the places, in order, so near by at it."""
+    if not places.size:
+        return instants
+    found = places[np.clip(np.searchsorted(places, instants - near), 0, places.size - 1)]
+    return np.asarray(np.where(np.abs(found - instants) <= near, found, instants), dtype=float)
+
+
+def _rounding(time: Array) -> float:
+    """Return by how much instants may differ that are meant to be the same: a few last digits of the largest."""
+    return 8.0 * float(np.spacing(np.abs(time[[0, -1]]).max()))
 
 
 def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
-    """The values at the rows; of two equal instants the first has what was before the jump."""
-    place = np.searchsorted(stops, time)
-    if place.max(initial=0) < stops.size and (stops[np.minimum(place, stops.size - 1)] == time).all():
+    """Return the values at the rows; of two equal instants the first has what was before the jump."""
+    at = _moved_to(time, stops, _rounding(time))
+    place = np.minimum(np.searchsorted(stops, at), stops.size - 1)
+    if (stops[place] == at).all():
         twice = np.zeros(time.size, dtype=bool)
         twice[:-1] = time[:-1] == time[1:]
         return np.where(twice[:, None], left[place], right[place])
@@ -77,44 +297,74 @@ def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
 
 
 class _Stepper:
-    """The steps of one run."""
+    """The steps of one run. behind: by how much the outputs of a step were older than its end at most, s."""
 
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
-        self.sloping = False
-        d = plant.description
-        self.follows = d.interpolates and bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
-        if self.follows:
-            self.references = plant.binding.references([v.reference for v in d.inputs.values()])
-            self.orders = self._ones(len(d.inputs))
-            self.slopes = Vector(len(d.inputs))
+    def __init__(self, plant: Plant, calls: Calls, inputs: Array, compute: Callable[[], Array]) -> None:
+        self.plant, self.calls, self.compute = plant, calls, compute
+        self.behind = 0.0
+        self._stepped = np.array(inputs)  # inputs at the end of the last step
+        self._now = np.array(inputs)
+        self._shown = False  # whether others were set since
+        self._sloping = False
+        if calls.sloping:
+            inputs_ = plant.description.inputs.values()
+            self._references = plant.binding.references([v.reference for v in inputs_])
+            self._orders = (c_int * len(inputs_))(*([1] * len(inputs_)))
+            self._slopes = Vector(len(inputs_))
 
-    @staticmethod
-    def _ones(count: int) -> object:
-        from ctypes import c_int
+    def stands_at(self, u: Array) -> bool:
+        """Return whether the FMU has these inputs."""
+        return bool((self._now == u).all())
 
-        return (c_int * count)(*([1] * count))
+    def show(self, u: Array) -> Array:
+        """Return the outputs with these inputs."""
+        self._set(u)
+        self._shown = True
+        return self.compute()
 
-    def hold(self, u: Array) -> None:
-        """Nothing; the inputs stand at u."""
+    def _set(self, u: Array) -> None:
         self.plant.inputs.set(u)
+        self._now[:] = u
 
-    def step(self, a: float, b: float, first: Array, last: Array, moves: bool) -> None:
-        """Nothing; the FMU is at b, its inputs having gone from `first` to `last`; moves: whether these differ."""
-        if self.follows and (moves or self.sloping):
-            self.hold(first)
-            self.slopes.values[:] = (last - first) / (b - a)
-            self.plant.binding.set_slopes_of_inputs(self.references, self.orders, self.slopes)
-            self.sloping = moves
-        elif moves:
-            self.hold(0.5 * (first + last))
+    def step(self, a: float, b: float, first: Array, last: Array) -> None:
+        """Bring the FMU from a to b while its inputs go from `first` to `last`."""
+        moves = bool((first != last).any())
+        if self._shown:
+            self._set(self._stepped)
+            if self.calls.reading == "recomputed":
+                self.compute()
+            self._shown = False
+        if moves and not self.calls.sloping:
+            for x, y in pairwise(np.linspace(0.0, 1.0, self.calls.parts + 1).tolist()):
+                self._apply(first + 0.5 * (x + y) * (last - first))
+                self._advance(a + x * (b - a), b if y == 1.0 else a + y * (b - a))
+            return
+        self._apply(first)
+        if moves or self._sloping:
+            self._slopes.values[:] = (last - first) / (b - a)
+            self.plant.binding.set_slopes_of_inputs(self._references, self._orders, self._slopes)
+            self._sloping = moves
+        self._advance(a, b)
+        self._stepped[:] = last
+        self._now[:] = np.nan  # an FMU may have moved its inputs along the slopes, or not
+
+    def _apply(self, u: Array) -> None:
+        """Have the inputs stand at u in the next step."""
+        if not self.stands_at(u):
+            self._set(u)
+        self._stepped[:] = u
+
+    def _advance(self, a: float, b: float) -> None:
         t = a
         for _ in range(EARLY):
             try:
-                reached = self.plant.binding.step(t, b - t)
+                reached, computed = self.plant.binding.step(t, b - t)
             except RuntimeError as e:
                 raise RunFailed(str(e), t) from None
             if reached >= b - 1e-12 * max(abs(b), 1.0):
+                behind = b - computed
+                if behind > 1e-9 * max(abs(b), b - a):
+                    self.behind = max(self.behind, behind)
                 return
             t = reached
         raise RunFailed(f"the FMU returned early {EARLY} times in one step", t)

@@ -140,6 +140,8 @@ class _Simulation:
             self._find_restart()
         if REPEATED[self.learned["restart"]]:
             self.notes["restart"] = REPEATED[self.learned["restart"]]
+        if self.description.interface == "co-simulation":
+            self._find_calls()
         gradients = np.zeros((self.time.size, len(self.names), len(self.parameters)))
         errors = np.zeros(len(self.parameters))
         smooth = self._trusted()
@@ -161,6 +163,8 @@ class _Simulation:
             self.notes["sensitivities"] = "; ".join(
                 f"{way}: {', '.join(n for n in ways if ways[n] == way)}" for way in dict.fromkeys(ways.values())
             )
+        if self.description.interface == "co-simulation":
+            self.notes |= co_simulation.notes(self.learned)
         c = self.counts
         counts = [c.accepted, c.events, c.evaluations, c.segments]
         return {"notes": self.notes, "counts": counts}, {"outputs": outputs, "gradients": gradients, "errors": errors}
@@ -191,6 +195,26 @@ class _Simulation:
         except RunFailed:
             return way
 
+    def _find_calls(self) -> None:
+        """Learn how a co-simulation FMU has to be called, where this experiment can show it."""
+        names = tuple(dict.fromkeys([*self.names, *self.description.outputs]))
+
+        def run(calls: co_simulation.Calls, time: Array) -> Array:
+            self.jobs.tell()
+
+            def rows(plant: Plant) -> Array:
+                return co_simulation.run(plant, self.values, self.signals, time, names, self.tolerance, calls)
+
+            if self.jobs.isolated:
+                return self._in_its_own_process(rows, exchange.Counts())
+            self.jobs.runs += 1
+            try:
+                return rows(self.jobs.plant)
+            except (Failure, RunFailed) as e:
+                raise self.jobs.failed(e) from None
+
+        co_simulation.find_calls(self.learned, self.description, self.signals, self.time, self.tolerance, run)
+
     # --- runs ---
 
     def _now(self, name: str) -> float:
@@ -213,7 +237,7 @@ class _Simulation:
             return self.jobs.last[1]
         counts = self.counts if own else exchange.Counts()
         if self.jobs.isolated:
-            outputs = self._in_its_own_process(values, moved, counts)
+            outputs = self._in_its_own_process(lambda p: self._rows(p, values, moved, self.names, counts), counts)
         else:
             outputs = self._rows(self.jobs.plant, values, moved, self.names, counts)
         bad = ~np.isfinite(outputs).all(axis=0)
@@ -227,12 +251,12 @@ class _Simulation:
             self.jobs.last = (key, outputs)
         return outputs
 
-    def _in_its_own_process(self, values: Mapping[str, float], signals: Signals, counts: exchange.Counts) -> Array:
+    def _in_its_own_process(self, run: Callable[[Plant], Array], counts: exchange.Counts) -> Array:
         """(n, outputs) of a run in a process made for it; what it finds out of the FMU is kept."""
 
         def work() -> Answer:
             plant = self.jobs.make({k: v for k, v in self.learned.items() if k != "restart"})
-            rows = self._rows(plant, values, signals, self.names, counts)
+            rows = run(plant)
             return {"learned": plant.learned, "counts": asdict(counts)}, {"rows": rows}
 
         heading, arrays = result(work)

@@ -239,3 +239,56 @@ def response(t, m=2.0, d=0.5, k=8.0):
     wd = wn * np.sqrt(1 - zeta**2)
     s = np.maximum(t - 1.0, 0.0)
     return np.where(t < 1.0, 0.0, 1 - np.exp(-zeta * wn * s) * (np.cos(wd * s) + zeta * wn / wd * np.sin(wd * s)))
+
+
+# T y' = u - y, as co-simulation; through is y + u. What the solver knows of u stands in r[6], in whose place a model
+# puts what it does wrong; r[7]: whether the solver computes, not a reader.
+LATCH_CODE = (
+    PLAIN
+    + """
+#define NR 14
+#undef INITIALIZE
+#define INITIALIZE(r) (r[6] = r[10] = r[4])
+static void start(double *r) { r[2] = 0.1; }
+static void equations(double *r, double t) {
+    r[1] = ((r[7] ? r[6] + r[11] * (t - r[12]) : r[4]) - r[0]) / r[2];
+    r[5] = r[0];
+    r[8] = r[0] + r[4];
+}
+"""
+)
+LATCHES = {
+    "plain": """
+#define AT_STEP(r) (r[6] = r[4], r[7] = 1)
+#define AT_GET(r) (r[7] = 0)
+""",
+    "changed": """
+#define AT_SET(r, v, x) do { if (v == 4 && x != r[4]) r[9] = 1; } while (0)
+#define AT_GET(r) (r[7] = r[9] = 0)
+#define AT_STEP(r) do { if (r[9]) r[6] = r[4]; r[9] = 0; r[7] = 1; } while (0)
+""",
+    "compared": """
+#define AT_GET(r) (r[7] = 0, r[10] = r[4])
+#define AT_STEP(r) do { if (r[4] != r[10]) r[6] = r[4]; r[10] = r[4]; r[7] = 1; } while (0)
+""",
+    "spoiled": """
+#define AT_SET(r, v, x) do { if (v == 4) r[9] = x != r[6]; } while (0)
+#define AT_GET(r) do { if (r[9]) r[10] = 1; r[7] = r[9] = 0; } while (0)
+#define AT_STEP(r) do { if (r[10] == 0) r[6] = r[4]; r[10] = r[9] = 0; r[7] = 1; } while (0)
+#undef INITIALIZE
+#define INITIALIZE(r) (r[6] = r[4])
+""",
+}
+"""When the solver takes over an input: always; where it was set to another value and nothing was read since; where it
+differs from what was read last; unless anything was read with it before."""
+LATCH_VARIABLES = (
+    *FAULTY_VARIABLES[:3],
+    Var("u", 4, "input", "continuous", (("start", "0"),)),
+    Var("out", 5, "output"),
+    Var("through", 8, "output"),
+)
+
+
+def latch(kind: str = "plain", more: str = "", name: str = "") -> CModel:
+    """The lag whose solver takes over its input in one of the ways of LATCHES."""
+    return CModel(name or kind, LATCH_CODE + LATCHES[kind] + more, LATCH_VARIABLES, 1, kinds=("CoSimulation",))

@@ -1,6 +1,8 @@
 /* The calls of FMI 2.0 or 3.0 around a small model. The model defines, before this file is included:
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
-   faults AT_INSTANTIATE, AT_SETUP, AT_STEP, AT_SLOPES, AT_RESET. States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
+   faults AT_INSTANTIATE, AT_SETUP, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r), AT_SET(r, reference, value), BEGIN(t, has_end,
+   end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s; STOPS_AT(t, h), the instant that a step reaches;
+   SLOPE(r, reference, slope). States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -8,23 +10,38 @@
 #include <unistd.h>
 
 typedef void *Instance;
-typedef struct { double r[NR]; double t, next; int timed; void (*log)(); void *env; } Model;
+typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*log)(); void *env; } Model;
 #define M ((Model *)c)
 #define N (NX > 0 ? NX : 1)
 
 static void fresh(Model *m) {
-    m->t = 0; m->timed = 0; m->next = 0;
+    m->t = 0; m->timed = 0; m->next = 0; m->point = 0; m->inner = 0;
     memset(m->r, 0, sizeof m->r);
     start(m->r);
 }
 static void slopes(Model *m) { equations(m->r, m->t); }
 static int get(Model *m, const unsigned *v, size_t n, double *x) {
+#ifdef AT_GET
+    AT_GET(m->r);
+#endif
     slopes(m);
     for (size_t i = 0; i < n; i++) x[i] = m->r[v[i]];
     return 0;
 }
 static int set(Model *m, const unsigned *v, size_t n, const double *x) {
-    for (size_t i = 0; i < n; i++) m->r[v[i]] = x[i];
+    for (size_t i = 0; i < n; i++) {
+#ifdef AT_SET
+        AT_SET(m->r, v[i], x[i]);
+#endif
+        m->r[v[i]] = x[i];
+    }
+    return 0;
+}
+static int begin(Model *m, double t, int has_end, double end) {
+    m->t = m->point = m->inner = t;
+#ifdef BEGIN
+    BEGIN(t, has_end, end);
+#endif
     return 0;
 }
 static int update(Model *m, int *changed, int *timed, double *next) {
@@ -64,6 +81,31 @@ static int substeps(Model *m, double h) { /* classical Runge-Kutta, 20 substeps;
     }
     return 0;
 }
+/* One communication step; early: whether it ended before t + h, at m->point; m->inner: where the outputs belong. */
+static int advance(Model *m, double t, double h, int *early) {
+    double goal = t + h;
+    *early = 0;
+    if (fabs(t - m->point) > 1e-9) return 3;
+#ifdef STOPS_AT
+    goal = STOPS_AT(t, h);
+    *early = goal < t + h - 1e-12;
+#endif
+#ifdef INTERNAL
+    while (m->inner + INTERNAL <= goal + 1e-9) {
+        m->t = m->inner;
+        int s = substeps(m, INTERNAL);
+        if (s) return s;
+        m->inner += INTERNAL;
+    }
+    m->t = m->inner; m->point = goal;
+    return 0;
+#else
+    m->t = t;
+    if (goal > t) { int s = substeps(m, goal - t); if (s) return s; }
+    m->t = m->point = m->inner = goal;
+    return 0;
+#endif
+}
 
 #if FMI == 2
 typedef struct { void (*logger)(); void *(*allocate)(); void (*release)(); void *finished; void *env; } Calls;
@@ -83,7 +125,7 @@ int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double e
 #ifdef AT_SETUP
     AT_SETUP(M->r, t, e, end);
 #endif
-    M->t = t; return 0;
+    return begin(M, t, e, end);
 }
 int fmi2EnterInitializationMode(Instance c) { return 0; }
 int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
@@ -130,13 +172,22 @@ int fmi2GetNominalsOfContinuousStates(Instance c, double *x, size_t n) {
     for (size_t i = 0; i < n; i++) x[i] = NOMINAL; return 0; }
 int fmi2GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const unsigned *k, size_t nk, const double *s, double *o) {
     return directional(M, u, nu, k, nk, s, o); }
-int fmi2DoStep(Instance c, double t, double h, int p) { M->t = t; int s = substeps(M, h); M->t = t + h; return s; }
-int fmi2SetRealInputDerivatives(Instance c, const unsigned *v, size_t n, const int *o, const double *x) { return 3; }
+int fmi2DoStep(Instance c, double t, double h, int p) { int early, s = advance(M, t, h, &early); return s ? s : 2 * early; }
+int fmi2GetRealStatus(Instance c, int kind, double *x) { *x = M->point; return kind == 2 ? 0 : 2; }
+int fmi2GetBooleanStatus(Instance c, int kind, int *x) { *x = 0; return kind == 3 ? 0 : 2; }
+int fmi2SetRealInputDerivatives(Instance c, const unsigned *v, size_t n, const int *o, const double *x) {
+#ifdef SLOPE
+    for (size_t i = 0; i < n; i++) SLOPE(M->r, v[i], x[i]);
+    return 0;
+#else
+    return 3;
+#endif
+}
 #define UNUSED(f) int f(void) { return 3; }
 UNUSED(fmi2GetString) UNUSED(fmi2SetString) UNUSED(fmi2GetFMUstate) UNUSED(fmi2SetFMUstate) UNUSED(fmi2FreeFMUstate)
 UNUSED(fmi2SerializedFMUstateSize) UNUSED(fmi2SerializeFMUstate) UNUSED(fmi2DeSerializeFMUstate)
-UNUSED(fmi2GetRealOutputDerivatives) UNUSED(fmi2CancelStep) UNUSED(fmi2GetStatus) UNUSED(fmi2GetRealStatus)
-UNUSED(fmi2GetIntegerStatus) UNUSED(fmi2GetBooleanStatus) UNUSED(fmi2GetStringStatus)
+UNUSED(fmi2GetRealOutputDerivatives) UNUSED(fmi2CancelStep) UNUSED(fmi2GetStatus) UNUSED(fmi2GetIntegerStatus)
+UNUSED(fmi2GetStringStatus)
 #else
 #include <stdbool.h>
 const char *fmi3GetVersion(void) { return "3.0"; }
@@ -151,7 +202,7 @@ static Instance made(const char *token, void *env, void (*log)()) {
 Instance fmi3InstantiateModelExchange(const char *n, const char *token, const char *p, bool v, bool l, void *env, void (*log)()) { return made(token, env, log); }
 Instance fmi3InstantiateCoSimulation(const char *n, const char *token, const char *p, bool v, bool l, bool e, bool r, const unsigned *q, size_t nq, void *env, void (*log)(), void (*i)()) { return made(token, env, log); }
 void fmi3FreeInstance(Instance c) { free(c); }
-int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { M->t = t; return 0; }
+int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { return begin(M, t, e, end); }
 int fmi3ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi3EnterEventMode(Instance c) { return 0; }
 int fmi3Terminate(Instance c) { return 0; }
@@ -190,7 +241,7 @@ int fmi3GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const
     return directional(M, u, nu, k, nk, s, o); }
 int fmi3EnterStepMode(Instance c) { return 0; }
 int fmi3DoStep(Instance c, double t, double h, bool p, bool *event, bool *end, bool *early, double *reached) {
-    M->t = t; int s = substeps(M, h); M->t = t + h; *event = *end = *early = false; *reached = t + h; return s; }
+    int left, s = advance(M, t, h, &left); *event = *end = false; *early = left; *reached = left ? M->point : M->inner; return s; }
 #define UNUSED(f) int f(void) { return 3; }
 UNUSED(fmi3InstantiateScheduledExecution) UNUSED(fmi3GetFloat32) UNUSED(fmi3GetInt8) UNUSED(fmi3GetUInt8)
 UNUSED(fmi3GetInt16) UNUSED(fmi3GetUInt16) UNUSED(fmi3GetUInt32) UNUSED(fmi3GetInt64) UNUSED(fmi3GetUInt64)

@@ -89,8 +89,21 @@ def test_a_jump_within_a_step_enters_as_the_mean_over_it(fixed):
 
 
 def test_the_same_fmu_that_claims_any_step_is_found_out(tmp_path):
-    run = experiment("step", ROWS[3][0], {"u": InputSignal.step(1.0, 0.0, 1.0)})
+    """It takes even steps, of the shortest interval, 0.011 s; the jump within one enters as the mean over it."""
+    rows, step = ROWS[3][0], 0.011
+    run = experiment("step", rows, {"u": InputSignal.step(1.0, 0.0, 1.0)})
     model = read_fmu(build(STUBBORN, tmp_path), interface="co-simulation")
-    with pytest.raises(SimulationError, match="experiment 'step'"):
+    for _ in range(2):
+        found = simulate(model, run)
+        assert np.abs(found["y"] - response(rows)).max() < 2.0 * 0.5 * step  # |y'| below 2, the jump off by half a step
+        assert "refuses steps of different lengths" in found.notes["steps"]
+    model.host.close()
+
+
+def test_a_step_that_even_ones_cannot_mend_is_an_error(tmp_path):
+    refusing = replace(STUBBORN, name="refusing", code=spring().code + "#define AT_STEP(r) return 3\n")
+    run = experiment("step", ROWS[3][0], {"u": InputSignal.step(1.0, 0.0, 1.0)})
+    model = read_fmu(build(refusing, tmp_path), interface="co-simulation")
+    with pytest.raises(SimulationError, match=r"experiment 'step'.*fmi2DoStep returned error"):
         simulate(model, run)
     model.host.close()
