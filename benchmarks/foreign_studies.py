@@ -52,8 +52,8 @@ class Mover:
         return float(np.nanmax(np.abs(self.response)))
 
 
-def stairs(peer: Peer, seed: int | None) -> dict[str, Array]:
-    """Each continuous input at each row: a step and a sine in stairs; with a seed, random stairs."""
+def stairs(peer: Peer, seed: int | None, times: float = 1.0) -> dict[str, Array]:
+    """Each continuous input at each row: a step and a sine in stairs; with a seed, random stairs, so many times larger."""
     plan = peer.plan()
     last = np.searchsorted(plan.corners, plan.rows, side="right") - 1
     values = {n: v[last] for n, v in plan.inputs.items()}
@@ -65,7 +65,7 @@ def stairs(peer: Peer, seed: int | None) -> dict[str, Array]:
             length = plan.rows.size // 20
             levels = random.uniform(-0.5, 0.5, plan.rows.size // length + 1)
             levels[0] = 0.0  # the record begins at the start value
-            u = peer.start(v) + peer.size(v) * np.repeat(levels, length)[: plan.rows.size]
+            u = peer.start(v) + times * peer.size(v) * np.repeat(levels, length)[: plan.rows.size]
             u[-1] = u[-2]
             values[v.name] = u
         else:
@@ -276,12 +276,17 @@ def diagnosed(path: Path, interface: str, told: Told, effect: str) -> None:
     if not continuous:
         told({"not_applicable": "no continuous input", "stage": "done"})
         return
-    cases = [stairs(peer, 3800 + k) for k in range(3)]
+    for times in (1.0, 10.0, 100.0):  # as large as it takes for a lag to be seen
+        cases = [stairs(peer, 3800 + k, times) for k in range(3)]
+        y = recorded(peer, cases[0]).outputs
+        scale = ranges(y)
+        lags = {n: (recorded(peer, cases[0], hidden="lag", at=n).outputs - y) / scale for n in continuous}
+        if max(float(np.nanmax(np.abs(s))) for s in lags.values()) > MOVES:
+            break
     y, scale, moving = movers(peer, cases[0])
     varying = [k for k in range(len(peer.names)) if np.nanmax(y[:, k]) > np.nanmin(y[:, k])][:MOST_OUTPUTS]
-    signatures = {}
+    signatures = {("lag", n): s for n, s in lags.items()}
     for name in continuous:
-        signatures["lag", name] = (recorded(peer, cases[0], hidden="lag", at=name).outputs - y) / scale
         signatures["delay", name] = (recorded(peer, cases[0], hidden="delay", at=name).outputs - y) / scale
     for k in varying[:1]:
         column = np.zeros_like(y)
