@@ -204,7 +204,8 @@ def asked(study: Path, verb: str, told: Told) -> dict[str, Any] | None:
     done = subprocess.run(
         [sys.executable, "-c", COMMAND, verb, str(study), "--json"],
         capture_output=True,
-        text=True,
+        encoding="utf-8",
+        errors="replace",
         stdin=subprocess.DEVNULL,
     )
     told({"code": done.returncode, "seconds": time.perf_counter() - begin})
