@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.fmu.binding import DISCARD, ERROR, Failure, Vector
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.plant import Plant, RunFailed
+from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.trajectory import Array
 
@@ -234,7 +234,11 @@ def _go(
     shows = calls.reading != "never"
     for k, t in enumerate(stops.tolist()):
         if k:
-            stepper.step(float(stops[k - 1]), t, after[k - 1], before[k])
+            try:
+                stepper.step(float(stops[k - 1]), t, after[k - 1], before[k])
+            except RunEnded as e:
+                e.rows = _rows(time[time <= stops[k - 1]], stops[:k], left[:k], right[:k])
+                raise
         plain = calls.plain or not shows or stepper.stands_at(before[k])
         left[k] = right[k] = seen.get() if plain else stepper.show(before[k])
         if calls.plain and shows and not stepper.stands_at(before[k]):
@@ -360,7 +364,7 @@ class _Stepper:
             try:
                 reached, computed = self.plant.binding.step(t, b - t)
             except RuntimeError as e:
-                raise RunFailed(str(e), t) from None
+                raise RunEnded(t) from e
             if reached >= b - 1e-12 * max(abs(b), 1.0):
                 behind = b - computed
                 if behind > 1e-9 * max(abs(b), b - a):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.fmu.binding import DISCARD, Block, Failure
-from hvdc_ident.fmu.plant import Plant, RunFailed
+from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
 from hvdc_ident.fmu.signals import Moving, Signals
 from hvdc_ident.fmu.tangent import Tangent
 from hvdc_ident.trajectory import Array
@@ -79,7 +79,17 @@ class Run:
         self.before = self.counts.accepted
 
     def go(self, values: Mapping[str, float]) -> None:
-        """Nothing; every row is filled. Raises RunFailed, Failure or SensitivitiesLost."""
+        """Fill every row. Raises RunFailed, Failure or SensitivitiesLost; RunEnded with the rows up to the end."""
+        try:
+            self._go(values)
+        except RunEnded as e:
+            while self.row < self.time.size and self.row > 0 and self.time[self.row] <= float(e.t or 0.0):
+                self.outputs[self.row] = self.seen.get()  # the FMU stands there
+                self.row += 1
+            e.rows = self.outputs[: self.row].copy()
+            raise
+
+    def _go(self, values: Mapping[str, float]) -> None:
         t = float(self.time[0])
         self.plant.begin(values, self.u, t, self.end, self.tolerance)
         x = self.b.get_states()
@@ -133,7 +143,7 @@ class Run:
             if self.plant.description.completed_step:
                 wanted, over = self.b.completed_step()
                 if over:
-                    raise RunFailed("the FMU asked for the end of the run", t)
+                    raise RunEnded(t)
                 if wanted and t < end:
                     return t, self._state_event(t, y)
         return end, y

@@ -14,7 +14,7 @@ from hvdc_ident.fmu.binding import Block, Failure
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.differences import ENOUGH, TINY, Step, derivative, first, noise_of, pair
 from hvdc_ident.fmu.isolation import result
-from hvdc_ident.fmu.plant import Plant, RunFailed, failure
+from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed, failure
 from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moves
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.fmu.tangent import Point, Tangent
@@ -132,6 +132,8 @@ class _Simulation:
         self.inputs = list(self.description.inputs)
         key = b"".join(arrays[n].tobytes() for n in ("time", "times", "points"))
         self.key = hashlib.sha256(key + repr((self.names, self.tolerance)).encode()).digest()
+        self.partial = bool(heading.get("partial"))  # whether a run that the FMU ends counts, with its rows
+        self.ended: tuple[float, int] | None = None  # when it ended this one, s, and the rows up to there
         self.notes: dict[str, str] = {}
         self.counts = exchange.Counts()
 
@@ -167,6 +169,10 @@ class _Simulation:
             self.notes |= co_simulation.notes(self.learned)
         c = self.counts
         counts = [c.accepted, c.events, c.evaluations, c.segments]
+        if self.ended is not None:
+            t, count = self.ended
+            self.notes["end"] = f"the FMU asked for the end of the run at {t:.6g} s: the rows go up to there"
+            outputs, gradients = outputs[:count], gradients[:count]
         return {"notes": self.notes, "counts": counts}, {"outputs": outputs, "gradients": gradients, "errors": errors}
 
     def _find_restart(self) -> None:
@@ -203,7 +209,10 @@ class _Simulation:
             self.jobs.tell()
 
             def rows(plant: Plant) -> Array:
-                return co_simulation.run(plant, self.values, self.signals, time, names, self.tolerance, calls)
+                try:
+                    return co_simulation.run(plant, self.values, self.signals, time, names, self.tolerance, calls)
+                except RunEnded as e:
+                    return self._padded(e, time.size)
 
             if self.jobs.isolated:
                 return self._in_its_own_process(rows, exchange.Counts())
@@ -240,14 +249,15 @@ class _Simulation:
             outputs = self._in_its_own_process(lambda p: self._rows(p, values, moved, self.names, counts), counts)
         else:
             outputs = self._rows(self.jobs.plant, values, moved, self.names, counts)
-        bad = ~np.isfinite(outputs).all(axis=0)
+        reached = outputs if self.ended is None else outputs[: self.ended[1]]
+        bad = ~np.isfinite(reached).all(axis=0)
         if bad.any():
-            row = int(np.flatnonzero(~np.isfinite(outputs).all(axis=1))[0])
+            row = int(np.flatnonzero(~np.isfinite(reached).all(axis=1))[0])
             name = self.names[int(np.flatnonzero(bad)[0])]
             raise RunFailed(
                 f"output '{name}' is not finite", float(self.time[row]), "check parameter values and limits"
             )
-        if own:
+        if own and self.ended is None:
             self.jobs.last = (key, outputs)
         return outputs
 
@@ -257,12 +267,13 @@ class _Simulation:
         def work() -> Answer:
             plant = self.jobs.make({k: v for k, v in self.learned.items() if k != "restart"})
             rows = run(plant)
-            return {"learned": plant.learned, "counts": asdict(counts)}, {"rows": rows}
+            return {"learned": plant.learned, "counts": asdict(counts), "end": self.ended}, {"rows": rows}
 
         heading, arrays = result(work)
         self.jobs.runs += 1
         self.learned |= heading["learned"]
         vars(counts).update(heading["counts"])
+        self.ended = tuple(heading["end"]) if heading["end"] else None
         return arrays["rows"]
 
     def _rows(
@@ -274,7 +285,34 @@ class _Simulation:
         counts: exchange.Counts,
         finer: float = 1.0,
     ) -> Array:
-        """(n, names) of a run as the FMU gives them. finer: factor on the integrator's tolerance."""
+        """(n, names) of a run as the FMU gives them; NaN after an end that it asked for, where such a run counts.
+
+        finer: factor on the integrator's tolerance.
+        """
+        try:
+            return self._whole(plant, values, signals, names, counts, finer)
+        except RunEnded as e:
+            rows = self._padded(e, self.time.size)
+            self.ended = (float(e.t or 0.0), len(e.rows) if e.rows is not None else 0)
+            return rows
+
+    def _padded(self, ended: RunEnded, count: int) -> Array:
+        """(count, names) of a run that the FMU ended, NaN after that. Raises the end where such a run does not count."""
+        rows = ended.rows
+        if not self.partial or rows is None or not rows.size:
+            raise ended
+        return np.vstack([rows, np.full((count - rows.shape[0], rows.shape[1]), np.nan)])
+
+    def _whole(
+        self,
+        plant: Plant,
+        values: Mapping[str, float],
+        signals: Signals,
+        names: tuple[str, ...],
+        counts: exchange.Counts,
+        finer: float,
+    ) -> Array:
+        """(n, names) of a run to the last row."""
         self.jobs.runs += 1
         if plant.binding.exchange:
             run = exchange.Run(plant, signals, self.time, names, finer * self.tolerance, counts=counts)

@@ -194,19 +194,21 @@ class FmuModel:
         *,
         outputs: Sequence[str] | None = None,
         tolerance: Tolerance | None = None,
+        partial: bool = False,
     ) -> Simulation:
-        """A run of the experiment in the FMU's worker.
+        """Return a run of the experiment in the FMU's worker.
 
         values: parameters, and inputs that stay constant, where they differ from the model's. outputs: names of any
         variables that change; default, what the experiment measured, else all outputs. notes: how derivatives were had
-        and, where by differences, their relative error.
+        and, where by differences, their relative error. partial: whether a run that the FMU ends is given with the rows
+        up to there (status "ended", the instant in the notes), without sensitivities and effects; else it has failed.
 
         Raises UnknownNameError for names it has not, SimulationError where the run fails.
         """
         from hvdc_ident.fmu.run import simulate
 
         chosen = outputs if outputs is not None else (experiment.outputs or None)
-        return simulate(self, experiment, values or {}, tuple(sensitivities), chosen, tolerance or Tolerance())
+        return simulate(self, experiment, values or {}, tuple(sensitivities), chosen, tolerance or Tolerance(), partial)
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}

@@ -50,6 +50,14 @@ class RunFailed(Exception):
         return cls(told["failed"], told["time"], told["hint"], said=told["said"], fatal=fatal, again=again)
 
 
+class RunEnded(RunFailed):
+    """The FMU asked for the end of the run at an instant. rows: (k, names) of outputs that were recorded up to it."""
+
+    def __init__(self, t: float) -> None:
+        super().__init__("the FMU asked for the end of the run", t, "a shorter experiment, or other values")
+        self.rows: Array | None = None
+
+
 def failure(error: Exception, messages: Sequence[str] = ()) -> RunFailed:
     """Return the failure that an error amounts to. messages: those of the FMU in this run, told where a call failed."""
     said = messages[-1] if messages else ""
@@ -181,7 +189,7 @@ class Plant:
             changed |= found.states_changed
             self.next_time = found.next_time
             if found.end:
-                raise RunFailed("the FMU asked for the end of the run", t)
+                raise RunEnded(t)
             if not found.again:
                 return changed
         raise RunFailed(f"the events at one instant did not settle in {ITERATIONS} iterations", t)

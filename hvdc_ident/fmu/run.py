@@ -29,6 +29,7 @@ def simulate(
     sensitivities: tuple[str, ...],
     outputs: Sequence[str] | None,
     tolerance: Tolerance,
+    partial: bool = False,
 ) -> Simulation:
     """The run, with its recording chains and effects. See `FmuModel.simulate`."""
     from hvdc_ident.fmu.ends import chains, simulate_with_effects
@@ -63,7 +64,7 @@ def simulate(
     try:
         if checked.effects:
             return simulate_with_effects(checked, experiment, given, sensitivities, names, tolerance)
-        return bare(checked, experiment, given, sensitivities, names, tolerance)
+        return bare(checked, experiment, given, sensitivities, names, tolerance, partial=partial and not sensitivities)
     except HvdcIdentError as e:
         raise e.at(place) from None
 
@@ -75,8 +76,10 @@ def bare(
     sensitivities: tuple[str, ...],
     names: tuple[str, ...],
     tolerance: Tolerance,
+    *,
+    partial: bool = False,
 ) -> Simulation:
-    """The run of the FMU itself, without effects."""
+    """The run of the FMU itself, without effects. partial: whether the rows up to an end that the FMU asks for do."""
     signals = Signals.of(list(inputs_of(model, experiment, given).values()))
     heading = {
         "do": "simulate",
@@ -85,6 +88,7 @@ def bare(
         "parameters": sensitivities,
         **about(model, sensitivities),
         "tolerance": tolerance.rtol,
+        "partial": partial,
     }
     arrays = {
         "time": experiment.time,
@@ -105,11 +109,13 @@ def bare(
     worst = max(errors, key=lambda n: errors[n], default=None)
     if worst is not None and errors[worst] > 0.0:
         notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {worst}, the least certain"
+    rows = out["outputs"]
+    status = "converged" if rows.shape[0] == experiment.time.size else "ended"
     return Simulation(
-        Trajectory(experiment.time, out["outputs"], names, units),
+        Trajectory(experiment.time[: rows.shape[0]], rows, names, units),
         sensitivities,
         out["gradients"],
-        Statistics("converged", method, accepted, 0, events, evaluations, segments, 0),
+        Statistics(status, method, accepted, 0, events, evaluations, segments, 0),
         FrozenMap(notes),
     )
 

@@ -84,6 +84,7 @@ class External(Protocol):
         *,
         outputs: Sequence[str] | None = None,
         tolerance: Any = None,
+        partial: bool = False,
     ) -> Any:
         """A run: a `hvdc_ident.simulate.Simulation`."""
 

@@ -269,6 +269,7 @@ def simulate(
     tolerance: Tolerance | None = None,
     rtol: float | None = None,
     method: Method = "auto",
+    partial: bool = False,
 ) -> Simulation:
     """The model's outputs at the experiment's times and, exactly, their derivatives by the named parameters.
 
@@ -277,7 +278,8 @@ def simulate(
     the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
     The name of an input among the sensitivities asks for the derivative by a constant added to that input all along,
     that of a state for the derivative by its start, which is then no longer the steady one.
-    A model that is external (an FMU) runs itself, from its own start; `method` is then its own.
+    A model that is external (an FMU) runs itself, from its own start; `method` is then its own. It may ask for the end
+    of its run: partial gives the rows up to there, with status "ended" and the instant in the notes; else that has failed.
 
     Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
     """
@@ -286,7 +288,8 @@ def simulate(
     if not isinstance(model, Model):
         chosen = tuple(model.outputs) if outputs is None else outputs
         tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
-        found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol)
+        ending = {"partial": True} if partial else {}
+        found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
         return found
     plant = with_recording(model, experiment)
     given = {**experiment.values, **(values or {})}

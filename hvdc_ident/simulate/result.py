@@ -48,7 +48,7 @@ class Simulation:
 
     @property
     def status(self) -> str:
-        """ "converged"; any other outcome is an exception."""
+        """ "converged", or "ended" where an FMU ended its run and its rows were asked for; else there is an exception."""
         return self.statistics.status
 
     def __getitem__(self, output: str) -> Array:

@@ -2,7 +2,7 @@
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
    faults AT_INSTANTIATE, AT_SETUP, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r), AT_SET(r, reference, value), BEGIN(t, has_end,
    end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s; STOPS_AT(t, h), the instant that a step reaches;
-   SLOPE(r, reference, slope). States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
+   SLOPE(r, reference, slope); ENDS(r, t) asks for the end. States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -13,6 +13,9 @@ typedef void *Instance;
 typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*log)(); void *env; } Model;
 #define M ((Model *)c)
 #define N (NX > 0 ? NX : 1)
+#ifndef ENDS
+#define ENDS(r, t) 0
+#endif
 
 static void fresh(Model *m) {
     m->t = 0; m->timed = 0; m->next = 0; m->point = 0; m->inner = 0;
@@ -149,10 +152,11 @@ int fmi2NewDiscreteStates(Instance c, Info *e) {
 #ifdef AGAIN
     e->again = AGAIN(M->r);
 #endif
+    e->end = ENDS(M->r, M->t);
     return 0;
 }
 int fmi2EnterContinuousTimeMode(Instance c) { return 0; }
-int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { *e = 0; *end = 0; return 0; }
+int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { *e = 0; *end = ENDS(M->r, M->t); return 0; }
 int fmi2SetTime(Instance c, double t) { M->t = t; return 0; }
 int fmi2SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
 int fmi2GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
@@ -172,9 +176,9 @@ int fmi2GetNominalsOfContinuousStates(Instance c, double *x, size_t n) {
     for (size_t i = 0; i < n; i++) x[i] = NOMINAL; return 0; }
 int fmi2GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const unsigned *k, size_t nk, const double *s, double *o) {
     return directional(M, u, nu, k, nk, s, o); }
-int fmi2DoStep(Instance c, double t, double h, int p) { int early, s = advance(M, t, h, &early); return s ? s : 2 * early; }
+int fmi2DoStep(Instance c, double t, double h, int p) { int early, s = advance(M, t, h, &early); return s ? s : early || ENDS(M->r, M->t) ? 2 : 0; }
 int fmi2GetRealStatus(Instance c, int kind, double *x) { *x = M->point; return kind == 2 ? 0 : 2; }
-int fmi2GetBooleanStatus(Instance c, int kind, int *x) { *x = 0; return kind == 3 ? 0 : 2; }
+int fmi2GetBooleanStatus(Instance c, int kind, int *x) { *x = kind == 3 && ENDS(M->r, M->t); return kind == 3 ? 0 : 2; }
 int fmi2SetRealInputDerivatives(Instance c, const unsigned *v, size_t n, const int *o, const double *x) {
 #ifdef SLOPE
     for (size_t i = 0; i < n; i++) SLOPE(M->r, v[i], x[i]);
@@ -215,10 +219,10 @@ int fmi3GetBoolean(Instance c, const unsigned *v, size_t n, bool *x, size_t m) {
 int fmi3SetBoolean(Instance c, const unsigned *v, size_t n, const bool *x, size_t m) { for (size_t i = 0; i < n; i++) M->r[v[i]] = x[i]; return 0; }
 int fmi3UpdateDiscreteStates(Instance c, bool *again, bool *end, bool *nominals, bool *values, bool *defined, double *next) {
     int changed, timed; update(M, &changed, &timed, next);
-    *again = *end = *nominals = false; *values = changed; *defined = timed; return 0;
+    *again = *nominals = false; *end = ENDS(M->r, M->t); *values = changed; *defined = timed; return 0;
 }
 int fmi3EnterContinuousTimeMode(Instance c) { return 0; }
-int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { *e = *end = false; return 0; }
+int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { *e = false; *end = ENDS(M->r, M->t); return 0; }
 int fmi3SetTime(Instance c, double t) { M->t = t; return 0; }
 int fmi3SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
 int fmi3GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
@@ -241,7 +245,7 @@ int fmi3GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const
     return directional(M, u, nu, k, nk, s, o); }
 int fmi3EnterStepMode(Instance c) { return 0; }
 int fmi3DoStep(Instance c, double t, double h, bool p, bool *event, bool *end, bool *early, double *reached) {
-    int left, s = advance(M, t, h, &left); *event = *end = false; *early = left; *reached = left ? M->point : M->inner; return s; }
+    int left, s = advance(M, t, h, &left); *event = false; *end = ENDS(M->r, M->t); *early = left; *reached = left ? M->point : M->inner; return s; }
 #define UNUSED(f) int f(void) { return 3; }
 UNUSED(fmi3InstantiateScheduledExecution) UNUSED(fmi3GetFloat32) UNUSED(fmi3GetInt8) UNUSED(fmi3GetUInt8)
 UNUSED(fmi3GetInt16) UNUSED(fmi3GetUInt16) UNUSED(fmi3GetUInt32) UNUSED(fmi3GetInt64) UNUSED(fmi3GetUInt64)

@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from hvdc_ident.experiment import Experiment
     from hvdc_ident.study.study import Study
 
 
@@ -26,17 +31,21 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         options.progress(done, len(study.experiments), f"experiment '{experiment.name}'")
         try:
             with at_given(study):
-                simulated = simulate(study.model, experiment, study.given).trajectory
+                one = simulate(study.model, experiment, study.given, partial=True)
         except ComputationError as e:
             status[experiment.name] = {"status": "failed", "reason": str(e)}
             for output in experiment.outputs:
                 table.setdefault(output, {})[experiment.name] = None
             continue
-        status[experiment.name] = {"status": "converged", "reason": ""}
+        simulated, ended = one.trajectory, one.status == "ended"
+        status[experiment.name] = {"status": one.status, "reason": one.notes.get("end", "")}
+        if ended:
+            experiment = _until(experiment, simulated.time.size)
         for output in experiment.outputs:
-            table.setdefault(output, {})[experiment.name] = rmse(experiment, simulated, output)
+            told = not ended or _comparable(experiment, output)
+            table.setdefault(output, {})[experiment.name] = rmse(experiment, simulated, output) if told else None
         files[f"simulation.{experiment.name}.csv"] = comparison_csv(experiment, simulated)
-    failed = [name for name, s in status.items() if s["status"] == "failed"]
+    failed = [name for name, s in status.items() if s["status"] != "converged"]
     data = {
         "values": {**study.model.values, **study.given},
         "rmse": table,
@@ -47,6 +56,23 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         },
     }
     return Outcome(data, files, failed=status[failed[0]]["reason"] if failed else "")
+
+
+def _until(experiment: Experiment, rows: int) -> Experiment:
+    """Return the experiment's first rows, which a run that an FMU ended came to."""
+    m = experiment.measured
+    assert m is not None  # a study's experiments have outputs
+    return experiment.with_(
+        time=m.time[:rows],
+        measured=Trajectory(m.time[:rows], m.values[:rows], m.names, m.units, m.origin),
+        noise_profile=FrozenMap({o: p[:rows] for o, p in experiment.noise_profile.items()}),
+    )
+
+
+def _comparable(experiment: Experiment, output: str) -> bool:
+    """Return whether any row of a measured output can be compared."""
+    assert experiment.measured is not None
+    return bool(np.isfinite(experiment.measured[output][experiment.compared]).any())
 
 
 STAGE = Stage(
