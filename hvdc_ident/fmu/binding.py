@@ -6,10 +6,13 @@ Vectors are numpy arrays whose address is taken once: what is called ten thousan
 from __future__ import annotations
 
 import contextlib
+import shutil
+import subprocess
 from collections.abc import Sequence
 from ctypes import byref, c_double
 from dataclasses import dataclass
 from math import nan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +26,50 @@ Failure = FMICallException
 """What a call raises that returned discard, error or fatal; `.function`, `.status`."""
 DISCARD, ERROR, FATAL = 2, 3, 4
 KEPT = 30  # messages of the FMU that are kept
+
+
+def why_not_loaded(error: Exception, folder: str, d: Description) -> tuple[str, str]:
+    """Return why an FMU's shared library cannot be loaded, and what to try, in words without its temporary folder."""
+    from fmpy import platform, platform_tuple, sharedLibraryExtension
+
+    place = Path(folder, "binaries", platform if d.version == 2 else platform_tuple)
+    library = place / f"{d.identifier}{sharedLibraryExtension}"
+    if missing := _missing_libraries(library):
+        hint = "install them, or put the folder they are in into LD_LIBRARY_PATH"
+        return f"the FMU's binary needs shared libraries that are not here: {', '.join(missing)}", hint
+    said = " ".join(str(error).split()).replace(f"{library.parent}/", "")
+    if "undefined symbol" in said:
+        function = said.rpartition(":")[2].strip()
+        return (
+            f"the FMU's binary lacks the function {function}",
+            f"export it again{f' from {d.tool}' if d.tool else ''}",
+        )
+    reason = said.rpartition(f"{library.name}: ")[2] or said
+    return f"the FMU's binary {library.name} cannot be loaded: {reason[:200]}", "copy or export the FMU again"
+
+
+def _missing_libraries(library: Path) -> list[str]:
+    """Return what the system's ldd does not find for a library; none where there is no ldd."""
+    command = shutil.which("ldd")
+    if command is None or not library.is_file():
+        return []
+    try:
+        said = subprocess.run([command, str(library)], capture_output=True, text=True, timeout=10, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    return [line.split()[0] for line in said.splitlines() if line.strip().endswith("not found")]
+
+
+def refusal(d: Description, said: str) -> str:
+    """Return what to try where an FMU gives no instance. said: its own words."""
+    words = said.casefold()
+    if "guid" in words or "token" in words:
+        return "take binary and modelDescription.xml from one export: they do not belong together"
+    if "licen" in words:
+        return f"the licence that it asks for{f', of {d.tool}' if d.tool else ''}, or an export that needs none"
+    if d.needs_tool:
+        return f"install {d.tool or 'its tool'}, in which alone it runs, or export it stand-alone"
+    return "look for a wrong GUID, a missing licence or a missing resource, which make an FMU refuse"
 
 
 @dataclass(frozen=True)

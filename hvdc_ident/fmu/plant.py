@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.fmu.binding import DISCARD, ERROR, FATAL, Binding, Block, Failure, Update
+from hvdc_ident.fmu.binding import DISCARD, ERROR, FATAL, Binding, Block, Failure, Update, refusal
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.trajectory import Array
 
@@ -170,7 +170,7 @@ class Plant:
             self.binding.instantiate()
         except RuntimeError:
             said = f": {self.binding.messages[-1]}" if self.binding.messages else ""
-            hint = "a wrong GUID, a missing licence or resource make an FMU refuse"
+            hint = refusal(self.description, said)
             raise RunFailed(f"the FMU gave no instance{said}", hint=hint, again=self._made > 0) from None
         self._made += 1
 

@@ -65,11 +65,18 @@ def main(
 
 def _serve(host: Connection, description: Any, folder: str, begun: Mapping[str, Any], view: memoryview[float]) -> None:
     """Answer requests until the connection closes. begun: what the host began with. view: where the progress is noted."""
+    from hvdc_ident.fmu.binding import why_not_loaded
     from hvdc_ident.fmu.jobs import Jobs
-    from hvdc_ident.fmu.plant import Plant
+    from hvdc_ident.fmu.plant import Plant, RunFailed
 
     def make(learned: dict[str, Any]) -> Plant:
-        plant = Plant(description, folder, learned)
+        try:
+            plant = Plant(description, folder, learned)
+        except MemoryError:
+            raise
+        except Exception as e:  # FMPy raises bare ones, beside those of ctypes
+            what, hint = why_not_loaded(e, folder, description)
+            raise RunFailed(what, hint=hint) from None
         plant.binding.progress = view
         view[PROCESS] = os.getpid()
         return plant

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from c_fmu import FOLDER, build, needs_compiler
+from c_fmu import COMPILER, FOLDER, build, needs_compiler
 from c_models import FAULTS, FAULTY, FAULTY_VARIABLES, broken
 from fmu_limits import PATIENT, QUICK
 
@@ -88,15 +89,21 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "exit": (made("exit", broken("leaves", "exit(0)")), "exit code 0 and no result"),
         "abort": (made("abort", broken("aborts", "abort()")), "SIGABRT"),
         "memory": (made("memory", broken("eats", "eat()")), r"used 1\d\d of its 128 MiB of memory"),
-        "guid": (made("guid", broken("foreign", token="{other}")), "no instance: the GUID is not that of this model"),
+        "guid": (
+            made("guid", broken("foreign", token="{other}")),
+            "no instance: the GUID is not that of this model.*one export",
+        ),
         "truncated": (
             made("cut", broken("cut"), **{f"{library}cut.so": code[: len(code) // 3]}),
-            "load shared|SIGBUS",
+            "cannot be loaded|SIGBUS",
         ),
-        "no library": (made("text", broken("text"), **{f"{library}text.so": b"no library"}), "load shared"),
+        "no library": (
+            made("text", broken("text"), **{f"{library}text.so": b"no library"}),
+            "cannot be loaded: file too short",
+        ),
         "no functions": (
             made("empty", broken("empty"), **{f"{library}empty.so": compiled("", 0, 0, 0, ())}),
-            "undefined symbol",
+            "lacks the function fmi2",
         ),
         "null": (made("null", broken("null", "return 0")), "gave no instance"),
     } | {"good": (whole, "")}
@@ -161,3 +168,16 @@ def test_an_fmu_that_gives_one_instance_a_process_gets_a_new_process_for_each_ru
             assert np.abs(simulate(model, STEP, {"T": lag})["out"] - answer(TIME, lag)).max() < 1e-6
         assert model.host.learned["restart"] == "process" and model.host.started == 1
         model.host.close()
+
+
+def test_shared_libraries_that_are_missing_are_named(tmp_path):
+    (tmp_path / "needed.c").write_text("int needed(void) { return 1; }")
+    (tmp_path / "user.c").write_text("int needed(void); int user(void) { return needed(); }")
+    flags = [COMPILER, "-shared", "-fPIC", "-L.", "-o"]
+    subprocess.run([*flags, "libneeded7.so", "needed.c"], cwd=tmp_path, check=True)
+    subprocess.run([*flags, "user.so", "user.c", "-lneeded7"], cwd=tmp_path, check=True)
+    library = f"binaries__{FOLDER[2]}__needy.so"
+    path = build(broken("needy"), tmp_path, **{library: (tmp_path / "user.so").read_bytes()})
+    with pytest.raises(ComputationError, match=r"not here: libneeded7.so\. Try: install them") as told:
+        simulate(read_fmu(path, interface="co-simulation"), STEP)
+    assert "hvdc_ident_fmu" not in str(told.value)

@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.study.stage import Options, Outcome, Stage
-from hvdc_ident.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from hvdc_ident.experiment import Experiment
@@ -60,6 +56,9 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 
 def _until(experiment: Experiment, rows: int) -> Experiment:
     """Return the experiment's first rows, which a run that an FMU ended came to."""
+    from hvdc_ident.frozen import FrozenMap
+    from hvdc_ident.trajectory import Trajectory
+
     m = experiment.measured
     assert m is not None  # a study's experiments have outputs
     return experiment.with_(
@@ -71,6 +70,8 @@ def _until(experiment: Experiment, rows: int) -> Experiment:
 
 def _comparable(experiment: Experiment, output: str) -> bool:
     """Return whether any row of a measured output can be compared."""
+    import numpy as np
+
     assert experiment.measured is not None
     return bool(np.isfinite(experiment.measured[output][experiment.compared]).any())
 
