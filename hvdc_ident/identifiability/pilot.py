@@ -10,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.fit import Problem, fit
+from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, source_of
 from hvdc_ident.fit.nuisance import unknown_of
@@ -94,16 +95,12 @@ class Optimum:
         n = sum(b.residual.size for b in self.blocks)
         return 2.0 * self.cost / max(n - self.theta.size, 1)
 
-    @property
+    @cached_property
     def excess(self) -> float:
-        """The same where it is more than chance allows with so many independent samples, else 1; 1 without noise."""
-        effective = max(sum(self.uncertainty.effective.values()), 1.0)
-        given = all(source_of(self.problem.fitted_experiments, o) == GIVEN for o in self.problem.outputs)
-        return (
-            self.misfit
-            if given and self.misfit > 1.0 + 4.0 * np.sqrt(2.0 / effective + 2.0 / self.problem.noise_dof)
-            else 1.0
-        )
+        """The misfit where `fit.adequacy` calls it larger than the noise told, else 1; 1 without noise."""
+        known = self.uncertainty
+        sources = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
+        return adequacy(self.problem, self.blocks, sources, known.effective, known.rho).widening
 
     def value(self, name: str) -> float:
         """The value of an unknown, in its unit."""

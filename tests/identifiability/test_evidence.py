@@ -10,7 +10,7 @@ from scipy.optimize import brentq, lsq_linear
 from scipy.stats import binom
 
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.bootstrap import bootstrap, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
@@ -19,10 +19,10 @@ from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.combinations import in_words
 from hvdc_ident.identifiability.evidence import bootstrap_rise, thresholds
 from hvdc_ident.identifiability.heterogeneity import heterogeneity
-from hvdc_ident.identifiability.pilot import pilot
+from hvdc_ident.identifiability.pilot import Optimum, pilot
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import coloured, decay, line, recorded
-from tests.identifiability.cases import T, closed, measured
+from tests.identifiability.cases import T, closed, measured, saturating
 
 LINE = closed(line, a=0.0, b=0.0)
 FREE = (Free("a", 0, -50, 50), Free("b", 0, -50, 50))
@@ -168,3 +168,17 @@ def test_a_limit_far_from_its_bound_is_not_read_at_the_bound_where_several_are_o
     low, high = (brentq(lambda k, rise=rise: cost(k) - least - rise, 5, 5000) for rise in (2.7, 0.7))
     limit = report.parameters["k"].ci95[0]
     assert low < limit < high < 1000
+
+
+@pytest.mark.parametrize("tone, flagged", [(0.0, False), (1.3, False), (6.0, True)])
+def test_identify_and_fit_call_the_same_misfit_larger_than_the_noise(tone, flagged):
+    """A tone of so many standard deviations is in the record and not in the model; below half the power it is left alone."""
+    simulator = closed(saturating, a=2.0, k=3.0)
+    record = measured(simulator, {"a": 2.0, "k": 3.0}, 0.01)
+    y = record.measured["y"] + 0.01 * tone * np.sin(2 * np.pi * 7.0 * record.time)
+    record = recorded("e", record.time, {"y": 0.01}, y=y)
+    problem = Problem(simulator, (record,), (Free("a", 2.0, 0.1, 10.0), Free("k", 3.0, 0.1, 20.0)))
+    result = fit(problem, starts=1)
+    at = Optimum(problem, np.array([result.values["a"], result.values["k"]]))
+    assert at.excess == pytest.approx(result.adequacy.widening)
+    assert (at.excess > 1.0) == flagged
