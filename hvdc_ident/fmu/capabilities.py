@@ -50,6 +50,15 @@ OFFERS = {
 """By the words for it, the attribute of FMI that says it."""
 
 
+LEARNED = {
+    "brought back to its start by": "restart",
+    "slopes of inputs": "sloping",
+    "communication steps": "steps",
+    "reading outputs after a jump": "reading",
+}
+"""By the words for it, the key of what the host has learned in its runs."""
+
+
 @dataclass(frozen=True)
 class Capabilities:
     """An FMU as it describes itself, and as it was found.
@@ -209,7 +218,7 @@ def read_capabilities(path: str | Path) -> Capabilities:
         indicators=int(given.numberOfEventIndicators or 0),
         log_categories=tuple(c.name for c in given.logCategories),
         groups=groups,
-        sizes=FrozenMap({g: len(vs) for g, vs in groups.items()}),
+        sizes=FrozenMap({g: len(vs) for g, vs in groups.items()} | {"states": len(given.derivatives)}),
         arrays=described.arrays,
         unused=tuple(v.name for v in given.modelVariables if v.type in ("String", "Binary", "Clock")),
     )
@@ -238,6 +247,7 @@ def tried(model: FmuModel, known: Capabilities | None = None) -> Capabilities:
     found = known or read_capabilities(model.fmu.path)
     subjects = {"two short runs": _two_runs, "derivatives at the start": _derivatives}
     words = {subject: _words(look, model, found) for subject, look in subjects.items()}
+    words |= {subject: str(model.host.learned.get(key, "")) for subject, key in LEARNED.items()}
     return replace(found, found=FrozenMap({k: v for k, v in words.items() if v}))
 
 

@@ -47,6 +47,7 @@ def test_json_has_every_variable_and_what_was_found(tmp_path):
     assert found["variables"]["parameters"]["k"]["also"] == ["stiffness"]
     assert list(found["variables"]["states"]) == ["x", "v"] and found["sizes"]["outputs"] == 2
     assert found["found"]["two short runs"].startswith("equal")
+    assert found["found"]["brought back to its start by"] == "reset"
     assert "agree with differences, for all 7" in found["found"]["derivatives at the start"]
 
 
