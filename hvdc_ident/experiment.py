@@ -2,114 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from hvdc_ident.errors import WaveformError
+from hvdc_ident.errors import WaveformError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array, Origin, Trajectory
+from hvdc_ident.signals import InputSignal
+from hvdc_ident.trajectory import Array, Origin, Trajectory, trajectory
+from hvdc_ident.waveform import input_signal
+
+__all__ = ["Experiment", "InputSignal", "SignalLike", "experiment", "recording_lines"]
+
+SignalLike: TypeAlias = InputSignal | float | ArrayLike | Callable[[Array], Any]
+"""An input: a signal, a constant, samples at the experiment's times, or a function of time evaluated there."""
 
 
-@dataclass(frozen=True, eq=False)
-class InputSignal:
-    """A piecewise linear signal with jumps.
-
-    times: (n,) in s, non-decreasing; a time that stands twice is a jump. values: (n,).
-    Before the first and after the last point the signal is constant.
-    breaks: instants at which an integrator has to stop: jumps and the corners that matter.
-    """
-
-    times: Array
-    values: Array
-    breaks: Array
-
-    def __post_init__(self) -> None:
-        for name in ("times", "values", "breaks"):
-            array = np.ascontiguousarray(getattr(self, name), dtype=float)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        t = self.times
-        if t.ndim != 1 or t.size == 0 or t.shape != self.values.shape:
-            raise WaveformError(
-                "an input signal's times and values do not fit",
-                expected="two vectors of one length, at least 1",
-                got=f"shapes {t.shape} and {self.values.shape}",
-            )
-        if not (np.isfinite(t).all() and np.isfinite(self.values).all()):
-            raise WaveformError("an input signal has a time or value that is not finite")
-        if (np.diff(t) < 0).any():
-            raise WaveformError("an input signal's times go back", expected="non-decreasing times")
-        if t.size > 2 and (t[2:] == t[:-2]).any():
-            raise WaveformError(
-                "an input signal has one time more than twice",
-                expected="at most two values at one instant: before and after a jump",
-            )
-
-    @classmethod
-    def constant(cls, value: float) -> InputSignal:
-        """A signal that never changes."""
-        return cls(np.zeros(1), np.array([float(value)]), np.empty(0))
-
-    @classmethod
-    def corners(cls, points: Iterable[tuple[float, float]]) -> InputSignal:
-        """The signal through (time, value) points joined by lines; two points at one time are a jump. Every point is a break."""
-        t, v = np.array(list(points), dtype=float).T
-        return cls(t, v, np.unique(t))
-
-    @classmethod
-    def step(cls, time: float, before: float, after: float) -> InputSignal:
-        """A jump from one value to another."""
-        return cls.corners([(time, before), (time, after)])
-
-    @classmethod
-    def ramp(cls, start: float, before: float, end: float, after: float) -> InputSignal:
-        """A ramp between two constant values."""
-        return cls.corners([(start, before), (end, after)])
-
-    def __call__(self, t: float | Array) -> Array:
-        """The value at t, after the jump where there is one."""
-        t = np.asarray(t, dtype=float)
-        right = np.searchsorted(self.times, t, side="right")
-        i, j = np.clip(right - 1, 0, None), np.clip(right, None, self.times.size - 1)
-        t0, t1 = self.times[i], self.times[j]
-        share = np.where(t1 > t0, np.clip((t - t0) / np.where(t1 > t0, t1 - t0, 1.0), 0.0, 1.0), 0.0)
-        return np.where(right == 0, self.values[0], self.values[i] + share * (self.values[j] - self.values[i]))
-
-    @property
-    def jumps(self) -> Array:
-        """(k,) instants at which the value changes at once, s."""
-        return np.asarray(self.times[1:][(np.diff(self.times) == 0) & (np.diff(self.values) != 0)])
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether the signal never changes."""
-        return bool((self.values == self.values[0]).all())
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class Experiment:
-    """One experiment: what the inputs did, when the outputs are wanted and what was measured.
+    """One experiment: how the inputs moved, the instants at which outputs are wanted, and what was recorded.
 
     time: (n,) instants at which outputs are wanted, s; one that stands twice asks for the values before and after a jump.
-    inputs: signals by input name; an input not named keeps the model's start value. A name in `drive` is a slot that follows its signal.
+    name: unique among the experiments of a fit.
+    inputs: by input name a number (constant), an InputSignal (`step`, `ramp`, `multisine`), or (n,) samples at `time`,
+    joined as those of a data file are (`waveform.input_signal`). An input not named keeps the model's start value.
+    outputs: by output name (n,) recorded samples at `time`, NaN where not recorded. Left out for a plain simulation.
+    noise: standard deviation of each recorded output, in its unit; where it is left out, a fit estimates it.
+    event: instant of the first disturbance, s. window: (from, to) in s of the rows that are compared.
+    role: "fit" or "holdout".
+
+    Further fields, all by name:
+    measured: a Trajectory with the recorded outputs, in place of `outputs`; their units stand there.
     values: inputs held constant at other than the model's start value.
-    measured: the recorded outputs at `time`, under the names of the model's outputs, NaN where not recorded; None for a
-    plain simulation.
-    noise: standard deviation of each measured output, in its unit; noise_profile: (n,) by output, the standard deviation
-    of each row over that one, where rows differ; noise_dof: how many independent samples it was estimated from, where it
-    was (else it is exact). event: instant of the first disturbance, s.
-    window: (from, to) in s of what is compared. role: "fit" or "holdout".
+    noise_profile: (n,) by output, the standard deviation of each row over `noise`, where rows differ; noise_dof: number of
+    independent samples that `noise` was estimated from (left out: it is exact).
+    drive: names among the inputs that are slots of the model and follow their signal in place of their equation.
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
     offsets: constants added to inputs all along, in their units. starts: states that begin at a value and not at rest.
-    nuisance: what is unknown about this experiment alone and is estimated with it: "time-shift", or the name of an input
+    nuisance: unknowns of this experiment alone, estimated with it: "time-shift", or the name of an input
     (its offset), a state (its start) or a parameter (a value of its own). search: of such parameters where
     a fit begins and its bounds, (start, min, max); of one not named they are the model's.
     domain: "time"; or "frequency", where `time` holds frequencies in Hz and the outputs are real and imaginary parts of
     measured responses, which a simulator of its own answers (`fit.frequency_data`).
+
+    Raises WaveformError where times, samples or names do not fit together.
+
+    >>> import numpy as np, hvdc_ident as hi
+    >>> t = np.linspace(0.0, 1.0, 5)
+    >>> record = hi.Experiment(t, inputs={"u": hi.step(0.0, 1.0, at=0.3)}, outputs={"y": [0.0, 0.0, 0.2, 0.5, 0.7]})
+    >>> record.outputs, float(record.inputs["u"](0.5))
+    (('y',), 1.0)
     """
 
     name: str
@@ -131,23 +76,50 @@ class Experiment:
     search: FrozenMap[tuple[float, float, float]] = field(default_factory=FrozenMap)
     domain: Literal["time", "frequency"] = "time"
 
-    def __post_init__(self) -> None:
-        time = np.ascontiguousarray(self.time, dtype=float)
-        if time.ndim != 1 or time.size == 0 or not np.isfinite(time).all() or (np.diff(time) < 0).any():
+    def __init__(
+        self,
+        time: ArrayLike,
+        name: str = "experiment",
+        *,
+        inputs: Mapping[str, SignalLike] | None = None,
+        outputs: Mapping[str, ArrayLike] | None = None,
+        noise: Mapping[str, float] | None = None,
+        event: float | None = None,
+        window: tuple[float, float] | None = None,
+        role: Literal["fit", "holdout"] = "fit",
+        **more: Any,
+    ) -> None:
+        where = f"experiment '{name}'"
+        if isinstance(time, str):
+            hint = f"Experiment(t, name={time!r}, inputs=..., outputs=...)"
             raise WaveformError(
-                "an experiment's times are wrong",
-                where=f"experiment '{self.name}'",
-                expected="finite, non-decreasing instants, at least one",
+                "an experiment begins with its times", expected="instants in s", got=repr(time), hint=hint
             )
-        time.setflags(write=False)
-        object.__setattr__(self, "time", time)
-        for name in ("inputs", "values", "noise", "offsets", "noise_dof", "starts", "noise_profile", "search"):
-            object.__setattr__(self, name, FrozenMap(getattr(self, name)))
+        for key in more:
+            if key not in _FURTHER:
+                raise unknown_name("field of an experiment", key, [*_STATED, *_FURTHER], where=where)
+        if role not in ("fit", "holdout"):
+            raise WaveformError("no such role", where=where, expected='"fit" or "holdout"', got=repr(role))
+        instants = _instants(time, where)
+        table = more.get("measured")
+        if outputs is not None and table is not None:
+            raise WaveformError("outputs and measured are both given", where=where, expected="one of them")
+        if outputs is not None:
+            columns = {n: _samples(n, v, instants, f"{where}, output") for n, v in outputs.items()}
+            table = trajectory(instants, columns)
+        if table is not None and not np.array_equal(table.time, instants):
+            raise WaveformError("the measured outputs stand at other times than the experiment's", where=where)
+        signals = {n: _signal(n, v, instants, where) for n, v in (inputs or {}).items()}
+        stated = {"inputs": signals, "noise": _deviations(noise or {}, where), "event": event, "window": window}
+        given = {**more, **stated, "name": name, "time": instants, "measured": table, "role": role}
+        for f in fields(self):
+            value = given.get(f.name)
+            if value is None and f.default is not MISSING:
+                value = f.default
+            elif f.default_factory is FrozenMap:
+                value = FrozenMap(value or {})
+            object.__setattr__(self, f.name, value)
         object.__setattr__(self, "instrument", FrozenMap({k: FrozenMap(v) for k, v in self.instrument.items()}))
-        if self.measured is not None and not np.array_equal(self.measured.time, time):
-            raise WaveformError(
-                "the measured outputs stand at other times than the experiment's", where=f"experiment '{self.name}'"
-            )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -208,9 +180,87 @@ def recording_lines(recording: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def experiment(
-    name: str, time: Any, inputs: Mapping[str, InputSignal | float] | None = None, **rest: Any
-) -> Experiment:
-    """An experiment whose inputs may be given as numbers too."""
-    signals = {k: v if isinstance(v, InputSignal) else InputSignal.constant(v) for k, v in (inputs or {}).items()}
-    return Experiment(name, np.asarray(time, dtype=float), FrozenMap(signals), **rest)
+_STATED = ("name", "inputs", "outputs", "noise", "event", "window", "role")
+_FURTHER = tuple(f.name for f in fields(Experiment) if f.name not in (*_STATED, "time"))
+
+
+def experiment(name: str, time: Any, inputs: Mapping[str, SignalLike] | None = None, **rest: Any) -> Experiment:
+    """Return an experiment, its name first."""
+    return Experiment(time, name, inputs=inputs, **rest)
+
+
+def _instants(time: ArrayLike, where: str) -> Array:
+    """Return the times as an array that cannot be changed. Raises WaveformError."""
+    expected = "finite, non-decreasing instants in s, at least one"
+    kept = isinstance(time, np.ndarray) and time.dtype == np.float64 and not time.flags.writeable
+    try:
+        found = np.asarray(time) if kept else np.array(time, dtype=float)
+    except (TypeError, ValueError):
+        raise WaveformError(
+            "an experiment's times are no numbers", where=where, expected=expected, got=str(time)[:60]
+        ) from None
+    if found.ndim != 1 or found.size == 0 or not np.isfinite(found).all() or (np.diff(found) < 0).any():
+        got = f"shape {found.shape}" if found.ndim != 1 or found.size == 0 else ""
+        raise WaveformError("an experiment's times are wrong", where=where, expected=expected, got=got)
+    found.setflags(write=False)
+    return found
+
+
+def _samples(name: str, values: ArrayLike, time: Array, where: str) -> Array:
+    """Return (n,) recorded samples. Raises WaveformError where they are no numbers or not as many as the times."""
+    place = f"{where} '{name}'"
+    try:
+        found = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise WaveformError(
+            "the samples are no numbers", where=place, expected=f"{time.size} numbers", got=str(values)[:60]
+        ) from None
+    if found.shape != time.shape:
+        raise WaveformError(
+            "the samples are not as many as the times",
+            where=place,
+            expected=f"shape {time.shape}",
+            got=f"{found.shape}",
+        )
+    return found
+
+
+def _signal(name: str, value: SignalLike, time: Array, where: str) -> InputSignal:
+    """Return the input signal that a number or samples stand for."""
+    if isinstance(value, InputSignal):
+        return value
+    if isinstance(value, int | float | np.number):
+        if not np.isfinite(value):
+            raise WaveformError("an input's value is not finite", where=f"{where}, input '{name}'", got=f"{value}")
+        return InputSignal.constant(float(value))
+    if callable(value):
+        value = np.asarray(value(time))
+    samples = _samples(name, value, time, f"{where}, input")
+    if not np.isfinite(samples).all():
+        first = time[int(np.argmin(np.isfinite(samples)))]
+        raise WaveformError(
+            f"the input is not recorded at {first:g} s",
+            where=f"{where}, input '{name}'",
+            expected="a number at every time: only outputs may have gaps",
+        )
+    return input_signal(time, samples)
+
+
+def _deviations(noise: Mapping[str, float], where: str) -> dict[str, float]:
+    """Return the standard deviations as plain numbers. Raises WaveformError for one that is none."""
+    if not isinstance(noise, Mapping):
+        raise WaveformError(
+            "noise is not given by output",
+            where=where,
+            expected='a standard deviation by output: noise={"y": 1e-3}',
+            got=repr(noise),
+        )
+    for name, value in noise.items():
+        if not (isinstance(value, int | float | np.number) and not np.isnan(value)):
+            raise WaveformError(
+                "no standard deviation",
+                where=f"{where}, noise of '{name}'",
+                expected="a number",
+                got=repr(value),
+            )
+    return {n: float(v) for n, v in noise.items()}

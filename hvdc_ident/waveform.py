@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.experiment import InputSignal
+from hvdc_ident.signals import InputSignal
 from hvdc_ident.trajectory import Array
 
 __all__ = [

@@ -48,7 +48,7 @@ def frequency_experiment(response: MeasuredResponse) -> Experiment:
     )
     dof = dict.fromkeys(noise, response.dof) if np.isfinite(response.dof) else {}
     return Experiment(
-        response.name, measured.time, measured=measured, noise=FrozenMap(noise), noise_profile=FrozenMap(profile),
+        measured.time, response.name, measured=measured, noise=FrozenMap(noise), noise_profile=FrozenMap(profile),
         noise_dof=FrozenMap(dof), role=response.role, domain="frequency",
     )  # fmt: skip
 

@@ -143,7 +143,7 @@ class _Ends:
         chosen = {n: (values or self.values)[n] for n in self.entrance.parameters}
 
         def run(time: Array) -> Simulation:
-            passing = Experiment("entrance", time, FrozenMap(given))
+            passing = Experiment(time, "entrance", inputs=FrozenMap(given))
             return engine_run(self.entrance, passing, chosen, sensitivities, tolerance=self.tolerance)
 
         grid = refined(lambda time: run(time).trajectory.values, e.time, self.breaks)
@@ -157,7 +157,7 @@ class _Ends:
         return inputs, slopes
 
     def _inside(self, inputs: Mapping[str, InputSignal], sensitivities: tuple[str, ...]) -> Simulation:
-        inner = Experiment(self.experiment.name, self.time, FrozenMap(inputs))
+        inner = Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs))
         return bare(self.model, inner, self.given, sensitivities, self.raw, self.tolerance)
 
     def _moving(self, name: str) -> Array:
@@ -213,7 +213,7 @@ class _Ends:
                 f"s{k}": signal_of(self.time, slope[:, self.raw.index(n)], self.breaks) for k, n in enumerate(outputs)
             }
         values = {n: self.values[n] for n in self.exit.parameters}
-        inner = Experiment("exit", self.experiment.time, FrozenMap(signals))
+        inner = Experiment(self.experiment.time, "exit", inputs=FrozenMap(signals))
         leaving = self.exit if slope is None else exit_(self.model, along=True)
         run = engine_run(leaving, inner, values, sensitivities, tolerance=self.tolerance)
         leaving_as = [f"y{outputs.index(n)}" for n in self.names]

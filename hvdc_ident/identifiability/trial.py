@@ -95,7 +95,7 @@ class Trial:
         """The experiment over the template's instants; nothing is recorded, so every output is given."""
         end = float(template.time[-1])
         signals = FrozenMap({m.input: m.signal(end) for m in self.moves})
-        return Experiment(self.kind, template.time, signals, event=self.moves[0].at)
+        return Experiment(template.time, self.kind, inputs=signals, event=self.moves[0].at)
 
     def text(self, units: Mapping[str, str]) -> str:
         """The trial in words, without a full stop."""

@@ -312,7 +312,7 @@ def simulated_response(
         return m, sum(terms, start=u)
 
     excited = rewritten(model, input, "multisine", multisine)
-    run = simulate(excited, Experiment("multisine", time), values, outputs=list(outputs), rtol=rtol)
+    run = simulate(excited, Experiment(time, "multisine"), values, outputs=list(outputs), rtol=rtol)
     found = np.empty((harmonics.size, len(outputs), 1), dtype=complex)
     drive = amplitude * np.exp(1j * (phases - np.pi / 2)) / 2
     for i, name in enumerate(outputs):

@@ -270,7 +270,7 @@ def steady_sensitivities(
     names = tuple(model.parameters if parameters is None else parameters)
     _, scale = factors(model, names, values or {}, ranges or {})
     shown = tuple(outputs or model.outputs)
-    rest = Experiment("rest", np.zeros(1))
+    rest = Experiment(np.zeros(1), "rest")
     run = simulate(model, rest, values, names, outputs=shown)
     steady = dict(zip(shown, run.trajectory.values[0].tolist(), strict=True))
     return SteadySensitivities(model.name, shown, names, FrozenMap(steady), scale, run.gradients[0])

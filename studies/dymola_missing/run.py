@@ -53,7 +53,7 @@ def setup() -> tuple[Model, Experiment, tuple[Free, ...]]:
     assert record is not None
     columns = np.column_stack([np.interp(time, given.time, record[o]) for o in given.outputs])
     measured = Trajectory(time, columns, given.outputs, tuple("pu" for _ in given.outputs))
-    even = Experiment(given.name, time, given.inputs, measured=measured, noise=given.noise, event=given.event)
+    even = Experiment(time, given.name, inputs=given.inputs, measured=measured, noise=given.noise, event=given.event)
     assert isinstance(study.model, Model)
     return study.model, even, tuple(study.candidates.values())
 

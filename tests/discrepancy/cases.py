@@ -77,7 +77,9 @@ def experiments(
         y = np.column_stack([_noisy(clean[:, k], s, noise, random) for k, s in enumerate(SIGMA.values())])
         measured = Trajectory(TIME, y, tuple(SIGMA), ("", ""))
         told = FrozenMap(SIGMA) if noise == "white" else FrozenMap()
-        found.append(Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=told, event=EVENT, role=role))
+        found.append(
+            Experiment(TIME, name, inputs=FrozenMap(inputs), measured=measured, noise=told, event=EVENT, role=role)
+        )
     return tuple(found)
 
 

@@ -31,7 +31,9 @@ def records(course: Callable[[dict[str, InputSignal]], Array]) -> tuple[Experime
         inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
         measured = noisy(course(inputs), random)
         found.append(
-            Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
+            Experiment(
+                TIME, name, inputs=FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role
+            )
         )
     return tuple(found)
 

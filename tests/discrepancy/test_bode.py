@@ -19,9 +19,9 @@ def lagged(event: float) -> np.ndarray:
 @pytest.mark.parametrize("event", [0.1, 0.1 + 0.4 * STEP, 0.1 + 0.9 * STEP])
 def test_a_record_shows_no_delay_of_its_own(event: float) -> None:
     e = Experiment(
-        "e",
         TIME,
-        FrozenMap({"u": InputSignal.step(event, 0.0, 1.0)}),
+        "e",
+        inputs=FrozenMap({"u": InputSignal.step(event, 0.0, 1.0)}),
         measured=Trajectory(TIME, lagged(event)[:, None], ("y",), ("",)),
     )
     omega, h = recorded(e, "u", "y", 0.0)

@@ -35,7 +35,7 @@ def records(rho: float, seed: int, told: float | None) -> list[Experiment]:
     noise = FrozenMap({} if told is None else {n: told * s for n, s in SIGMA.items()})
     return [
         Experiment(
-            f"e{k}", times, FrozenMap(step), event=0.2, noise=noise,
+            times, f"e{k}", inputs=FrozenMap(step), event=0.2, noise=noise,
             measured=Trajectory(times, y[:, k] * list(SIGMA.values()), tuple(SIGMA), ("", "", "")),
         )
         for k in range(3)

@@ -166,7 +166,7 @@ def test_a_limit_that_is_never_reached_is_not_excited() -> None:
 
 def test_nothing_moves_nothing_is_excited() -> None:
     time = np.linspace(0, 1, 200)
-    run = simulate(model(), Experiment("still", time))
+    run = simulate(model(), Experiment(time, "still"))
     random = np.random.default_rng(0)
     noisy = run.trajectory.values + 1e-3 * random.standard_normal(run.trajectory.values.shape)
     still = experiment("still", time, {"ref": InputSignal.constant(1.0)}, event=0.5).with_(

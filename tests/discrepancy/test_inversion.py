@@ -39,7 +39,9 @@ def levels() -> tuple[tuple[Experiment, ...], dict[str, Array]]:
         seen = y + random.standard_normal(y.shape) * list(SIGMA.values())
         measured = Trajectory(TIME, seen, tuple(SIGMA), ("", ""))
         found.append(
-            Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role)
+            Experiment(
+                TIME, name, inputs=FrozenMap(inputs), measured=measured, noise=FrozenMap(SIGMA), event=EVENT, role=role
+            )
         )
     return tuple(found), asked
 

@@ -65,9 +65,9 @@ def recorded() -> Experiment:
     """Fifteen sines in the reference, known at the record's rows."""
     values = 1.0 + 0.05 * sum(np.sin(f * TIME) for f in np.geomspace(4.0, 120.0, 15))
     return Experiment(
-        "recorded",
         TIME,
-        FrozenMap({"ref": InputSignal.corners(list(zip(TIME, values, strict=True)))}),
+        "recorded",
+        inputs=FrozenMap({"ref": InputSignal.corners(list(zip(TIME, values, strict=True)))}),
         measured=experiments()[0].measured,
     )
 

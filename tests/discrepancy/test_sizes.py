@@ -47,7 +47,7 @@ def record(levels, role, seed):
     signal = InputSignal(np.array([0.0, *np.repeat(edges, 2), t[-1]]), np.repeat(levels, 2).astype(float), edges)
     measured = Trajectory(t, y[:, None], ("y",), ("",))
     return Experiment(
-        f"{role}{seed}", t, FrozenMap({"r": signal}), measured=measured, noise=FrozenMap({"y": 1e-3}), role=role
+        t, f"{role}{seed}", inputs=FrozenMap({"r": signal}), measured=measured, noise=FrozenMap({"y": 1e-3}), role=role
     )
 
 

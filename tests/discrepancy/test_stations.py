@@ -93,7 +93,9 @@ def records() -> list[Experiment]:
         values = _solved(moves) + random.normal(size=(TIME.size, 4)) * SIGMA
         measured = Trajectory(TIME, values, OUTPUTS, ("",) * 4)
         noise = FrozenMap(dict(zip(OUTPUTS, SIGMA, strict=True)))
-        found.append(Experiment(name, TIME, FrozenMap(inputs), measured=measured, noise=noise, event=0.2, role=role))
+        found.append(
+            Experiment(TIME, name, inputs=FrozenMap(inputs), measured=measured, noise=noise, event=0.2, role=role)
+        )
     return found
 
 

@@ -202,7 +202,7 @@ class Block:
             if source is not None:
                 signals["source"] = _signal(time, source[:, c])
             values = {n: float(v[c]) for n, v in parameters.items()}
-            run = simulate(self.model, Experiment("alone", time, FrozenMap(signals)), values, rtol=1e-5)
+            run = simulate(self.model, Experiment(time, "alone", inputs=FrozenMap(signals)), values, rtol=1e-5)
             y[:, c] = run["y"]
         return y
 

@@ -48,9 +48,9 @@ def experiments_of(case: Case) -> tuple[Experiment, ...]:
         measured = Trajectory(rows, records, names, tuple("" for _ in names))
         found.append(
             Experiment(
-                NAMES[k],
                 rows,
-                FrozenMap(inputs),
+                NAMES[k],
+                inputs=FrozenMap(inputs),
                 measured=measured,
                 noise=FrozenMap(noise),
                 event=case.event,
