@@ -23,8 +23,8 @@ from numba import njit
 
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import Tolerance, engine, simulate
 from hvdc_ident.simulate.call import call
+from hvdc_ident.simulate.engine import Tolerance, engine, simulate
 from hvdc_ident.simulate.structure import NAMES
 
 GAINS = ("KPVDC", "KIVDC", "KPP", "KIP", "KPQ", "KIQ", "KPQ2", "KIQ2")

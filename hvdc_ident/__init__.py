@@ -1,34 +1,45 @@
-"""Linearisation, identifiability, calibration and discrepancy diagnosis of converter models.
+"""Linearisation, identifiability, calibration and discrepancy diagnosis of converter and power-system models.
 
-The verbs and the nouns of the package; each is imported when it is first used.
+    import hvdc_ident as hi
+
+    hi.check        what a study, a model and its data hold      hi.simulate    outputs over time, with exact derivatives
+    hi.linearize    A, B, C, D, modes, margins                   hi.bode        a frequency response
+    hi.sweep        errors over a range of parameters            hi.sensitivities   exact derivatives of everything
+    hi.identify     what the data tell about the parameters      hi.fit         the estimates, with intervals
+    hi.diagnose     what the model lacks                         hi.export      to an FMU, Modelica, MATLAB, CSV
+
+Each takes a model (`hi.Model`, a shipped name, a path), data (`hi.Experiment`, a table, a study) or a whole study.
 """
 
 from __future__ import annotations
 
-import importlib
-import sys
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from hvdc_ident.api import (
+    bode,
+    check,
+    diagnose,
+    export,
+    find_operating_point,
+    fit,
+    identify,
+    linearize,
+    sensitivities,
+    simulate,
+    sweep,
+)
+from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
-    import inspect
-
-    from hvdc_ident.discrepancy import diagnose
-    from hvdc_ident.experiment import Experiment, InputSignal
-    from hvdc_ident.fit import fit
+    from hvdc_ident.discrepancy import Diagnosis
+    from hvdc_ident.experiment import Experiment
+    from hvdc_ident.fit.result import FitResult
     from hvdc_ident.formats import read_waveforms
-    from hvdc_ident.identifiability import identifiability
-    from hvdc_ident.linearize import (
-        LinearModel,
-        OperatingPoint,
-        continuation,
-        find_operating_point,
-        linearize,
-        one_sided,
-        point_at,
-    )
+    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.linearize.compare import compare
     from hvdc_ident.linearize.gap import gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.jacobian import one_sided
+    from hvdc_ident.linearize.linear_model import LinearModel
     from hvdc_ident.linearize.locus import root_locus
     from hvdc_ident.linearize.loop import loop, plant_and_controller
     from hvdc_ident.linearize.margins import loop_margins, margins
@@ -39,6 +50,7 @@ if TYPE_CHECKING:
         simulated_response,
     )
     from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
+    from hvdc_ident.linearize.operating_point import OperatingPoint, continuation, point_at
     from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
     from hvdc_ident.linearize.reduce import balanced
     from hvdc_ident.linearize.response_file import read_response
@@ -48,17 +60,19 @@ if TYPE_CHECKING:
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.sensitivity.global_screening import morris, sobol
     from hvdc_ident.sensitivity.linear import linear_sensitivities
-    from hvdc_ident.sensitivity.local import sensitivities
-    from hvdc_ident.sensitivity.sweep import sweep
-    from hvdc_ident.simulate import simulate
-    from hvdc_ident.study.export import export
-    from hvdc_ident.study.study import load_study
+    from hvdc_ident.sensitivity.sweep_result import SweepResult
+    from hvdc_ident.signals import InputSignal, multisine, ramp, step
+    from hvdc_ident.simulate.result import Simulation
+    from hvdc_ident.study.study import Study, load_study
     from hvdc_ident.trajectory import Trajectory
 
     __version__: str
 
 __all__ = [
+    "Diagnosis",
     "Experiment",
+    "FitResult",
+    "IdentifiabilityReport",
     "Input",
     "InputSignal",
     "LinearModel",
@@ -67,9 +81,14 @@ __all__ = [
     "OperatingPoint",
     "Parameter",
     "Port",
+    "Simulation",
+    "Study",
+    "SweepResult",
     "Trajectory",
     "__version__",
     "balanced",
+    "bode",
+    "check",
     "compare",
     "continuation",
     "diagnose",
@@ -79,7 +98,7 @@ __all__ = [
     "gap",
     "h2_norm",
     "hinf_norm",
-    "identifiability",
+    "identify",
     "linear_sensitivities",
     "linearize",
     "linf_norm",
@@ -89,6 +108,7 @@ __all__ = [
     "loop_margins",
     "margins",
     "morris",
+    "multisine",
     "ncf_margin",
     "nu_gap",
     "one_sided",
@@ -96,6 +116,7 @@ __all__ = [
     "point_at",
     "port_admittance",
     "port_impedance",
+    "ramp",
     "read_response",
     "read_waveforms",
     "response_at_tones",
@@ -105,105 +126,56 @@ __all__ = [
     "simulate",
     "simulated_response",
     "sobol",
+    "step",
     "sweep",
     "symbolic_transfer",
 ]
 
-_HOME = {
-    "Experiment": "experiment",
-    "Input": "parameters",
-    "InputSignal": "experiment",
-    "LinearModel": "linearize",
-    "MeasuredResponse": "linearize.measured",
-    "Model": "model.definition",
-    "OperatingPoint": "linearize",
-    "Parameter": "parameters",
-    "Port": "linearize.port",
-    "Trajectory": "trajectory",
-    "balanced": "linearize.reduce",
-    "compare": "linearize.compare",
-    "continuation": "linearize",
-    "diagnose": "discrepancy",
-    "export": "study.export",
-    "find_operating_point": "linearize",
-    "fit": "fit",
-    "gap": "linearize.gap",
-    "h2_norm": "linearize.norms",
-    "hinf_norm": "linearize.norms",
-    "identifiability": "identifiability",
-    "linear_sensitivities": "sensitivity.linear",
-    "linearize": "linearize",
-    "linf_norm": "linearize.norms",
-    "load_model": "models",
-    "load_study": "study.study",
-    "loop": "linearize.loop",
-    "loop_margins": "linearize.margins",
-    "margins": "linearize.margins",
-    "morris": "sensitivity.global_screening",
-    "ncf_margin": "linearize.gap",
-    "nu_gap": "linearize.gap",
-    "one_sided": "linearize",
-    "plant_and_controller": "linearize.loop",
-    "point_at": "linearize",
-    "port_admittance": "linearize.port",
-    "port_impedance": "linearize.port",
-    "read_response": "linearize.response_file",
-    "read_waveforms": "formats",
-    "response_at_tones": "linearize.measured",
-    "response_from_record": "linearize.measured",
-    "root_locus": "linearize.locus",
-    "sensitivities": "sensitivity.local",
-    "simulate": "simulate",
-    "simulated_response": "linearize.measured",
-    "sobol": "sensitivity.global_screening",
-    "sweep": "sensitivity.sweep",
-    "symbolic_transfer": "linearize.symbolic",
-}
+_imported = offered(
+    __name__,
+    {
+        "discrepancy": "Diagnosis",
+        "experiment": "Experiment",
+        "fit.result": "FitResult",
+        "formats": "read_waveforms",
+        "identifiability": "IdentifiabilityReport",
+        "linearize.compare": "compare",
+        "linearize.gap": "gap ncf_margin nu_gap",
+        "linearize.jacobian": "one_sided",
+        "linearize.linear_model": "LinearModel",
+        "linearize.locus": "root_locus",
+        "linearize.loop": "loop plant_and_controller",
+        "linearize.margins": "loop_margins margins",
+        "linearize.measured": "MeasuredResponse response_at_tones response_from_record simulated_response",
+        "linearize.norms": "h2_norm hinf_norm linf_norm",
+        "linearize.operating_point": "OperatingPoint continuation point_at",
+        "linearize.port": "Port port_admittance port_impedance",
+        "linearize.reduce": "balanced",
+        "linearize.response_file": "read_response",
+        "linearize.symbolic": "symbolic_transfer",
+        "model.definition": "Model",
+        "models": "load_model",
+        "parameters": "Input Parameter",
+        "sensitivity.global_screening": "morris sobol",
+        "sensitivity.linear": "linear_sensitivities",
+        "sensitivity.sweep_result": "SweepResult",
+        "signals": "InputSignal multisine ramp step",
+        "simulate.result": "Simulation",
+        "study.study": "Study load_study",
+        "trajectory": "Trajectory",
+    },
+)
 
 
-_VERBS = ("fit", "identifiability", "linearize", "simulate")
-"""Names of a function and of the folder it lives in."""
+if not TYPE_CHECKING:
 
+    def __getattr__(name):
+        """Return a public name, imported now; or the version."""
+        if name == "__version__":
+            from importlib.metadata import version
 
-class _Verb(ModuleType):
-    """A folder that can be called: it runs the function of its own name."""
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        return self._function(*arguments, **named)
-
-    @property
-    def _function(self) -> Any:
-        return self.__dict__[self.__name__.rpartition(".")[2]]
-
-    @property
-    def __signature__(self) -> inspect.Signature:
-        import inspect
-
-        return inspect.signature(self._function)
-
-
-class _Package(ModuleType):
-    """The package; importing `hvdc_ident.fit` puts that folder under the verb's name: it answers the call."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in _VERBS and isinstance(value, ModuleType):
-            value.__class__ = _Verb
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
-
-
-def __getattr__(name: str) -> Any:
-    """The public name, imported now; or the version."""
-    if name == "__version__":
-        from importlib.metadata import version
-
-        return version("hvdc_ident")
-    if name not in _HOME:
-        raise AttributeError(f"module 'hvdc_ident' has no attribute '{name}'")
-    module = importlib.import_module(f"hvdc_ident.{_HOME[name]}")
-    return module if name in _VERBS else getattr(module, name)
+            return version("hvdc_ident")
+        return _imported(name)
 
 
 def __dir__() -> list[str]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import re
 import subprocess
 import sys
+import textwrap
 
 import pytest
 
@@ -17,7 +16,6 @@ def test_all_names_resolve() -> None:
     for name in hvdc_ident.__all__:
         assert getattr(hvdc_ident, name) is not None
     assert sorted(hvdc_ident.__all__) == list(hvdc_ident.__all__) == dir(hvdc_ident)
-    assert set(hvdc_ident._HOME) | {"__version__"} == set(hvdc_ident.__all__)
 
 
 def test_another_name_is_an_attribute_error() -> None:
@@ -31,10 +29,15 @@ def test_public_names_have_a_docstring(name: str) -> None:
 
 
 @pytest.mark.parametrize("verb", ["fit", "linearize", "simulate"])
-def test_a_verb_can_be_called_whatever_was_imported_first(verb: str) -> None:
-    folder = importlib.import_module(f"hvdc_ident.{verb}")
-    assert callable(getattr(hvdc_ident, verb))
-    assert inspect.signature(getattr(hvdc_ident, verb)) == inspect.signature(getattr(folder, verb))
+def test_a_verb_is_a_function_whatever_was_imported_first(verb: str) -> None:
+    code = f"""
+        import hvdc_ident.{verb}, inspect, types
+        import hvdc_ident as hi
+        from hvdc_ident.{verb} import {verb}
+        assert type(hi) is types.ModuleType and inspect.isfunction(hi.{verb}) and inspect.isfunction({verb})
+        assert "Return" in hi.{verb}.__doc__ and inspect.signature(hi.{verb})
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)
 
 
 def test_version_is_a_version() -> None:

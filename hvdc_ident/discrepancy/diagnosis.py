@@ -24,9 +24,9 @@ from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
 from hvdc_ident.discrepancy.verdict.lines import detectable, lines
 from hvdc_ident.errors import StudyError, unknown_name
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator
-from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel, recording

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import SimulationError, StudyError
-from hvdc_ident.fit.executor import Executor, mapped
+from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
+from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.clock import has_clocks, searched
-from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.fit.intervals import estimates_of
 from hvdc_ident.fit.noise import floor_of, source_of, source_text
 from hvdc_ident.fit.nuisance import unknown_of

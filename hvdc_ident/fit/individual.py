@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.estimate import fit
-from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem

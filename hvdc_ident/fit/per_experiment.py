@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from hvdc_ident.errors import StudyError, unknown_name
+from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.estimate import fit
-from hvdc_ident.fit.executor import Executor, Progress, mapped
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import FitResult

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.executor import Executor, Progress, mapped
+from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.objective import Objective, Reached, descend
 from hvdc_ident.fit.profile_walk import (
     ONE_SIDED,

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
-from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.noise import unknown_noise
 from hvdc_ident.fit.profile import Walk

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from hvdc_ident.executor import Progress
 from hvdc_ident.fit import Free, Problem
-from hvdc_ident.fit.executor import Progress
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.optima import OtherOptimum

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from hvdc_ident.fit.executor import Executor
+from hvdc_ident.executor import Executor
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import Profile, Profiles, profiles
 from hvdc_ident.identifiability import verdicts

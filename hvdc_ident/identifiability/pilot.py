@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from hvdc_ident.errors import FitError, SimulationError
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import adequacy
-from hvdc_ident.fit.executor import Executor, Progress
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, source_of
 from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hvdc_ident.errors import ComputationError, InputError, StudyError
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.sensitivity.axes import Samples
-from hvdc_ident.sensitivity.sweep import Progress, Runner, sweep
+from hvdc_ident.sensitivity.sweep import sweep
 from hvdc_ident.sensitivity.text import table_text
 from hvdc_ident.trajectory import Array
 
@@ -102,7 +103,7 @@ def morris(
     trajectories: int = 20,
     levels: int = 4,
     seed: int = 0,
-    executor: Runner | None = None,
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Screening:
     """Elementary effects of the RMSE over the ranges: trajectories (k + 1) runs for k parameters; same seed, same result.
@@ -147,7 +148,7 @@ def sobol(
     values: Mapping[str, float] | None = None,
     samples: int = 256,
     seed: int = 0,
-    executor: Runner | None = None,
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Screening:
     """First-order and total shares of the RMSE's variance over the ranges: samples (k + 2) runs; same seed, same result.
@@ -213,7 +214,7 @@ def _errors(
     against: Literal["data", "base"] | Model,
     outputs: Sequence[str] | None,
     values: Mapping[str, float] | None,
-    executor: Runner | None,
+    executor: Executor | None,
     progress: Progress | None,
 ) -> tuple[Array, tuple[tuple[str, str], ...], str]:
     """(runs, series) RMSE, nan where a run failed; what the columns are; the first reason."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.executor import Executor, Progress, ends
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
@@ -19,28 +20,9 @@ from hvdc_ident.sensitivity.question import Want, check, task_of
 from hvdc_ident.sensitivity.sweep_result import SweepResult
 from hvdc_ident.trajectory import Array
 
-Progress = Callable[[int, int, str], None]
-"""Called with points done, points in all, and a line of text."""
 CHUNK = 2048  # points looked up, queued or written at a time
 PROBE, WORTH = 0.3, 2.0  # s: points run here first; work left that is worth starting other processes for
 TOLD = 0.1  # s between two reports of progress
-
-
-class Ended(Protocol):
-    """What became of one item: its place among the items, and its value, or why it has none."""
-
-    @property
-    def index(self) -> int: ...
-    @property
-    def value(self) -> Any: ...
-    @property
-    def failure(self) -> str: ...
-
-
-class Runner(Protocol):
-    """Anything that runs a function over items and tells what became of each, in any order."""
-
-    def run(self, function: Callable[[Any], Any], items: Iterator[Any], /) -> Iterator[Ended]: ...
 
 
 class Kept(Protocol):
@@ -86,7 +68,7 @@ def sweep(
     want: Sequence[Want] = ("rmse",),
     linear: tuple[Sequence[str], Sequence[str]] | None = None,
     omega: Array | None = None,
-    executor: Runner | None = None,
+    executor: Executor | None = None,
     kept: Callable[[str], Kept] | None = None,
     progress: Progress | None = None,
 ) -> SweepResult:
@@ -102,7 +84,8 @@ def sweep(
 
     Raises InputError for names, values, bounds or data that do not fit, ComputationError where the reference fails.
 
-    >>> from hvdc_ident import load_model, sweep
+    >>> from hvdc_ident import load_model
+    >>> from hvdc_ident.sensitivity.sweep import sweep
     >>> found = sweep(load_model("vsc-hvdc-link"), [], {"KIVDC": [250.0, 750.0, 1500.0]}, want=["poles"])
     >>> len(found), found.poles.shape
     (3, (3, 6))
@@ -154,7 +137,7 @@ def _known(table: _Table, shelf: Kept | None, told: _Told) -> NDArray[np.intp]:
     return np.array(open_, dtype=np.intp)
 
 
-def _run(table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor: Runner | None, told: _Told) -> None:
+def _run(table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor: Executor | None, told: _Told) -> None:
     """Every missing point run: here while that is quick, in the executor where there is much left."""
     begin, count = time.perf_counter(), 0
     for count, (index, row) in enumerate(_rows(table.points, missing), start=1):
@@ -165,14 +148,14 @@ def _run(table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor:
     left = missing[count:]
     if not left.size or executor is None:
         return
-    for end in executor.run(table.task, (row for _, row in _rows(table.points, left))):
-        index = int(left[end.index])
+    for place, packed, failure in ends(executor, table.task, (row for _, row in _rows(table.points, left))):
+        index = int(left[place])
         row = table.points.rows(index, index + 1)[0]
-        if end.failure:
-            table.failed[index] = end.failure
+        if failure:
+            table.failed[index] = failure
             told.step()
         else:
-            _finish(table, index, row, end.value, shelf, told)
+            _finish(table, index, row, packed, shelf, told)
 
 
 def _finish(table: _Table, index: int, row: Array, packed: bytes, shelf: Kept | None, told: _Told) -> None:

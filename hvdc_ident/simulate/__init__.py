@@ -1,6 +1,13 @@
 """From a model to trajectories with exact sensitivities."""
 
-from hvdc_ident.simulate.engine import Engine, Tolerance, engine, simulate
-from hvdc_ident.simulate.result import Simulation, Statistics
+from typing import TYPE_CHECKING
 
-__all__ = ["Engine", "Simulation", "Statistics", "Tolerance", "engine", "simulate"]
+from hvdc_ident.lazy import offered
+
+if TYPE_CHECKING:
+    from hvdc_ident.simulate.engine import Engine, Tolerance, simulate
+    from hvdc_ident.simulate.result import Simulation, Statistics
+else:
+    __getattr__ = offered(__name__, {"engine": "Engine Tolerance simulate", "result": "Simulation Statistics"})
+
+__all__ = ["Engine", "Simulation", "Statistics", "Tolerance", "simulate"]

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hvdc_ident.executor import Progress
 from hvdc_ident.files import write_text
-from hvdc_ident.study.stage import Progress, silent
+from hvdc_ident.study.stage import silent
 from hvdc_ident.study.waveforms import Campaign, write_waveforms
 
 QUESTIONS = """

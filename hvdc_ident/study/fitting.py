@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +16,14 @@ from hvdc_ident.fit.individual import part_of
 from hvdc_ident.fit.loss import loss
 from hvdc_ident.fit.tolerance import tolerance
 from hvdc_ident.fit.windowed import windowed_errors
+from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.model.definition import Model
+from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
 from hvdc_ident.study.schema import Fit
 from hvdc_ident.study.unknowns import priors
 
 if TYPE_CHECKING:
-    from hvdc_ident.fit.executor import Executor, Progress
+    from hvdc_ident.executor import Executor, Progress
     from hvdc_ident.study.study import Study
 
 
@@ -61,6 +63,30 @@ def groups_of(study: Study, problem: Problem) -> list[Group]:
         for g in asked_of(study).groups
     ]
     return [g for g in groups if g.parameters]
+
+
+def need(study: Study, stage: str) -> None:
+    """Raise StudyError where the study has no data to fit or no candidate, SteadyStateError where it has no start."""
+    need_experiments(study, stage, role="fit", responses=True)
+    need_candidates(study, stage)
+    need_start(study)
+
+
+def estimated(
+    study: Study,
+    report: Mapping[str, Any],
+    *,
+    force: Sequence[str] = (),
+    seed: int = 0,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> FitResult:
+    """Return the fit of the candidates that a report, as its `to_dict`, calls identifiable, and of those that are forced."""
+
+    def fit_of(open_set: Problem) -> FitResult:
+        return fitted(study, with_settings(study, open_set), seed=seed, executor=executor, progress=progress)
+
+    return gated_fit(problem_of(study), report, fit_of, force=force, whole=as_reported(study))
 
 
 def fitted(

@@ -32,6 +32,14 @@ EXPECTED = {
 }
 
 
+def is_study(path: Path) -> bool:
+    """Return whether a file is a study and no model card: TOML with a table [model]."""
+    try:
+        return isinstance(_toml(path.read_bytes(), path.name).get("model"), dict)
+    except (OSError, StudyError):
+        return False
+
+
 def parse_study(content: bytes, path: Path) -> StudyFile:
     """The study file's tables. Raises StudyError: not text or TOML, another schema, a key or value that is wrong."""
     where = path.name
@@ -42,6 +50,11 @@ def parse_study(content: bytes, path: Path) -> StudyFile:
         raise StudyError(
             "a schema this version does not read", where=f"{where}, schema", expected="1", got=_shown(table["schema"])
         )
+    return checked(table, where)
+
+
+def checked(table: dict[str, Any], where: str) -> StudyFile:
+    """Return a study's tables, checked. Raises StudyError for a key or a value that is wrong."""
     try:
         return StudyFile.model_validate(table)
     except ValidationError as e:

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from hvdc_ident.study.stage import Progress, silent
+from hvdc_ident.executor import Progress
+from hvdc_ident.study.stage import silent
 
 PATIENCE = 1.0  # s
 

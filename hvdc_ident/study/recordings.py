@@ -112,6 +112,27 @@ def read_experiments(
     return tuple(found), FrozenMap(notes)
 
 
+def with_noise(experiment: Experiment) -> tuple[Experiment, FrozenMap[NoiseNote]]:
+    """Return the experiment with its event and the noise of its outputs where it does not state them, and their sources.
+
+    By the rules of a data file: the noise is estimated before the event, and where there is none the fit's residual tells.
+    """
+    e = experiment
+    event = e.event if e.event is not None else event_time(e.inputs)
+    if e.measured is None:
+        return e.with_(event=event), FrozenMap()
+    table = e.measured
+    notes = {
+        o: _noise(e.noise.get(o), e.time, table[o], event, by_row=o in e.noise_profile and o in e.noise)
+        for o in e.outputs
+    }
+    estimated = [o for o, n in notes.items() if n.source == "estimated"]
+    dof = {o: _noise_dof(e.time[np.isfinite(table[o])], event) for o in estimated}
+    noise = {o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}
+    profile = {o: v for o, v in e.noise_profile.items() if o in noise}
+    return e.with_(event=event, noise=noise, noise_dof=e.noise_dof | dof, noise_profile=profile), FrozenMap(notes)
+
+
 def _check_names(table: schema.Experiment, model: AnyModel, place: str) -> None:
     """Raises where the table names what the model does not have."""
     signals = [*table.inputs, *table.outputs, *table.drive]

@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import unknown_name
+from hvdc_ident.executor import Progress
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
-
-Progress = Callable[[int, int, str], None]
-"""Called with what is done, what there is to do, and a line of text."""
 
 
 def silent(done: int, total: int, text: str) -> None:

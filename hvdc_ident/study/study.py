@@ -91,7 +91,7 @@ def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float
     compared, compared_sources = _linear_model_compared_with(settings, file, trust)
     recordings = Recordings(file.parent)
     model = with_unknowns(settings, model, where)
-    candidates = _candidates(settings, model, where)
+    candidates = candidates_of(settings, model, where)
     experiments, noise = read_experiments(settings.experiment, model, recordings, where)
     experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
     responses, response_sources = read_responses(settings, model, file.parent, where)
@@ -226,7 +226,8 @@ def _is_path(source: str) -> bool:
     return "/" in source or "\\" in source or Path(source).suffix in (".toml", ".fmu", ".py")
 
 
-def _candidates(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[Free]:
+def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[Free]:
+    """Return the parameters that may be estimated. Raises StudyError or UnknownNameError."""
     found = {}
     for name, line in settings.parameters.items():
         place = f"{where}, parameters.{name}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 from hvdc_ident.experiment import Experiment, recording_lines
@@ -13,6 +16,25 @@ from hvdc_ident.study.stage import stages
 from hvdc_ident.study.steady_notes import steady_notes
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.tables import candidate_lines
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What `check` found. data: as `check --json` prints it."""
+
+    data: Mapping[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the findings as JSON has them."""
+        return dict(self.data)
+
+    def __str__(self) -> str:
+        return summary_text(self.to_dict())
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
 
 
 def summary(study: Study, seed: int = 0) -> dict[str, Any]:

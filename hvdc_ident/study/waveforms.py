@@ -14,13 +14,14 @@ from typing import Any, Literal
 import numpy as np
 
 from hvdc_ident.errors import InputError
+from hvdc_ident.executor import Progress
 from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.files import write_text
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.study.stage import Progress, silent
+from hvdc_ident.study.stage import silent
 from hvdc_ident.study.tables import csv_text
 from hvdc_ident.trajectory import Array
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from common.ending import number
 from hvdc_ident.discrepancy import Diagnosis
-from hvdc_ident.fit.executor import Progress
+from hvdc_ident.executor import Progress
 
 
 def told(found: Diagnosis) -> dict[str, Any]:

@@ -8,7 +8,10 @@ import importlib
 import pytest
 
 WITH_EXAMPLES = (
+    "hvdc_ident.api",
+    "hvdc_ident.experiment",
     "hvdc_ident.formats",
+    "hvdc_ident.signals",
     "hvdc_ident.linearize.compare",
     "hvdc_ident.linearize.jacobian",
     "hvdc_ident.linearize.loop",

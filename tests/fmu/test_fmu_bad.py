@@ -14,10 +14,11 @@ from c_fmu import COMPILER, FOLDER, build, needs_compiler
 from c_models import FAULTS, FAULTY, FAULTY_VARIABLES, broken
 from fmu_limits import PATIENT, QUICK
 
-from hvdc_ident import load_model, simulate, sweep
+from hvdc_ident import load_model, simulate
 from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.sensitivity.sweep import sweep
 
 pytestmark = needs_compiler
 

@@ -10,8 +10,9 @@ import pytest
 from c_fmu import needs_compiler
 from typer.testing import CliRunner
 
-from hvdc_ident import diagnose, load_model, simulate
+from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
+from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free
 from hvdc_ident.fmu.export import export_fmu

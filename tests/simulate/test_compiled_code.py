@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident import simulate as room
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model.card import parse_card
-from hvdc_ident.simulate import simulate
+from hvdc_ident.simulate import kernel, simulate
 from hvdc_ident.simulate.kernel import _FILES
 
 OUTPUTS = {
@@ -65,7 +64,7 @@ def test_outputs_of_a_plain_run_and_of_one_with_sensitivities_are_what_their_tex
 
 
 def test_the_cache_knows_every_file_that_is_compiled():
-    folder = Path(room.__file__).parent
+    folder = Path(kernel.__file__).parent
     compiled = {"@kernel", "@njit", "@intrinsic", "@elementwise", "cfunc("}
     found = {p.stem for p in folder.glob("*.py") if any(word in p.read_text() for word in compiled)}
     assert found <= set(_FILES)

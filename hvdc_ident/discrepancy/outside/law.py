@@ -26,7 +26,7 @@ from hvdc_ident.discrepancy.trials.refitted import RACE, is_far
 from hvdc_ident.discrepancy.trials.select import Ruler
 from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit.executor import mapped
+from hvdc_ident.executor import mapped
 from hvdc_ident.trajectory import Array
 
 MOST = 3

@@ -11,9 +11,9 @@ import numpy as np
 
 from hvdc_ident.discrepancy.noise.records import Noise, noise_of
 from hvdc_ident.errors import StudyError
+from hvdc_ident.executor import Executor
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Problem, Simulator
-from hvdc_ident.fit.executor import Executor
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.gate import gate, gated

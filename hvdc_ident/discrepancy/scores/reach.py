@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.scores.inversion import KNOTS, Inversion
 from hvdc_ident.discrepancy.scores.scored import Path
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.fit.executor import Executor, mapped
+from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.frozen import FrozenMap
 
 SHARE = 0.7

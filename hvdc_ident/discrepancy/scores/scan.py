@@ -27,7 +27,7 @@ from hvdc_ident.discrepancy.signatures.block import block, parameter
 from hvdc_ident.discrepancy.signatures.finite import Column, kind_of
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-from hvdc_ident.fit.executor import Executor, Progress, mapped
+from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array

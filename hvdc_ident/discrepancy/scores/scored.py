@@ -21,8 +21,8 @@ from hvdc_ident.discrepancy.signatures.ends import Ends, ends
 from hvdc_ident.discrepancy.signatures.finite import LOOSE, Column, Task, columns_of, signatures, tasks
 from hvdc_ident.discrepancy.signatures.response import Along, along
 from hvdc_ident.effects import effects
+from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.fit.executor import Executor, mapped
 from hvdc_ident.fit.residual import Block, Treatment
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel

@@ -26,8 +26,8 @@ from hvdc_ident.discrepancy.trials.race import done
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import SlotSignal, effects, scanned
 from hvdc_ident.errors import HvdcIdentError, SimulationError
+from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.executor import mapped
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.discrepancy.refits.nominal import orthonormal
 from hvdc_ident.discrepancy.refits.refit import Job, Refit, find
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.executor import mapped
+from hvdc_ident.executor import mapped
 from hvdc_ident.fit.problem import stacked
 from hvdc_ident.trajectory import Array
 

@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.scores.scored import Path, Scores, runs
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
-from hvdc_ident.fit.executor import Executor, Progress
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.trajectory import Array

@@ -3,60 +3,92 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from hvdc_ident.errors import ComputationError
 from hvdc_ident.study.stage import Options, Outcome, Stage
 from hvdc_ident.words import form_of
 
 if TYPE_CHECKING:
+    from hvdc_ident.discrepancy import Diagnosis
+    from hvdc_ident.executor import Executor, Progress
     from hvdc_ident.study.study import Study
 
 
+class NothingIdentified(ComputationError):
+    """The data identify none of the parameters."""
+
+
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
-    """The verdict with its evidence, the gap before and after, and the augmented model as a card."""
-    from hvdc_ident.discrepancy import Options as Budget
-    from hvdc_ident.discrepancy import diagnose
+    """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.discrepancy.findings.sizes import size_curves
-    from hvdc_ident.identifiability import gate
     from hvdc_ident.model.definition import Model
     from hvdc_ident.study.at_work import executor_of
-    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
-    from hvdc_ident.study.schema import Diagnose
 
-    need_experiments(study, "diagnose", role="fit")
-    need_candidates(study, "diagnose")
-    need_start(study)
-    asked = study.settings.diagnose or Diagnose()
+    _need(study)
     report = earlier["identify"]
     if "parameters" not in report:
         why = f"nothing can be diagnosed before the stage identify has run: {report.get('message', 'it failed')}"
         return Outcome({"status": "failed", "message": why}, failed=why)
-    if not gate(report, diagnosis=True).fitted:
-        why = (
-            "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own. "
-            "Try: `hvdc-ident identify STUDY` says why of each, and what to measure next"
-        )
-        return Outcome({"status": "failed", "message": why}, failed=why)
     with executor_of(study, options, "diagnose") as executor:
-        found = diagnose(
-            study.model,
-            study.experiments,
-            tuple(study.candidates.values()),
-            effects="all" if asked.effects == "all" else list(asked.effects),
-            material=asked.material,
-            report=report,
-            options=Budget(most=asked.most, thorough=asked.thorough),
-            seed=options.seed,
-            executor=executor,
-            progress=options.progress,
-        )
+        try:
+            found = diagnosed(study, report, seed=options.seed, executor=executor, progress=options.progress)
+        except NothingIdentified as e:
+            return Outcome({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
-    data = {**found.to_dict(), "sizes": sizes}
-    if study.responses:
-        names = ", ".join(r.name for r in study.responses)
-        note = f"The measured frequency responses ({names}) are not used here: an effect is looked for in recordings alone."
-        data["notes"] = [*data["notes"], note]
-    return Outcome(data, found.files)
+    return Outcome({**found.to_dict(), "sizes": sizes}, found.files)
+
+
+def _need(study: Study) -> None:
+    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
+
+    need_experiments(study, "diagnose", role="fit")
+    need_candidates(study, "diagnose")
+    need_start(study)
+
+
+def diagnosed(
+    study: Study,
+    report: Mapping[str, Any],
+    *,
+    seed: int = 0,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Return the diagnosis of the study's model. report: on its candidates, as its `to_dict`.
+
+    Raises StudyError where it lacks data or candidates, NothingIdentified where the report leaves no parameter to be fitted.
+    """
+    from hvdc_ident.discrepancy import Options as Budget
+    from hvdc_ident.discrepancy import diagnose
+    from hvdc_ident.identifiability import gate
+    from hvdc_ident.study.schema import Diagnose
+
+    _need(study)
+    asked = study.settings.diagnose or Diagnose()
+    if not gate(report, diagnosis=True).fitted:
+        raise NothingIdentified(
+            "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own",
+            hint="`hvdc-ident identify STUDY` says why of each, and what to measure next",
+        )
+    found = diagnose(
+        study.model,
+        study.experiments,
+        tuple(study.candidates.values()),
+        effects="all" if asked.effects == "all" else list(asked.effects),
+        material=asked.material,
+        report=report,
+        options=Budget(most=asked.most, thorough=asked.thorough),
+        seed=seed,
+        executor=executor,
+        progress=progress,
+    )
+    if not study.responses:
+        return found
+    names = ", ".join(r.name for r in study.responses)
+    note = f"The measured frequency responses ({names}) are not used here: an effect is looked for in recordings alone."
+    return replace(found, notes=(*found.notes, note))
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:

@@ -15,30 +15,22 @@ if TYPE_CHECKING:
 
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
-    """The estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
-    from hvdc_ident.identifiability import gated_fit
+    """Return the estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
     from hvdc_ident.identifiability.gate import gate, gated
     from hvdc_ident.study import fitting
     from hvdc_ident.study.at_work import executor_of
-    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
     from hvdc_ident.study.responses import compared
 
-    need_experiments(study, "fit", role="fit", responses=True)
-    need_candidates(study, "fit")
-    problem = fitting.problem_of(study)
-    need_start(study)
+    fitting.need(study, "fit")
     report = earlier["identify"]
     if "parameters" not in report:
         why = f"nothing can be fitted before the stage identify has run: {report.get('message', 'it failed')}"
         return Outcome({"status": "failed", "message": why}, failed=why)
-
     with executor_of(study, options, "fit") as executor:
-
-        def fit(open_set: Problem) -> FitResult:
-            asked = fitting.with_settings(study, open_set)
-            return fitting.fitted(study, asked, seed=options.seed, executor=executor, progress=options.progress)
-
-        result = gated_fit(problem, report, fit, force=options.force, whole=fitting.as_reported(study))
+        result = fitting.estimated(
+            study, report, force=options.force, seed=options.seed, executor=executor, progress=options.progress
+        )
+    problem = fitting.problem_of(study)
     data = {**result.to_dict(), **_context(study, problem, options, report, result)}
     if result.status == "failed":
         return Outcome(data, failed=result.message)

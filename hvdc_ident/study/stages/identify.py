@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 from hvdc_ident.study.stage import Options, Outcome, Stage
 
 if TYPE_CHECKING:
+    from hvdc_ident.executor import Executor, Progress
     from hvdc_ident.fit import Group
+    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
 
 FEWEST_STARTS = 4
@@ -20,33 +22,43 @@ SOON = 60.0
 
 
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
-    """A verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
-    from hvdc_ident.fit.frequency_data import with_responses
-    from hvdc_ident.identifiability import identifiability, identifiability_by_group
+    """Return a verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
     from hvdc_ident.study.at_work import executor_of
-    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
+    from hvdc_ident.study.fitting import need
     from hvdc_ident.study.tables import candidate_lines
 
-    need_experiments(study, "identify", role="fit", responses=True)
-    need_candidates(study, "identify")
-    need_start(study)
-    starts = max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
-    pair = study.settings.identifiability.pair if study.settings.identifiability else None
-    _first_answer(study, options, starts)
+    need(study, "identify")
+    _first_answer(study, options, _starts(study))
     with executor_of(study, options, "identify") as executor:
-        common: dict[str, Any] = {
-            "starts": starts,
-            "seed": options.seed,
-            "executor": executor,
-            "progress": options.progress,
-            "pair": (pair[0], pair[1]) if pair else None,
-        }
-        simulator, experiments = with_responses(study.model, study.experiments, study.responses)
-        subject = simulator if study.responses else study.model
-        asked = (subject, experiments, tuple(study.candidates.values()))
-        groups = groups_of(study)
-        report = identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
+        report = judged(study, seed=options.seed, executor=executor, progress=options.progress)
     return Outcome({**report.to_dict(), "candidates": candidate_lines(study)})
+
+
+def judged(
+    study: Study, *, seed: int = 0, executor: Executor | None = None, progress: Progress | None = None
+) -> IdentifiabilityReport:
+    """Return the report on the study's candidates. The study has data and candidates (`fitting.need`)."""
+    from hvdc_ident.fit.frequency_data import with_responses
+    from hvdc_ident.identifiability import identifiability, identifiability_by_group
+
+    pair = study.settings.identifiability.pair if study.settings.identifiability else None
+    common: dict[str, Any] = {
+        "starts": _starts(study),
+        "seed": seed,
+        "executor": executor,
+        "progress": progress,
+        "pair": (pair[0], pair[1]) if pair else None,
+    }
+    simulator, experiments = with_responses(study.model, study.experiments, study.responses)
+    subject = simulator if study.responses else study.model
+    asked = (subject, experiments, tuple(study.candidates.values()))
+    groups = groups_of(study)
+    return identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
+
+
+def _starts(study: Study) -> int:
+    """Return the number of starts of the pilot fit."""
+    return max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
 
 
 def _first_answer(study: Study, options: Options, starts: int) -> None:

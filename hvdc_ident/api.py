@@ -1,0 +1,588 @@
+"""The verbs of the package: five lines for each job, with a model, a study or plain arrays.
+
+Each puts together what is meant (`study.assemble`) and calls the room that does the work. Nothing heavy is imported before
+a verb is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+# The rooms are there before the package binds the verbs of the same names: an import of a room would replace them later.
+import hvdc_ident.fit
+import hvdc_ident.linearize
+import hvdc_ident.simulate  # noqa: F401
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hvdc_ident.discrepancy import Diagnosis
+    from hvdc_ident.executor import Executor, Progress
+    from hvdc_ident.experiment import Experiment, SignalLike
+    from hvdc_ident.fit import FitResult, Problem
+    from hvdc_ident.identifiability import IdentifiabilityReport
+    from hvdc_ident.linearize import LinearModel, OperatingPoint
+    from hvdc_ident.linearize.frequency import Response
+    from hvdc_ident.linearize.jacobian import Side
+    from hvdc_ident.sensitivity.local import LocalSensitivities
+    from hvdc_ident.sensitivity.sweep_result import SweepResult
+    from hvdc_ident.simulate import Simulation, Tolerance
+    from hvdc_ident.study.assemble import DataLike, ModelLike, ParametersLike
+    from hvdc_ident.study.export import FmuOptions
+    from hvdc_ident.study.study import Study
+    from hvdc_ident.study.summary import Summary
+    from hvdc_ident.trajectory import Array
+
+Values: TypeAlias = "Mapping[str, float] | FitResult | None"
+Names: TypeAlias = "str | Iterable[str] | None"
+Workers: TypeAlias = "Executor | int | None"
+
+
+def simulate(
+    model: ModelLike,
+    data: Any = None,
+    parameters: Values = None,
+    sensitivities: Names = (),
+    *,
+    inputs: Mapping[str, SignalLike] | None = None,
+    outputs: Names = None,
+    tolerance: Tolerance | None = None,
+    rtol: float | None = None,
+    method: Literal["auto", "explicit", "rosenbrock"] = "auto",
+) -> Simulation:
+    """Return the model's outputs over time and, exactly, their derivatives by the named parameters.
+
+    model: a Model, a shipped name, the path of a card, an FMU or a study, or a Study.
+    data: times in s, an Experiment, or the name of an experiment of the study (left out: its only one).
+    parameters: values that differ from the model's, or a FitResult. sensitivities: names of parameters.
+    inputs: by name a number, a signal (`step`, `ramp`, `multisine`) or samples at the times; others keep the model's value.
+    outputs: names of outputs or signals (default: all outputs).
+    tolerance: of the integration; rtol: shorthand for one with atol = rtol / 100.
+    The start is the steady state of the inputs' first values unless a state says otherwise.
+
+    Raises UnknownNameError, SteadyStateError where there is no steady start, SimulationError where the run stops early.
+
+    >>> import numpy as np, hvdc_ident as hi
+    >>> t = np.linspace(0.0, 0.5, 6)
+    >>> run = hi.simulate("vsc-hvdc-link", t, inputs={"Pref2": hi.step(0.4, 0.5, at=0.1)}, outputs="Irorder2")
+    >>> run["Irorder2"].round(3).tolist()
+    [0.4, 0.4, 0.495, 0.5, 0.5, 0.5]
+    """
+    from hvdc_ident.simulate.engine import simulate as run
+    from hvdc_ident.study.assemble import names_of, subject_of, values_of
+    from hvdc_ident.study.study import Study
+
+    subject = subject_of(model)
+    plant = subject.model if isinstance(subject, Study) else subject
+    experiment = _experiment(subject, data, inputs)
+    return run(
+        plant,
+        experiment,
+        values_of(parameters, plant),
+        names_of(sensitivities, "parameter") or (),
+        outputs=names_of(outputs, "output"),
+        tolerance=tolerance,
+        rtol=rtol,
+        method=method,
+    )
+
+
+def find_operating_point(
+    model: ModelLike,
+    inputs: Mapping[str, float] | None = None,
+    outputs: Mapping[str, float] | None = None,
+    parameters: Values = None,
+    *,
+    free: Names = None,
+    at: Literal["steady", "start"] = "steady",
+    **search: Any,
+) -> OperatingPoint:
+    """Return the operating point at which every derivative is 0.
+
+    inputs: values of inputs (or of parameters, states and signals that are to hold). outputs: values that outputs are to
+    have (a trimmed point); the inputs that move them at rest are then found, or the inputs and parameters in `free`.
+    parameters: values that differ from the model's, or a FitResult.
+    at="start": states with a given start stand there and only the rest is solved.
+    search: bounds, guess, moving, time as in `hvdc_ident.linearize.find_operating_point`.
+
+    Raises UnknownNameError; SteadyStateError, with the worst equation, where there is no such point.
+
+    >>> import hvdc_ident as hi
+    >>> point = hi.find_operating_point("vsc-hvdc-link", {"Pref2": 0.5})
+    >>> round(point.outputs["P2"], 9)
+    0.5
+    """
+    from hvdc_ident.linearize.operating_point import find_operating_point as find
+    from hvdc_ident.study.assemble import model_of, names_of, values_of
+
+    plant = model_of(model)
+    fixed = {**values_of(parameters, plant), **(inputs or {})}
+    return find(plant, fixed, names_of(free, "parameter or input") or (), outputs=outputs, at=at, **search)
+
+
+def linearize(
+    model: ModelLike,
+    point: OperatingPoint | None = None,
+    *,
+    inputs: Names = None,
+    outputs: Names = None,
+    parameters: Values = None,
+    sensitivities: Names = (),
+    pade_order: int = 5,
+    side: Side = "refuse",
+    descriptor: bool = False,
+) -> LinearModel:
+    """Return the linear model between inputs and outputs (or signals; default: all) at an operating point.
+
+    point: default, the steady state at the model's values and `parameters`. A study gives the inputs, outputs and point of
+    its [linearize] where they are not named here.
+    pade_order: of every delay in the state space (frequency responses take delays exactly). sensitivities: parameters whose
+    exact derivatives of A, B, C, D come along. side: of a limit on which the point lies, "refuse", "below" or "above".
+    descriptor: keep the algebraic unknowns as states, with E.
+
+    Raises UnknownNameError, and LinearizationError on a kink or for an ill-posed loop.
+
+    >>> import hvdc_ident as hi
+    >>> linear = hi.linearize("vsc-hvdc-link", inputs="Vdcref1", outputs="Irorder1")
+    >>> linear.A.shape, linear.D.shape
+    ((6, 6), (1, 1))
+    """
+    from hvdc_ident.linearize.jacobian import linearize as linear_model
+    from hvdc_ident.linearize.operating_point import find_operating_point as find
+    from hvdc_ident.study.assemble import names_of, subject_of, values_of
+    from hvdc_ident.study.linear_analysis import operating_point
+    from hvdc_ident.study.study import Study
+
+    subject = subject_of(model)
+    plant = subject.model if isinstance(subject, Study) else subject
+    asked = subject.settings.linearize if isinstance(subject, Study) else None
+    values = values_of(parameters, plant)
+    if point is None and isinstance(subject, Study):
+        point = operating_point(subject, {**subject.given, **values})
+    elif point is None:
+        point = find(plant, values)
+    return linear_model(
+        plant,
+        point,
+        inputs=names_of(inputs, "input") or (asked.inputs if asked else None),
+        outputs=names_of(outputs, "output") or (asked.outputs if asked else None),
+        pade_order=pade_order,
+        sensitivities=names_of(sensitivities, "parameter") or (),
+        side=asked.side if asked and side == "refuse" else side,
+        descriptor=descriptor,
+    )
+
+
+def bode(
+    model: ModelLike | LinearModel,
+    frequencies: Sequence[float] | Array | None = None,
+    *,
+    inputs: Names = None,
+    outputs: Names = None,
+    parameters: Values = None,
+    point: OperatingPoint | None = None,
+) -> Response:
+    """Return the frequency response between inputs and outputs, delays exact; it draws itself with `plot()`.
+
+    model: as in `linearize`, or a LinearModel. frequencies: in Hz (default: around the poles).
+
+    >>> import hvdc_ident as hi
+    >>> response = hi.bode("vsc-hvdc-link", [0.01, 5.0], inputs="Vdcref1", outputs="Irorder1")
+    >>> response.magnitude.shape
+    (2, 1, 1)
+    """
+    import numpy as np
+
+    from hvdc_ident.linearize import LinearModel
+
+    if isinstance(model, LinearModel):
+        from hvdc_ident.study.assemble import names_of
+
+        chosen = names_of(inputs, "input") or model.input_names, names_of(outputs, "output") or model.output_names
+        linear = model.channel(*chosen)
+    else:
+        linear = linearize(model, point, inputs=inputs, outputs=outputs, parameters=parameters)
+    return linear.bode(None if frequencies is None else 2 * np.pi * np.atleast_1d(np.asarray(frequencies, dtype=float)))
+
+
+def sensitivities(
+    model: ModelLike,
+    data: Any = None,
+    parameters: Names = None,
+    *,
+    inputs: Mapping[str, SignalLike] | Names = None,
+    outputs: Names = None,
+    values: Values = None,
+    frequencies: Sequence[float] | Array | None = None,
+) -> LocalSensitivities:
+    """Return the exact derivatives of trajectories, steady state, eigenvalues and frequency responses by parameters.
+
+    data: times in s, an Experiment, several, or left out (then a study's own, if a study is given).
+    parameters: names (default: all). inputs: where `data` are times, the input signals; else names of the inputs of the
+    frequency response. values: where the derivatives are taken, if not at the model's values. frequencies: in Hz.
+
+    Raises InputError for a model without equations (an FMU), UnknownNameError, SteadyStateError or SimulationError.
+
+    >>> import numpy as np, hvdc_ident as hi
+    >>> t = np.linspace(0.0, 0.5, 51)
+    >>> found = hi.sensitivities("vsc-hvdc-link", t, "KIVDC", inputs={"Vdcref1": hi.step(1.0, 1.019, at=0.1)}, outputs="Irorder1")
+    >>> found.trajectories is not None
+    True
+    """
+    import numpy as np
+
+    from hvdc_ident.errors import InputError
+    from hvdc_ident.model.definition import Model
+    from hvdc_ident.sensitivity.local import sensitivities as derivatives
+    from hvdc_ident.study.assemble import experiments_of, names_of, subject_of, values_of
+    from hvdc_ident.study.study import Study
+
+    subject = subject_of(model)
+    plant = subject.model if isinstance(subject, Study) else subject
+    if not isinstance(plant, Model):
+        hint = "simulate(..., sensitivities=[...]) gives an FMU's derivatives"
+        raise InputError(
+            "exact sensitivities need the model's equations", where=f"model '{plant.name}'", got="an FMU", hint=hint
+        )
+    moved = inputs if isinstance(inputs, Mapping) else None
+    seen = None if isinstance(inputs, Mapping) else names_of(inputs, "input")
+    experiments: Sequence[Experiment] = ()
+    if data is None:
+        experiments = subject.experiments if isinstance(subject, Study) else ()
+    elif moved is not None or _are_times(data):
+        experiments = (_experiment(plant, data, moved),)
+    else:
+        experiments = experiments_of(data, plant)
+    return derivatives(
+        plant,
+        experiments,
+        names_of(parameters, "parameter"),
+        values=values_of(values, plant),
+        inputs=seen or (tuple(moved) if moved else None),
+        outputs=names_of(outputs, "output"),
+        omega=None if frequencies is None else 2 * np.pi * np.atleast_1d(np.asarray(frequencies, dtype=float)),
+    )
+
+
+def sweep(
+    model: ModelLike,
+    parameters: Any = None,
+    data: DataLike | None = None,
+    *,
+    outputs: Names = None,
+    against: Any = None,
+    want: Names = None,
+    values: Values = None,
+    executor: Workers = None,
+    progress: Progress | bool | None = None,
+) -> SweepResult:
+    """Return the RMSE of each output in each experiment, and poles where wanted, at many values of some parameters.
+
+    parameters: {name: values}, several make their product; or `grid`, `log_grid`, `latin_hypercube` of
+    `hvdc_ident.sensitivity.axes`. A study has its own in [[sweep]]. data: a study, experiments or a table.
+    against: "data" (default where outputs were recorded), "base" (the run at the model's own values) or another model.
+    want: "rmse", "poles" or "bode" (default: "rmse", without data "poles").
+    executor, progress: as in `fit`. A point that fails is a row with a reason and no number.
+
+    >>> import hvdc_ident as hi
+    >>> table = hi.sweep("vsc-hvdc-link", {"KIVDC": [250.0, 750.0, 1500.0]})
+    >>> table.poles.shape
+    (3, 6)
+    """
+    from hvdc_ident.errors import StudyError
+    from hvdc_ident.sensitivity.sweep import sweep as swept
+    from hvdc_ident.study.assemble import model_of, names_of, study_of, values_of
+    from hvdc_ident.study.sweeps import against_of, axes_of, wanted
+
+    study = study_of(model, data)
+    tables = study.settings.sweep
+    if parameters is None and not tables:
+        raise StudyError(
+            "no parameter to sweep", where=study.path.name, hint='sweep(model, {"NAME": np.linspace(1, 2, 11)}, data)'
+        )
+    recorded = any(e.outputs for e in study.experiments)
+    if against is None:
+        said = against_of(tables) if tables else "data"
+        against = study.against or ("base" if said == "base" or not recorded else "data")
+    elif against not in ("data", "base"):
+        against = model_of(against)
+    chosen: Any = names_of(want, "quantity") or (wanted(tables) if tables and parameters is None else None)
+    linear = study.settings.linearize
+    with _open(executor) as pool, _told(progress) as told:
+        return swept(
+            study.model,
+            study.experiments,
+            axes_of(tables, 0) if parameters is None else parameters,
+            against=against,
+            outputs=names_of(outputs, "output"),
+            values={**study.given, **values_of(values, study.model)},
+            want=chosen or (("rmse",) if study.experiments else ("poles",)),
+            linear=(linear.inputs or list(study.model.inputs), linear.outputs or list(study.model.outputs))
+            if linear
+            else None,
+            executor=pool,
+            progress=told,
+        )
+
+
+def identify(
+    model: ModelLike,
+    data: DataLike | None = None,
+    parameters: ParametersLike | None = None,
+    *,
+    pair: Sequence[str] | None = None,
+    seed: int = 0,
+    executor: Workers = None,
+    progress: Progress | bool | None = None,
+) -> IdentifiabilityReport:
+    """Return what the data tell about each parameter: a verdict with its evidence, the set to fit, what to measure next.
+
+    model: a Study, or a Model, a shipped name or a path. data: experiments, a study, or a table whose columns are named like
+    the model's inputs and outputs. parameters: names, or by name bounds (min, max), a start value, or a line as in a
+    study's [parameters]; a study has its own. pair: two of them whose common profile is wanted too.
+    executor, progress: as in `fit`.
+
+    Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
+
+    >>> import numpy as np, hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> t = np.linspace(0.0, 5.0, 101)
+    >>> y = 3.0 * np.where(t > 1.0, 1.0 - np.exp(-(t - 1.0) / 0.5), 0.0) + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    >>> record = hi.Experiment(t, inputs={"u": hi.step(0.0, 1.0, at=1.0)}, outputs={"y": y})
+    >>> hi.identify(lag, record, {"T": (0.1, 10.0), "k": (0.0, 10.0)}).identifiable
+    ('T', 'k')
+    """
+    from hvdc_ident.study.assemble import study_of
+    from hvdc_ident.study.stages.identify import judged
+
+    study = _asked(study_of(model, data, parameters, identifiability={"pair": list(pair)} if pair else {}), "identify")
+    with _open(executor) as pool, _told(progress) as told:
+        return judged(study, seed=seed, executor=pool, progress=told)
+
+
+def fit(
+    model: ModelLike | Problem,
+    data: DataLike | None = None,
+    parameters: ParametersLike | None = None,
+    *,
+    report: IdentifiabilityReport | None = None,
+    force: Names = None,
+    seed: int = 0,
+    executor: Workers = None,
+    progress: Progress | bool | None = None,
+    **settings: Any,
+) -> FitResult:
+    """Return the estimates of the parameters that the data identify; the others are held, each with its reason.
+
+    model, data, parameters: as in `identify`, whose report decides what is fitted (`report`: one that is there already).
+    force: names to fit whatever the verdict on them.
+    settings: keys of a study's [fit]: starts, optimiser, loss, whiten, mode, groups, guard, residual, band.
+    executor: a number of processes on this machine, or anything with the `map` of concurrent.futures.
+    progress: True for a bar on stderr, or a function called with runs done, runs in all and a line of text.
+    A `hvdc_ident.fit.Problem` is fitted as it stands, all that is free in it.
+
+    Raises StudyError or UnknownNameError for what does not fit together. A fit that fails says so in `status`.
+
+    >>> import numpy as np, hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> t = np.linspace(0.0, 5.0, 101)
+    >>> y = 3.0 * np.where(t > 1.0, 1.0 - np.exp(-(t - 1.0) / 0.5), 0.0) + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    >>> record = hi.Experiment(t, inputs={"u": hi.step(0.0, 1.0, at=1.0)}, outputs={"y": y})
+    >>> result = hi.fit(lag, record, {"T": (0.1, 10.0), "k": (0.0, 10.0)})
+    >>> result.status, {n: round(e.value, 1) for n, e in result.estimates.items()}
+    ('converged', {'T': 0.5, 'k': 3.0})
+    """
+    from hvdc_ident.fit import Problem
+    from hvdc_ident.fit.estimate import fit as fit_of
+    from hvdc_ident.study import fitting
+    from hvdc_ident.study.assemble import names_of, study_of
+    from hvdc_ident.study.stages.identify import judged
+
+    with _open(executor) as pool, _told(progress) as told:
+        if isinstance(model, Problem):
+            return fit_of(model, seed=seed, executor=pool, progress=told, **settings)
+        study = _asked(study_of(model, data, parameters, fit=settings), "fit")
+        fitting.need(study, "fit")
+        found = report or judged(study, seed=seed, executor=pool, progress=told)
+        return fitting.estimated(
+            study, found.to_dict(), force=names_of(force, "parameter") or (), seed=seed, executor=pool, progress=told
+        )
+
+
+def diagnose(
+    model: ModelLike,
+    data: DataLike | None = None,
+    parameters: ParametersLike | None = None,
+    *,
+    effects: Names = None,
+    report: IdentifiabilityReport | None = None,
+    seed: int = 0,
+    executor: Workers = None,
+    progress: Progress | bool | None = None,
+    **settings: Any,
+) -> Diagnosis:
+    """Return what the model lacks, if the data tell: the verdict, the missing effects, and the gap before and after.
+
+    model, data, parameters, report: as in `fit`. effects: names of the catalogue that are tried (default: all).
+    settings: keys of a study's [diagnose]: material, most, thorough. executor, progress: as in `fit`.
+
+    Raises StudyError where data or parameters are missing, ComputationError where the data identify no parameter.
+    """
+    from hvdc_ident.study.assemble import names_of, study_of
+    from hvdc_ident.study.stages.diagnose import diagnosed
+    from hvdc_ident.study.stages.identify import judged
+
+    chosen = names_of(effects, "effect")
+    tried = {} if chosen is None else {"effects": "all" if chosen == ("all",) else list(chosen)}
+    study = _asked(study_of(model, data, parameters, diagnose={**settings, **tried}), "diagnose")
+    with _open(executor) as pool, _told(progress) as told:
+        found = report or judged(study, seed=seed, executor=pool, progress=told)
+        return diagnosed(study, found.to_dict(), seed=seed, executor=pool, progress=told)
+
+
+def check(model: ModelLike, data: DataLike | None = None, parameters: ParametersLike | None = None) -> Summary:
+    """Return what was found in a study, or in a model, data and parameters: rows, event, noise, levels before the event.
+
+    No stage is run. What does not hold together raises an InputError: what, where, expected, got, what to try.
+
+    >>> import hvdc_ident as hi
+    >>> hi.check("vsc-hvdc-link").to_dict()["sizes"]["states"]
+    6
+    """
+    from hvdc_ident.study.assemble import study_of
+    from hvdc_ident.study.summary import Summary, summary
+
+    return Summary(summary(study_of(model, data, parameters)))
+
+
+def export(
+    source: ModelLike | LinearModel,
+    path: str | Path,
+    linear: bool = False,
+    fmu: FmuOptions | None = None,
+    values: str | FitResult | Mapping[str, float] | None = None,
+    folder: str | Path | None = None,
+) -> Path:
+    """Write a model or its linear model in the format of the path's ending, and return the path.
+
+    .toml, .fmu and .mo are the model, .ssv its parameters, .mat, .json, .csv, .m and .tex its linear model.
+    source: a Study, a Model, a shipped name, a path, or a LinearModel. linear: the linear model even for .mo.
+    fmu: version and kinds of an FMU. values: of a study "given", "start" or "fitted" (left out, the fitted ones where a fit
+    stands in its folder of results, `folder`); or a FitResult, or values by name. The file says which it holds.
+
+    Raises StudyError for an ending that is not known and where fitted values are asked for and none stand.
+
+    >>> import tempfile, hvdc_ident as hi
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     hi.export("vsc-hvdc-link", f"{folder}/link.mat").name
+    'link.mat'
+    """
+    from hvdc_ident.linearize import LinearModel
+    from hvdc_ident.model.definition import Model
+    from hvdc_ident.study.assemble import subject_of, values_of
+    from hvdc_ident.study.export import export as write
+    from hvdc_ident.study.study import Study
+
+    found: Any = source if isinstance(source, LinearModel) else subject_of(source)
+    if values is not None and not isinstance(values, str):
+        plant = found.model if isinstance(found, Study) else found
+        found, values = plant.with_values(values_of(values, plant)), None
+    if not isinstance(found, Study | Model | LinearModel):
+        from hvdc_ident.linearize import linearize as linear_model
+
+        found = linear_model(found)
+    return write(found, path, linear, fmu, values, folder)
+
+
+def _are_times(data: Any) -> bool:
+    """Return whether data are instants and no experiment or table."""
+    import numpy as np
+
+    if isinstance(data, np.ndarray):
+        return True
+    return isinstance(data, Sequence) and not isinstance(data, str) and all(isinstance(v, int | float) for v in data)
+
+
+def _experiment(subject: Any, data: Any, inputs: Mapping[str, SignalLike] | None) -> Experiment:
+    """Return the experiment that is meant, with these inputs in place of its own. Raises InputError."""
+    from hvdc_ident.errors import InputError, unknown_name
+    from hvdc_ident.experiment import Experiment
+    from hvdc_ident.study.study import Study
+
+    if inputs is not None and not isinstance(inputs, Mapping):
+        raise InputError(
+            "inputs are given by name",
+            expected='{"u": 1.0}, {"u": hi.step(...)} or {"u": samples}',
+            got=repr(inputs)[:60],
+        )
+    known = {e.name: e for e in subject.experiments} if isinstance(subject, Study) else {}
+    if isinstance(data, str) and known:
+        if data not in known:
+            raise unknown_name("experiment", data, known, where=f"study '{subject.name}'")
+        data = known[data]
+    elif data is None and len(known) == 1:
+        data = next(iter(known.values()))
+    if data is None:
+        listed = f"one of {', '.join(known)}" if known else "times in s, or an Experiment"
+        raise InputError(
+            "over what time?" if not known else "which experiment?",
+            expected=listed,
+            hint="simulate(model, t, inputs={...})",
+        )
+    if isinstance(data, Experiment):
+        if not inputs:
+            return data
+        given = Experiment(data.time, data.name, inputs=inputs)
+        return data.with_(inputs=data.inputs | given.inputs, values=data.values.without(*given.inputs))
+    if not _are_times(data):
+        raise InputError("no times", expected="instants in s, or an Experiment", got=f"a {type(data).__name__}")
+    return Experiment(data, inputs=inputs)
+
+
+def _asked(study: Study, verb: str) -> Study:
+    """Return the study. Raises StudyError where data or parameters are missing that Python would state."""
+    from hvdc_ident.errors import StudyError
+
+    known = list(study.model.parameters)
+    listed = ", ".join(known[:8]) + (f" and {len(known) - 8} more" if len(known) > 8 else "")
+    if not study.experiments and not study.responses:
+        hint = f'hi.{verb}(model, hi.Experiment(t, inputs={{"u": u}}, outputs={{"y": y}}), {{"{known[0] if known else "k"}": (min, max)}})'
+        raise StudyError(
+            f"{verb} needs data", where=study.path.name, expected="experiments with recorded outputs", hint=hint
+        )
+    if not study.candidates:
+        hint = f'{{"{known[0]}": (min, max)}}' if known else ""
+        raise StudyError(f"{verb} needs parameters", where=study.path.name, expected=f"some of {listed}", hint=hint)
+    return study
+
+
+@contextmanager
+def _open(executor: Workers) -> Iterator[Executor | None]:
+    """Open so many processes on this machine; an executor is taken as it is."""
+    from hvdc_ident.errors import InputError
+
+    if executor is None or hasattr(executor, "map"):
+        yield executor
+        return
+    if isinstance(executor, bool) or not isinstance(executor, int) or executor < 1:
+        raise InputError(
+            "no executor", expected="a number of processes, or something with `map`", got=repr(executor)[:60]
+        )
+    from hvdc_ident.study.executors import open_executor
+
+    with open_executor("local", executor) as pool:
+        yield pool
+
+
+@contextmanager
+def _told(progress: Progress | bool | None) -> Iterator[Progress | None]:
+    """Open a bar on stderr for True; a function is taken as it is."""
+    if not isinstance(progress, bool):
+        yield progress
+        return
+    from hvdc_ident.study.progress import progress as bar
+
+    with bar(quiet=not progress) as shown:
+        yield shown

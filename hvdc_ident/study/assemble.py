@@ -1,0 +1,288 @@
+"""A study put together in Python: from a model, data and parameters in any of the forms in which a user has them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+
+from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.fit import FitResult, Free
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.linearize.measured import MeasuredResponse
+from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
+from hvdc_ident.models import is_shipped, load_model
+from hvdc_ident.parameters import Parameter
+from hvdc_ident.study.parse import checked, is_study
+from hvdc_ident.study.recordings import with_noise
+from hvdc_ident.study.study import Study, candidates_of, load_study
+from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
+from hvdc_ident.trajectory import Trajectory
+
+ModelLike: TypeAlias = AnyModel | Study | str | Path
+"""A model, a study's model, a shipped name, or the path of a model card, an FMU or a study."""
+DataLike: TypeAlias = Experiment | Trajectory | Study | str | Path | Iterable[Any] | Any
+"""Experiments, a study's, a table whose columns are named like the model's inputs and outputs, or the path of one."""
+ParametersLike: TypeAlias = str | Iterable[Any] | Mapping[str, Any]
+"""Parameter names; or by name bounds (min, max), a start value, or a line as in a study's [parameters]."""
+
+
+def model_of(source: ModelLike) -> AnyModel:
+    """Return the model that is meant. Raises InputError for what is no model."""
+    if isinstance(source, str | Path):
+        found = subject_of(source)
+        return found.model if isinstance(found, Study) else found
+    if isinstance(source, Study):
+        return source.model
+    if isinstance(source, Model) or (hasattr(source, "with_effects") and hasattr(source, "simulate")):
+        return source
+    inner = getattr(source, "model", None)
+    if isinstance(inner, Model) or hasattr(inner, "with_effects"):
+        return cast("AnyModel", inner)
+    raise InputError(
+        "no model",
+        expected="a Model, a Study, the name of a shipped model, or the path of a model card, an FMU or a study",
+        got=f"a {type(source).__name__}",
+    )
+
+
+def subject_of(source: ModelLike) -> AnyModel | Study:
+    """Return the study or the model that is meant; a .toml file with a table [model] is a study."""
+    if isinstance(source, str | Path):
+        path = Path(source)
+        if not is_shipped(str(source)) and path.suffix.lower() == ".toml" and is_study(path):
+            return load_study(path)
+        return load_model(source)
+    return source if isinstance(source, Study) else model_of(source)
+
+
+def names_of(names: str | Iterable[str] | None, kind: str) -> tuple[str, ...] | None:
+    """Return the names as a tuple; one alone may be a text. None stays None. Raises InputError for what is no name."""
+    if names is None:
+        return None
+    found = (names,) if isinstance(names, str) else tuple(names)
+    for name in found:
+        if not isinstance(name, str):
+            article = "an" if kind[0] in "aeiou" else "a"
+            raise InputError(f"no name of {article} {kind}", expected="a text, or a list of texts", got=repr(name))
+    return found
+
+
+def values_of(
+    values: Mapping[str, float] | FitResult | None, model: AnyModel, kind: str = "parameter"
+) -> dict[str, float]:
+    """Return values by name, of a fit its estimates. Raises InputError where one is no number or no such name is there."""
+    table = dict(values.values) if isinstance(values, FitResult) else values or {}
+    if not isinstance(table, Mapping):
+        raise InputError(f"{kind} values are given by name", expected="{name: number}", got=repr(values)[:60])
+    known: Collection[str] = model.inputs if kind == "input" else model.parameters
+    others: Collection[str] = () if kind == "input" else model.inputs
+    found = {}
+    for name, value in table.items():
+        if name not in known and name not in others:
+            raise unknown_name(kind, name, known, where=f"model '{model.name}'")
+        if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+            raise InputError(
+                f"the value of '{name}' is no finite number", where=f"model '{model.name}'", got=repr(value)[:60]
+            )
+        found[name] = float(value)
+    return found
+
+
+def experiments_of(data: DataLike, model: AnyModel) -> tuple[Experiment, ...]:
+    """Return the experiments that are meant, each named differently, the units of its outputs those of the model.
+
+    Raises InputError for what is no data, UnknownNameError for an input or output that the model does not have.
+    """
+    if isinstance(data, str | Path):
+        path = Path(data)
+        if path.suffix.lower() == ".toml":
+            return load_study(path).experiments
+        from hvdc_ident.formats import read_waveforms
+
+        data = [_from_table(read_waveforms(path), model, path.stem)]
+    elif isinstance(data, Study):
+        return data.experiments
+    elif isinstance(data, Experiment):
+        data = [data]
+    elif isinstance(data, Trajectory) or _is_frame(data):
+        data = [_from_table(data, model, "experiment")]
+    elif not isinstance(data, Iterable) or isinstance(data, np.ndarray | Mapping):
+        raise _no_data(data)
+    found = []
+    for item in data:
+        if isinstance(item, Experiment):
+            found.append(item)
+        elif isinstance(item, str | Path | Trajectory) or _is_frame(item):
+            found.extend(experiments_of(item, model))
+        else:
+            raise _no_data(item)
+    return tuple(_fitting(e, model) for e in _numbered(found))
+
+
+def _no_data(data: object) -> InputError:
+    return InputError(
+        "no data",
+        expected="an Experiment or several, a Study, a table (Trajectory, DataFrame), or the path of a study or a recording",
+        got=f"a {type(data).__name__}",
+        hint='hi.Experiment(t, inputs={"u": u}, outputs={"y": y})',
+    )
+
+
+def _is_frame(data: object) -> bool:
+    """Return whether data is a pandas DataFrame, or what looks like one."""
+    return all(hasattr(data, n) for n in ("columns", "index", "to_numpy"))
+
+
+def _from_table(table: Any, model: AnyModel, name: str) -> Experiment:
+    """Return an experiment of a table, by the names of its columns. The time is the column `time`, else the index."""
+    if isinstance(table, Trajectory):
+        time, columns = table.time, {n: table[n] for n in table.names}
+    else:
+        columns = {str(c): np.asarray(table[c], dtype=float) for c in table.columns}
+        time = columns.pop("time") if "time" in columns else np.asarray(table.index, dtype=float)
+    for column in columns:
+        if column not in model.inputs and column not in model.outputs:
+            raise unknown_name("input or output", column, [*model.inputs, *model.outputs], where=f"a column of {name}")
+    outputs = {n: v for n, v in columns.items() if n in model.outputs and n not in model.inputs}
+    return Experiment(time, name, inputs={n: v for n, v in columns.items() if n in model.inputs}, outputs=outputs)
+
+
+def _numbered(experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Return the experiments, those that share a name with a number behind it."""
+    names = [e.name for e in experiments]
+    return [
+        e.with_(name=f"{e.name}-{names[: k + 1].count(e.name)}") if names.count(e.name) > 1 else e
+        for k, e in enumerate(experiments)
+    ]
+
+
+def _fitting(e: Experiment, model: AnyModel) -> Experiment:
+    """Return the experiment with the units of the model's outputs. Raises UnknownNameError."""
+    where = f"experiment '{e.name}'"
+    for name in e.inputs:
+        if name not in model.inputs and name not in e.drive:
+            raise unknown_name("input", name, model.inputs, where=where)
+    for name in e.outputs:
+        if name not in model.outputs:
+            raise unknown_name("output", name, model.outputs, where=where)
+    for name in e.noise:
+        if name not in e.outputs:
+            raise unknown_name("recorded output", name, e.outputs, where=f"{where}, noise")
+    if e.measured is None or any(e.measured.units):
+        return e
+    table = e.measured
+    return e.with_(measured=replace(table, units=tuple(model.outputs[o].unit for o in table.names)))
+
+
+def lines_of(parameters: ParametersLike, model: AnyModel) -> dict[str, dict[str, Any]]:
+    """Return the lines of a study's [parameters] that are meant.
+
+    A name alone is estimated from the model's value within the model's bounds. (min, max) are bounds; where the model's value
+    lies outside them the search begins in their middle. A number is where it begins.
+    """
+    if isinstance(parameters, str):
+        parameters = (parameters,)
+    if not isinstance(parameters, Mapping):
+        parameters = {p.name: p for p in parameters if isinstance(p, Free)} | {
+            p: None for p in parameters if not isinstance(p, Free)
+        }
+    lines = {}
+    for name, given in parameters.items():
+        if name not in model.parameters:
+            if name in model.inputs:
+                raise StudyError(
+                    f"'{name}' is an input, not a parameter", where="parameters", hint="an experiment's inputs"
+                )
+            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+        lines[name] = _line(name, given, model.parameters[name].value)
+    return lines
+
+
+def _line(name: str, given: Any, value: float) -> dict[str, Any]:
+    """Return one line of [parameters]. Raises StudyError for what is none."""
+    if given is None:
+        return {}
+    if isinstance(given, Free | Parameter):
+        keys = ("start", "min", "max", "given") if isinstance(given, Free) else ("min", "max")
+        stated = {k: float(getattr(given, k)) for k in keys}
+        stated |= {} if isinstance(given, Free) else {"start": given.value}
+        return {k: v for k, v in stated.items() if np.isfinite(v)}
+    if isinstance(given, Mapping):
+        return {
+            k: float(v) if isinstance(v, int | np.number) and not isinstance(v, bool) else v for k, v in given.items()
+        }
+    if isinstance(given, int | float | np.number) and not isinstance(given, bool):
+        return {"start": float(given)}
+    pair = list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else []
+    if len(pair) != 2 or not all(isinstance(v, int | float | np.number) for v in pair):
+        raise StudyError(
+            "no bounds",
+            where=f"parameters, '{name}'",
+            expected="(min, max), a start value, or {start = ..., min = ..., max = ...} as a dict",
+            got=repr(given)[:60],
+        )
+    low, high = map(float, pair)
+    if not low < high:
+        raise StudyError(
+            "bounds in the wrong order", where=f"parameters, '{name}'", expected="min < max", got=f"({low:g}, {high:g})"
+        )
+    bounds = {k: v for k, v in (("min", low), ("max", high)) if np.isfinite(v)}
+    return bounds if low <= value <= high else bounds | {"start": float(np.clip(0.5 * (low + high), low, high))}
+
+
+def study_of(
+    subject: ModelLike, data: DataLike | None = None, parameters: ParametersLike | None = None, **tables: Any
+) -> Study:
+    """Return the study that a model, data and parameters make; of a study that is given, with these in place of its own.
+
+    tables: keys of the study's tables by table, {"fit": {"starts": 4}}, added to its own.
+    Raises InputError: StudyError, UnknownNameError or WaveformError.
+    """
+    found = subject_of(subject)
+    source = found if isinstance(found, Study) else None
+    model = source.model if source else cast("AnyModel", found)
+    if data is not None and isinstance(data, str | Path) and Path(data).suffix.lower() == ".toml":
+        data = load_study(data)
+    if source is None and isinstance(data, Study):
+        source, data = replace(data, model=model), None
+    where = source.path.name if source else model.name
+    base: dict[str, Any] = (
+        source.settings.model_dump(by_alias=True, exclude_unset=True)
+        if source
+        else {"schema": 1, "model": {"source": model.name}}
+    )
+    if parameters is not None:
+        base["parameters"] = lines_of(parameters, model)
+    for table, keys in tables.items():
+        if keys:
+            base[table] = {**(base.get(table) or {}), **keys}
+    settings = checked(base, where)
+    if parameters is not None or source is None:
+        model = with_unknowns(settings, model, where)
+    candidates = (
+        candidates_of(settings, model, where) if parameters is not None or source is None else source.candidates
+    )
+    responses: tuple[MeasuredResponse, ...] = ()
+    if data is None and source is not None:
+        experiments, noise, responses = source.experiments, source.noise, source.responses
+    else:
+        pairs = [with_noise(e) for e in (experiments_of(data, model) if data is not None else ())]
+        experiments, noise = tuple(e for e, _ in pairs), FrozenMap({e.name: n for e, n in pairs})
+        experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
+    if source is not None:
+        return replace(
+            source,
+            model=model,
+            candidates=candidates,
+            experiments=experiments,
+            noise=noise,
+            settings=settings,
+            responses=responses,
+        )
+    return Study(model.name, Path(model.name), model, candidates, experiments, noise, settings, FrozenMap())
