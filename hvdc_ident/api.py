@@ -332,7 +332,7 @@ def identify(
     data: DataLike | None = None,
     parameters: ParametersLike | None = None,
     *,
-    pair: Sequence[str] | None = None,
+    pair: Names = None,
     seed: int = 0,
     executor: Workers = None,
     progress: Progress | bool | None = None,
@@ -354,10 +354,11 @@ def identify(
     >>> hi.identify(lag, record, {"T": (0.1, 10.0), "k": (0.0, 10.0)}).identifiable
     ('T', 'k')
     """
-    from hvdc_ident.study.assemble import study_of
+    from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.stages.identify import judged
 
-    study = _asked(study_of(model, data, parameters, identifiability={"pair": list(pair)} if pair else {}), "identify")
+    both = {"pair": list(names_of(pair, "parameter") or ())} if pair else {}
+    study = _asked(study_of(model, data, parameters, identifiability=both), "identify")
     with _open(executor) as pool, _told(progress) as told:
         return judged(study, seed=seed, executor=pool, progress=told)
 
@@ -537,7 +538,9 @@ def _experiment(subject: Any, data: Any, inputs: Mapping[str, SignalLike] | None
         given = Experiment(data.time, data.name, inputs=inputs)
         return data.with_(inputs=data.inputs | given.inputs, values=data.values.without(*given.inputs))
     if not _are_times(data):
-        raise InputError("no times", expected="instants in s, or an Experiment", got=f"a {type(data).__name__}")
+        raise InputError(
+            "no times", expected="instants in s, or an Experiment", got=f"an object of type {type(data).__name__}"
+        )
     return Experiment(data, inputs=inputs)
 
 

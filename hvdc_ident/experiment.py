@@ -106,7 +106,7 @@ class Experiment:
             raise WaveformError("outputs and measured are both given", where=where, expected="one of them")
         if outputs is not None:
             columns = {n: _samples(n, v, instants, f"{where}, output") for n, v in outputs.items()}
-            table = trajectory(instants, columns)
+            table = replace(trajectory(instants, columns), origin=Origin(time_unit="s"))
         if table is not None and not np.array_equal(table.time, instants):
             raise WaveformError("the measured outputs stand at other times than the experiment's", where=where)
         signals = {n: _signal(n, v, instants, where) for n, v in (inputs or {}).items()}

@@ -35,7 +35,7 @@ def gate(report: Mapping[str, Any], force: Sequence[str] = (), *, diagnosis: boo
     parameters = report["parameters"]
     for name in force:
         if name not in parameters:
-            raise unknown_name("candidate", name, parameters, where="--force")
+            raise unknown_name("candidate", name, parameters, where="force")
     open_set = {*report["identifiable"], *(report.get("not_judged", ()) if diagnosis else ())}
     forced = tuple(n for n in parameters if n in force and n not in open_set)
     fitted = tuple(n for n in parameters if n in open_set or n in forced)

@@ -20,7 +20,7 @@ from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.study.parse import checked, is_study
 from hvdc_ident.study.recordings import with_noise
-from hvdc_ident.study.study import Study, candidates_of, load_study
+from hvdc_ident.study.study import Study, candidates_of, check_questions, load_study
 from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
 from hvdc_ident.trajectory import Trajectory
 
@@ -47,7 +47,7 @@ def model_of(source: ModelLike) -> AnyModel:
     raise InputError(
         "no model",
         expected="a Model, a Study, the name of a shipped model, or the path of a model card, an FMU or a study",
-        got=f"a {type(source).__name__}",
+        got=f"an object of type {type(source).__name__}",
     )
 
 
@@ -129,7 +129,7 @@ def _no_data(data: object) -> InputError:
     return InputError(
         "no data",
         expected="an Experiment or several, a Study, a table (Trajectory, DataFrame), or the path of a study or a recording",
-        got=f"a {type(data).__name__}",
+        got=f"an object of type {type(data).__name__}",
         hint='hi.Experiment(t, inputs={"u": u}, outputs={"y": y})',
     )
 
@@ -275,14 +275,10 @@ def study_of(
         pairs = [with_noise(e) for e in (experiments_of(data, model) if data is not None else ())]
         experiments, noise = tuple(e for e, _ in pairs), FrozenMap({e.name: n for e, n in pairs})
         experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
+    made = {"model": model, "candidates": candidates, "experiments": experiments, "noise": noise, "settings": settings}
     if source is not None:
-        return replace(
-            source,
-            model=model,
-            candidates=candidates,
-            experiments=experiments,
-            noise=noise,
-            settings=settings,
-            responses=responses,
-        )
-    return Study(model.name, Path(model.name), model, candidates, experiments, noise, settings, FrozenMap())
+        study = replace(source, **made, responses=responses)
+    else:
+        study = Study(name=model.name, path=Path(model.name), sources=FrozenMap(), **made)
+    check_questions(study, where)
+    return study

@@ -117,7 +117,7 @@ def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float
         compared=compared,
         responses=responses,
     )
-    _check_questions(study, where)
+    check_questions(study, where)
     return study
 
 
@@ -254,8 +254,8 @@ def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> Fr
     return FrozenMap(found)
 
 
-def _check_questions(study: Study, where: str) -> None:
-    """Raises where a stage's table names what is not there."""
+def check_questions(study: Study, where: str) -> None:
+    """Raise UnknownNameError or StudyError where a stage's table names what is not there."""
     s, model = study.settings, study.model
     names = [e.name for e in study.experiments]
     measured = list(dict.fromkeys(o for e in study.experiments for o in e.outputs))
