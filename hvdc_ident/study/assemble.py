@@ -275,7 +275,13 @@ def study_of(
         pairs = [with_noise(e) for e in (experiments_of(data, model) if data is not None else ())]
         experiments, noise = tuple(e for e, _ in pairs), FrozenMap({e.name: n for e, n in pairs})
         experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
-    made = {"model": model, "candidates": candidates, "experiments": experiments, "noise": noise, "settings": settings}
+    made: dict[str, Any] = {
+        "model": model,
+        "candidates": candidates,
+        "experiments": experiments,
+        "noise": noise,
+        "settings": settings,
+    }
     if source is not None:
         study = replace(source, **made, responses=responses)
     else:
