@@ -355,10 +355,12 @@ def identify(
     ('T', 'k')
     """
     from hvdc_ident.study.assemble import names_of, study_of
+    from hvdc_ident.study.fitting import need
     from hvdc_ident.study.stages.identify import judged
 
     both = {"pair": list(names_of(pair, "parameter") or ())} if pair else {}
     study = _asked(study_of(model, data, parameters, identifiability=both), "identify")
+    need(study, "identify")
     with _open(executor) as pool, _told(progress) as told:
         return judged(study, seed=seed, executor=pool, progress=told)
 
@@ -432,12 +434,14 @@ def diagnose(
     Raises StudyError where data or parameters are missing, ComputationError where the data identify no parameter.
     """
     from hvdc_ident.study.assemble import names_of, study_of
+    from hvdc_ident.study.fitting import need
     from hvdc_ident.study.stages.diagnose import diagnosed
     from hvdc_ident.study.stages.identify import judged
 
     chosen = names_of(effects, "effect")
     tried = {} if chosen is None else {"effects": "all" if chosen == ("all",) else list(chosen)}
     study = _asked(study_of(model, data, parameters, diagnose={**settings, **tried}), "diagnose")
+    need(study, "diagnose")
     with _open(executor) as pool, _told(progress) as told:
         found = report or judged(study, seed=seed, executor=pool, progress=told)
         return diagnosed(study, found.to_dict(), seed=seed, executor=pool, progress=told)
