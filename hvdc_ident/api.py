@@ -177,7 +177,7 @@ def linearize(
 
 def bode(
     model: ModelLike | LinearModel,
-    frequencies: Sequence[float] | Array | None = None,
+    omega: Sequence[float] | Array | None = None,
     *,
     inputs: Names = None,
     outputs: Names = None,
@@ -186,10 +186,10 @@ def bode(
 ) -> Response:
     """Return the frequency response between inputs and outputs, delays exact; it draws itself with `plot()`.
 
-    model: as in `linearize`, or a LinearModel. frequencies: in Hz (default: around the poles).
+    model: as in `linearize`, or a LinearModel. omega: in rad/s (default: around the poles).
 
     >>> import hvdc_ident as hi
-    >>> response = hi.bode("vsc-hvdc-link", [0.01, 5.0], inputs="Vdcref1", outputs="Irorder1")
+    >>> response = hi.bode("vsc-hvdc-link", [0.1, 30.0], inputs="Vdcref1", outputs="Irorder1")
     >>> response.magnitude.shape
     (2, 1, 1)
     """
@@ -204,7 +204,7 @@ def bode(
         linear = model.channel(*chosen)
     else:
         linear = linearize(model, point, inputs=inputs, outputs=outputs, parameters=parameters)
-    return linear.bode(None if frequencies is None else 2 * np.pi * np.atleast_1d(np.asarray(frequencies, dtype=float)))
+    return linear.bode(None if omega is None else np.atleast_1d(np.asarray(omega, dtype=float)))
 
 
 def sensitivities(
@@ -215,13 +215,13 @@ def sensitivities(
     inputs: Mapping[str, SignalLike] | Names = None,
     outputs: Names = None,
     values: Values = None,
-    frequencies: Sequence[float] | Array | None = None,
+    omega: Sequence[float] | Array | None = None,
 ) -> LocalSensitivities:
     """Return the exact derivatives of trajectories, steady state, eigenvalues and frequency responses by parameters.
 
     data: times in s, an Experiment, several, or left out (then a study's own, if a study is given).
     parameters: names (default: all). inputs: where `data` are times, the input signals; else names of the inputs of the
-    frequency response. values: where the derivatives are taken, if not at the model's values. frequencies: in Hz.
+    frequency response. values: where the derivatives are taken, if not at the model's values. omega: of the responses, rad/s.
 
     Raises InputError for a model without equations (an FMU), UnknownNameError, SteadyStateError or SimulationError.
 
@@ -262,7 +262,7 @@ def sensitivities(
         values=values_of(values, plant),
         inputs=seen or (tuple(moved) if moved else None),
         outputs=names_of(outputs, "output"),
-        omega=None if frequencies is None else 2 * np.pi * np.atleast_1d(np.asarray(frequencies, dtype=float)),
+        omega=None if omega is None else np.atleast_1d(np.asarray(omega, dtype=float)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any, Literal, TypeAlias
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hvdc_ident.errors import WaveformError, unknown_name
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.notebook import Shown, Table
 from hvdc_ident.signals import InputSignal
 from hvdc_ident.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.waveform import input_signal
@@ -22,7 +23,7 @@ SignalLike: TypeAlias = InputSignal | float | ArrayLike | Callable[[Array], Any]
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class Experiment:
+class Experiment(Shown):
     """One experiment: how the inputs moved, the instants at which outputs are wanted, and what was recorded.
 
     time: (n,) instants at which outputs are wanted, s; one that stands twice asks for the values before and after a jump.
@@ -133,6 +134,42 @@ class Experiment:
             return np.ones(self.time.size, dtype=bool)
         return (self.time >= self.window[0]) & (self.time <= self.window[1])
 
+    def _screen(self) -> Iterator[str | Table]:
+        event = "no event" if self.event is None else f"event at {self.event:g} s"
+        yield f"Experiment {self.name} ({self.role}): {self.time.size} rows, {self.time[0]:g} to {self.time[-1]:g} s, {event}"
+        inputs = [
+            (n, float(s.values[0]), float(s.values[-1]), "constant" if s.is_constant else f"{s.jumps.size} jumps")
+            for n, s in self.inputs.items()
+        ]
+        yield Table(("input", "first", "last", "moves"), tuple(inputs)) if inputs else ""
+        table = self.measured
+        outputs = (
+            [(n, table.unit(n), *_ends(table[n]), self.noise.get(n), table.gaps(n)) for n in table.names]
+            if table
+            else []
+        )
+        header = ("output", "unit", "smallest", "largest", "noise", "gaps")
+        yield Table(header, tuple(outputs)) if outputs else ""
+
+    def table(self) -> Trajectory:
+        """Return inputs and recorded outputs over time, as one table."""
+        columns = {n: s(self.time) for n, s in self.inputs.items()}
+        if self.measured is None:
+            return trajectory(self.time, columns)
+        recorded = {n: self.measured[n] for n in self.measured.names}
+        units = dict(zip(self.measured.names, self.measured.units, strict=True))
+        return trajectory(self.time, {**columns, **recorded}, units)
+
+    def to_dataframe(self) -> Any:
+        """Return inputs and recorded outputs as a pandas DataFrame over time. Raises InputError where pandas is missing."""
+        return self.table().to_dataframe()
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the recorded outputs, or the inputs where nothing was recorded, over time, and return the axes."""
+        axes = self.table().plot(self.outputs or None, ax)
+        axes.set_title(self.name, fontsize="small")
+        return axes
+
     def with_(self, **changes: Any) -> Experiment:
         """A copy with some fields changed."""
         return replace(self, **changes)
@@ -187,6 +224,10 @@ _FURTHER = tuple(f.name for f in fields(Experiment) if f.name not in (*_STATED, 
 def experiment(name: str, time: Any, inputs: Mapping[str, SignalLike] | None = None, **rest: Any) -> Experiment:
     """Return an experiment, its name first."""
     return Experiment(time, name, inputs=inputs, **rest)
+
+
+def _ends(values: Array) -> tuple[float, float]:
+    return float(np.fmin.reduce(values)), float(np.fmax.reduce(values))
 
 
 def _instants(time: ArrayLike, where: str) -> Array:

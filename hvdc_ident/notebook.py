@@ -1,17 +1,98 @@
-"""How values show themselves: a table for notebooks, and the axes a figure is drawn on."""
+"""How results are displayed: one screen of text, a table in a notebook, a figure, a data frame."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
+from textwrap import fill
 from typing import Any
+
+from hvdc_ident.errors import InputError
+
+WIDTH = 110
+"""Characters in a line of a summary."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under a header; numbers are shown with six digits, None as an empty cell."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+
+    def __str__(self) -> str:
+        cells = [self.header, *(tuple(map(_text, row)) for row in self.rows)]
+        widths = [max(len(row[k]) for row in cells) for k in range(len(self.header))]
+        numbers = [all(isinstance(row[k], int | float | None) for row in self.rows) for k in range(len(widths))]
+
+        def line(row: Sequence[str]) -> str:
+            padded = (c.rjust(w) if right else c.ljust(w) for c, w, right in zip(row, widths, numbers, strict=True))
+            return "  ".join(padded).rstrip()
+
+        return "\n".join(map(line, cells))
+
+    @property
+    def html(self) -> str:
+        """The table as HTML."""
+        return _html_table(self.header, self.rows)
+
+
+class Shown:
+    """A result that shows itself: `print` gives its screen, a notebook the same with tables.
+
+    A class gives `_screen`; its first text is the headline, which `repr` shows alone.
+    """
+
+    def _screen(self) -> Iterable[str | Table]:
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        blocks = (str(b) if isinstance(b, Table) else _wrapped(b) for b in self._screen())
+        return "\n\n".join(b for b in blocks if b)
+
+    def __repr__(self) -> str:
+        headline, kind = str(next(iter(self._screen()), "")).splitlines()[0], type(self).__name__
+        return f"<{headline}>" if headline.startswith(kind) else f"<{kind}: {headline}>"
+
+    def _repr_html_(self) -> str:
+        blocks = [b for b in self._screen() if b]
+        return "".join(b.html if isinstance(b, Table) else f"<p>{_breaks(b)}</p>" for b in blocks)
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(fill(line, WIDTH, subsequent_indent="  ", break_long_words=False) for line in text.splitlines())
+
+
+def _breaks(text: str) -> str:
+    return escape(text).replace("\n", "<br>")
+
+
+def library(name: str, purpose: str) -> Any:
+    """Return an optional library, imported now. Raises InputError where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(f"{purpose} needs {name}, which is not installed", hint=f"pip install {name}") from None
+
+
+def data_frame(columns: Mapping[str, Any], index: Any = None, index_name: str | None = None) -> Any:
+    """Return a pandas DataFrame. Raises InputError where pandas is not installed."""
+    frame = library("pandas", "to_dataframe").DataFrame(dict(columns), index=index)
+    frame.index.name = index_name
+    return frame
 
 
 def table_html(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """An HTML table with a title; numbers with six digits, text escaped."""
+    return f"<p>{escape(title)}</p>{_html_table(header, rows)}"
+
+
+def _html_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     head = "".join(f"<th>{escape(h)}</th>" for h in header)
     body = "".join("<tr>" + "".join(f"<td>{_cell(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<p>{escape(title)}</p><table><tr>{head}</tr>{body}</table>"
+    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def axes_of(ax: Any, width: float = 7.0, height: float = 5.0, *, rows: int = 1) -> Any:
@@ -24,4 +105,10 @@ def axes_of(ax: Any, width: float = 7.0, height: float = 5.0, *, rows: int = 1) 
 
 
 def _cell(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else escape(str(value))
+    return escape(_text(value))
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

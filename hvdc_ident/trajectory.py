@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.errors import WaveformError, unknown_name
-from hvdc_ident.notebook import axes_of, table_html
+from hvdc_ident.notebook import axes_of, data_frame, library, table_html
 
 Array = NDArray[np.float64]
 
@@ -96,15 +96,24 @@ class Trajectory:
         """The number of rows at which the signal was not recorded."""
         return int(np.count_nonzero(np.isnan(self[name])))
 
-    def plot(self, names: Iterable[str] | None = None, ax: Any = None) -> Any:
+    def plot(self, names: str | Iterable[str] | None = None, ax: Any = None) -> Any:
         """Axes with the signals over time, all or those named."""
         axes = axes_of(ax)
-        for name in self.names if names is None else names:
+        for name in self.names if names is None else [names] if isinstance(names, str) else names:
             unit = self.unit(name)
             axes.plot(self.time, self[name], label=f"{name}, {unit}" if unit else name)
         axes.set_xlabel("time, s")
         axes.legend(fontsize="small")
         return axes
+
+    def to_dataframe(self) -> Any:
+        """Return the signals as a pandas DataFrame over time in s. Raises InputError where pandas is not installed."""
+        return data_frame({n: self[n] for n in self.names}, self.time, "time")
+
+    def to_xarray(self) -> Any:
+        """Return the signals as an xarray Dataset over time in s, each with its unit."""
+        columns = {n: ("time", self[n], {"units": u}) for n, u in zip(self.names, self.units, strict=True)}
+        return library("xarray", "to_xarray").Dataset(columns, coords={"time": ("time", self.time, {"units": "s"})})
 
     def _repr_html_(self) -> str:
         span = f"{self.time[0]:g} to {self.time[-1]:g} s" if len(self) else "no rows"

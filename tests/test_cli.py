@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -207,7 +208,7 @@ def test_a_stage_that_fails_keeps_its_results_and_ends_in_1(study: Path, monkeyp
     def fails(*_: object, **__: object) -> None:
         raise SimulationError("the run stopped at 0.5 s")
 
-    monkeypatch.setattr("hvdc_ident.simulate.simulate", fails)
+    monkeypatch.setattr(importlib.import_module("hvdc_ident.simulate"), "simulate", fails, raising=False)
     result = call("simulate", study)
     assert result.exit_code == 1
     assert result.stderr.strip() == "error: simulate: the run stopped at 0.5 s"

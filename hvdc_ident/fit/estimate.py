@@ -24,7 +24,7 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.refined import Refined
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.residual_tests import residual_tests
-from hvdc_ident.fit.result import Covariance, Estimate, FitResult, StartOutcome, Status
+from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, StartOutcome, Status
 from hvdc_ident.fit.starts import DISTINCT, Optimum, best_first, distinct, latin_hypercube
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
@@ -313,7 +313,7 @@ def _held(problem: Problem) -> FrozenMap[str]:
     """The reason for each parameter that is not fitted."""
     free = {f.name for f in problem.free}
     rest = [n for n in problem.simulator.parameters if n not in free]
-    default = {n: "held at a given value" if n in problem.held else "not a candidate" for n in rest}
+    default = {n: "held at a given value" if n in problem.held else NOT_ASKED for n in rest}
     return FrozenMap({n: problem.why.get(n, default[n]) for n in rest})
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
@@ -12,7 +12,19 @@ import numpy as np
 
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.notebook import Shown, Table, axes_of, data_frame
 from hvdc_ident.trajectory import Array
+
+NOT_ASKED = "not a candidate"
+"""The reason of a parameter that is held because nobody asked for it."""
+FIT_WORDS = {
+    "does-not-fit": "The model does not fit these records",
+    "noise-understated": "The noise may be understated",
+    "noise-overstated": "The noise is overstated",
+    "not-judged": "Not judged",
+    "fits": "The model fits",
+}
+"""The first words of a verdict on the residuals."""
 
 Status = Literal["converged", "at-bound", "two-optima", "not-converged", "failed"]
 
@@ -61,8 +73,8 @@ class Covariance:
     dof: float = math.inf
 
 
-@dataclass(frozen=True, eq=False)
-class FitResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class FitResult(Shown):
     """The outcome of a fit; `to_dict` is the JSON.
 
     fitted: names of the free parameters. held: the reason for each other one. values: fitted ones and those held at
@@ -114,6 +126,72 @@ class FitResult:
         """The result as JSON takes it: full precision, None for what is not finite."""
         return {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.metadata.get("json", True)}
 
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Fit: {self.status}. {self.message[:1].upper()}{self.message[1:]}."
+        yield self._quality()
+        start = self.starts[0].start if self.starts else {}
+        rows = [(n, e.value, e.unit, _ends(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
+        yield (
+            Table(("parameter", "estimate", "unit", "95 % interval", "std", "start", "remark"), tuple(rows))
+            if rows
+            else ""
+        )
+        own = [(x, n, e.value, e.unit, _ends(e)) for x, table in self.nuisance.items() for n, e in table.items()]
+        yield Table(("experiment", "nuisance", "estimate", "unit", "95 % interval"), tuple(own)) if own else ""
+        yield self._held()
+        columns = (self.rmse_given, self.rmse_start, self.rmse)
+        errors = [
+            (f"{o}, {x}", *((c.get(o) or {}).get(x) for c in columns)) for o, line in self.rmse.items() for x in line
+        ]
+        yield Table(("RMSE of", "given", "start", "fitted"), tuple(errors)) if errors else ""
+        yield f"Next: {self.adequacy.next}" if self.adequacy is not None and self.adequacy.next else ""
+
+    def _quality(self) -> str:
+        """The verdict on the residuals, in a line."""
+        if self.adequacy is None:
+            return ""
+        chi2 = "" if self.adequacy.chi2_per_dof is None else f" (chi2/dof {self.adequacy.chi2_per_dof:.3g})"
+        words = FIT_WORDS[self.adequacy.verdict]
+        return f"{words}{chi2}" + (f": {self.adequacy.text}." if self.adequacy.text else ".")
+
+    def _held(self) -> str:
+        """The parameters that are held, a line each; those that nobody asked about in one."""
+        told = {n: why for n, why in self.held.items() if why != NOT_ASKED and n not in self.estimates}
+        others = [n for n, why in self.held.items() if why == NOT_ASKED]
+        lines = [f"{n}: {why}" for n, why in told.items()]
+        return "\n".join([*lines, *([f"Not asked about: {', '.join(others)}."] if others else [])])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the estimates with their 95 % intervals about the start, in % of it, and return the axes."""
+        axes = axes_of(ax, 7.0, 1.2 + 0.4 * max(len(self.estimates), 1))
+        start = self.starts[0].start if self.starts else {}
+        for row, (name, e) in enumerate(self.estimates.items()):
+            base = start.get(name) or 0.0
+            size = abs(base) or abs(e.value) or 1.0
+            axes.plot([100 * (e.value - base) / size], [row], marker="o", color="#1f5fa8")
+            low, high = e.ci95 or (None, None)
+            if low is not None and high is not None:
+                axes.plot(
+                    [100 * (low - base) / size, 100 * (high - base) / size], [row, row], color="#1f5fa8", linewidth=2
+                )
+        axes.axvline(0.0, color="#999999", linestyle=":")
+        axes.set_yticks(range(len(self.estimates)), list(self.estimates))
+        axes.invert_yaxis()
+        axes.set_xlabel("change from the start, with the 95 % interval, %")
+        return axes
+
+    def to_dataframe(self) -> Any:
+        """Return the estimates as a pandas DataFrame, a row a parameter. Raises InputError where pandas is missing."""
+        ends = [e.ci95 or (None, None) for e in self.estimates.values()]
+        columns: dict[str, Any] = {
+            "estimate": [e.value for e in self.estimates.values()],
+            "unit": [e.unit for e in self.estimates.values()],
+            "std": [e.std for e in self.estimates.values()],
+            "ci95_low": [low for low, _ in ends],
+            "ci95_high": [high for _, high in ends],
+        }
+        return data_frame(columns, list(self.estimates), "parameter")
+
     def to_toml_values(self) -> str:
         """The text of a [model.values] table: fitted and held parameters, full precision, with units as comments."""
         lines = ["[model.values]"]
@@ -121,6 +199,16 @@ class FitResult:
             unit = self.estimates[name].unit if name in self.estimates else ""
             lines.append(f"{_key(name)} = {float(value)!r}" + (f"  # {unit}" if unit else ""))
         return "\n".join(lines) + "\n"
+
+
+def _ends(e: Estimate) -> str:
+    """The 95 % interval as text, with the figures that tell its ends apart."""
+    low, high = e.ci95 or (None, None)
+    if low is None or high is None:
+        return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
+    width = high - low
+    figures = 6 if width <= 0 else min(15, max(4, math.ceil(math.log10(max(abs(low), abs(high)) / width)) + 2))
+    return f"{low:.{figures}g} to {high:.{figures}g}"
 
 
 def plain(value: Any) -> Any:

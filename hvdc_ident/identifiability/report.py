@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from typing import Any
@@ -21,6 +21,7 @@ from hvdc_ident.identifiability.optima import OtherOptimum
 from hvdc_ident.identifiability.recommend import Recommendation
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
+from hvdc_ident.notebook import Shown, Table, data_frame
 from hvdc_ident.sensitivity.fisher import Collinear
 from hvdc_ident.sensitivity.local import LocalSensitivities
 
@@ -30,8 +31,8 @@ CONDITIONS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class IdentifiabilityReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class IdentifiabilityReport(Shown):
     """What the experiments tell about the candidates.
 
     parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
@@ -138,24 +139,51 @@ class IdentifiabilityReport:
             draw_profile(axes, parameter, found["profiles"][parameter], found["parameters"][parameter])
         return axes
 
-    def __str__(self) -> str:
-        width = max(map(len, self.parameters), default=0)
-        lines = [f"{n:{width}}  {v.verdict}: {v.reason}" for n, v in self.parameters.items()]
-        if self.misspecification.flag:
-            lines.append(f"The model does not explain these data: {'; '.join(self.misspecification.signs)}.")
+    def _screen(self) -> Iterator[str | Table]:
+        fitted = ", ".join(self.identifiable) or "none"
+        yield f"Identifiable: {fitted} (of {len(self.parameters)} asked about)."
+        rows = [(n, v.verdict, v.value, v.unit, _interval(v)) for n, v in self.parameters.items()]
+        yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
+        yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
+        yield from self._remarks()
+
+    def _remarks(self) -> Iterator[str]:
+        signs = self.misspecification
+        if signs.flag:
+            yield f"The model does not explain these data: {'; '.join(signs.signs)}."
         if self.recommended is not None:
-            lines.append(f"Measure next: {self.recommended.text}")
-        return "\n".join([*lines, *self.notes, CONDITIONS])
+            yield f"Measure next: {self.recommended.text}"
+        yield "\n".join([*self.notes, CONDITIONS])
+
+    def __str__(self) -> str:
+        return "\n\n".join(str(block) for block in self._screen() if block)  # reasons stay whole: they are searched for
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{escape(n)}</td><td>{v.verdict}</td><td>{v.value:.6g} {escape(v.unit)}</td>"
-            f"<td style='text-align:left'>{escape(v.reason)}</td></tr>"
-            for n, v in self.parameters.items()
-        )
-        rest = escape(str(self)).split("\n")[len(self.parameters) :]
-        head = "<tr><th>parameter</th><th>verdict</th><th>value</th><th>why</th></tr>"
-        return f"<table>{head}{rows}</table>" + "".join(f"<p>{line}</p>" for line in rest)
+        rows = [(n, v.verdict, f"{v.value:.6g} {v.unit}", _interval(v), v.reason) for n, v in self.parameters.items()]
+        table = Table(("parameter", "verdict", "value", "95 % interval", "why"), tuple(rows))
+        return table.html + "".join(f"<p>{escape(line)}</p>" for line in self._remarks())
+
+    def to_dataframe(self) -> Any:
+        """Return the verdicts as a pandas DataFrame, a row a parameter. Raises InputError where pandas is missing."""
+        verdicts = self.parameters.values()
+        ends = [v.ci95 or (None, None) for v in verdicts]
+        columns: dict[str, Any] = {
+            "verdict": [v.verdict for v in verdicts],
+            "value": [v.value for v in verdicts],
+            "unit": [v.unit for v in verdicts],
+            "std": [v.std for v in verdicts],
+            "ci95_low": [low for low, _ in ends],
+            "ci95_high": [high for _, high in ends],
+            "reason": [v.reason for v in verdicts],
+        }
+        return data_frame(columns, list(self.parameters), "parameter")
+
+
+def _interval(v: Verdict) -> str:
+    low, high = v.ci95 or (None, None)
+    if low is None or high is None:
+        return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
+    return f"{low:.6g} to {high:.6g}"
 
 
 def _bootstrap(b: Bootstrap | None) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.notebook import data_frame
 
 if TYPE_CHECKING:
     import xarray
@@ -61,6 +62,22 @@ class Response:
         if output not in self.output_names:
             raise unknown_name("output", output, self.output_names)
         return np.asarray(self.values[:, self.output_names.index(output), self.input_names.index(input)])
+
+    def to_xarray(self) -> xarray.DataArray:
+        """Return the response with labelled axes; the same as `array`."""
+        return self.array
+
+    def to_dataframe(self) -> Any:
+        """Return gain and phase of every channel as a pandas DataFrame over frequency in Hz.
+
+        Raises InputError where pandas is not installed.
+        """
+        columns = {}
+        for j, o in enumerate(self.output_names):
+            for k, i in enumerate(self.input_names):
+                columns[f"{o}/{i} gain"] = self.magnitude[:, j, k]
+                columns[f"{o}/{i} phase, degrees"] = self.phase_deg[:, j, k]
+        return data_frame(columns, self.frequency_hz, "frequency, Hz")
 
     @property
     def array(self) -> xarray.DataArray:

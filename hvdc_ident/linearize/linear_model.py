@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.delays import DelayFree
 from hvdc_ident.linearize.operating_point import OperatingPoint
-from hvdc_ident.notebook import table_html
+from hvdc_ident.notebook import Shown, Table
 
 if TYPE_CHECKING:
     import control
@@ -38,8 +38,8 @@ class Gradient:
     times: tuple[Array, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class LinearModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel(Shown):
     """E x' = A x + B u, y = C x + D u: deviations from the operating point, in the model's units, time in s.
 
     E is the identity unless the algebraic part had to stay. gradients: derivatives by parameter name. delay_free: the
@@ -326,30 +326,28 @@ class LinearModel:
 
         return draw(self, kind, ax)
 
-    def _repr_html_(self) -> str:
-        sizes = f"{len(self.state_names)} states, {len(self.input_names)} inputs, {len(self.output_names)} outputs"
-        rows = [(f"{m.eigenvalue:.5g}", m.frequency_hz, m.damping) for m in self.modes()]
-        return table_html(f"Linear model {self.name}: {sizes}", ("eigenvalue, rad/s", "Hz", "damping"), rows)
-
-    def __str__(self) -> str:
+    def _screen(self) -> Iterator[str | Table]:
         def listed(names: tuple[str, ...]) -> str:
             return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
 
         stable = "stable" if (self.poles().real < 0).all() else "not stable"
-        lines = [
-            f"linear model of {self.name}: {len(self.state_names)} states, {stable}",
-            f"inputs {listed(self.input_names)}; outputs {listed(self.output_names)}",
-        ]
-        shown = [m for m in self.modes() if m.eigenvalue.imag >= 0][:20]
-        lines += [
-            f"{m.eigenvalue.real:12.5g} {m.eigenvalue.imag:+12.5g}j 1/s, {m.frequency_hz:.4g} Hz, damping "
-            f"{m.damping:.3g}, mostly {m.dominant}"
-            for m in shown
-        ]
-        return "\n".join(lines)
+        yield f"Linear model of {self.name}: {len(self.state_names)} states, {stable}"
+        lines = [f"inputs {listed(self.input_names)}; outputs {listed(self.output_names)}"]
+        if "values" in self.provenance:
+            lines.append(f"at the {self.provenance['values']}")
+        yield "\n".join(lines)
+        modes = [m for m in self.modes() if m.eigenvalue.imag >= 0]
+        rows = [(_eigenvalue(m.eigenvalue), m.frequency_hz, m.damping, m.dominant) for m in modes[:20]]
+        yield Table(("eigenvalue, 1/s", "Hz", "damping", "mostly"), tuple(rows))
+        yield f"and {len(modes) - 20} more modes" if len(modes) > 20 else ""
 
     def to_dict(self) -> dict[str, Any]:
         """The model as plain lists, with names, units, operating point and provenance."""
         from hvdc_ident.linearize.export.json_text import to_dict
 
         return to_dict(self)
+
+
+def _eigenvalue(value: complex) -> str:
+    """An eigenvalue as text, its conjugate with it."""
+    return f"{value.real:.5g} ± {value.imag:.5g}j" if value.imag else f"{value.real:.5g}"

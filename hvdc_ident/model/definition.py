@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias
@@ -12,7 +12,7 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import table_html
+from hvdc_ident.notebook import Shown, Table
 from hvdc_ident.parameters import Input, Parameter
 
 Start: TypeAlias = sp.Expr | Literal["free"] | None
@@ -100,8 +100,8 @@ class Origin:
     neutral: FrozenMap[sp.Expr] = field(default_factory=FrozenMap)
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, repr=False)
+class Model(Shown):
     """A continuous-time model with limits, delays and sampled parts.
 
     Every name is one symbol; an expression may use `time`, parameters, inputs, states, signals, unknowns, delays and
@@ -190,12 +190,16 @@ class Model:
 
         return tied(self, {n: parse(e) if isinstance(e, str) else e for n, e in ties.items()})
 
-    def _repr_html_(self) -> str:
-        sizes = f"{len(self.states)} states, {len(self.algebraic)} unknowns, {len(self.signals)} signals"
-        rows = [(n, q.value, q.unit, q.description) for n, q in self.parameters.items()]
-        rows += [(n, q.value, q.unit, q.description) for n, q in self.inputs.items()]
-        header = ("parameter or input", "value", "unit", "")
-        return table_html(f"Model {self.name}: {sizes}, outputs {', '.join(self.outputs)}", header, rows)
+    def _screen(self) -> Iterator[str | Table]:
+        counts = f"{len(self.states)} states, {len(self.algebraic)} unknowns, {len(self.signals)} signals"
+        yield f"Model {self.name}: {counts}, outputs {', '.join(self.outputs)}"
+        yield self.description
+        inputs = [(n, q.value, q.unit, q.description) for n, q in self.inputs.items()]
+        yield Table(("input", "value", "unit", ""), tuple(inputs)) if inputs else ""
+        rows = [(n, q.value, q.unit, q.min, q.max, q.description) for n, q in self.parameters.items()]
+        yield Table(("parameter", "value", "unit", "min", "max", ""), tuple(rows)) if rows else ""
+        outputs = [(n, o.unit, o.description) for n, o in self.outputs.items()]
+        yield Table(("output", "unit", ""), tuple(outputs)) if outputs else ""
 
     def __getitem__(self, name: str) -> sp.Symbol:
         """The symbol of one of the model's names, for use in expressions."""

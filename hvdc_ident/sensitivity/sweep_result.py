@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.files import csv_cell
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.notebook import Shown, Table, data_frame
 from hvdc_ident.sensitivity.axes import Points, Samples
 from hvdc_ident.trajectory import Array
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import xarray
 
 
-@dataclass(frozen=True, eq=False)
-class SweepResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class SweepResult(Shown):
     """A sweep's n points.
 
     axes: of the product. units: by parameter. series: (output, experiment) of the columns of rmse, with series_units.
@@ -209,14 +209,27 @@ class SweepResult:
             axes.legend()
         return axes
 
-    def __str__(self) -> str:
-        text = f"sweep of {', '.join(self.parameters)}: {len(self)} points, {len(self.failed)} failed"
-        lines = []
-        for k, (o, e) in enumerate(self.series):
-            if np.isfinite(self.rmse[:, k]).any():
-                at = ", ".join(f"{n} = {v:.6g}" for n, v in self.best(o, e).items())
-                lines.append(f"{o} in {e}: RMSE {np.nanmin(self.rmse[:, k]):.4g} at {at}")
-        return "\n".join([text, *lines])
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame, a row a point: parameters, RMSE by output and experiment, status and reason.
 
-    def _repr_html_(self) -> str:
-        return "<pre>" + escape(str(self)) + "</pre>"
+        Raises InputError where pandas is missing.
+        """
+        points = self.points.rows(0, len(self))
+        columns: dict[str, Any] = {n: points[:, k] for k, n in enumerate(self.parameters)}
+        columns |= {f"rmse.{o}.{e}": self.rmse[:, k] for k, (o, e) in enumerate(self.series)}
+        reasons = [self.failed.get(i, "") for i in range(len(self))]
+        return data_frame({**columns, "status": ["failed" if r else "done" for r in reasons], "reason": reasons})
+
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Sweep of {', '.join(self.parameters)}: {len(self)} points, {len(self.failed)} failed"
+        rows = []
+        for k, ((o, e), unit) in enumerate(zip(self.series, self.series_units, strict=True)):
+            if np.isfinite(self.rmse[:, k]).any():
+                at = ", ".join(f"{n} = {v:.6g} {self.units[n]}".rstrip() for n, v in self.best(o, e).items())
+                low, high = float(np.nanmin(self.rmse[:, k])), float(np.nanmax(self.rmse[:, k]))
+                rows.append((o, e, unit, low, at, high))
+        yield Table(("output", "experiment", "unit", "smallest RMSE", "at", "largest"), tuple(rows)) if rows else ""
+        if "poles" in self.wanted and np.isfinite(self.poles).any():
+            right = self.poles.real[np.isfinite(self.poles).all(axis=1)].max(axis=1)
+            yield f"Rightmost pole: {np.min(right):.4g} to {np.max(right):.4g} 1/s; {int((right > 0).sum())} points are unstable"
+        yield f"The first that failed: {next(iter(self.failed.values()))}" if self.failed else ""

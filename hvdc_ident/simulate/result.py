@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.notebook import Shown, Table
 from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
@@ -32,8 +34,8 @@ class Statistics:
     forced: int
 
 
-@dataclass(frozen=True, eq=False)
-class Simulation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Simulation(Shown):
     """Simulated outputs and their exact derivatives.
 
     trajectory: the outputs at the experiment's times. parameters: names of the sensitivity parameters.
@@ -74,8 +76,24 @@ class Simulation:
         """Axes with the outputs over time."""
         return self.trajectory.plot(outputs, ax)
 
-    def _repr_html_(self) -> str:
-        return self.trajectory._repr_html_()
+    def _screen(self) -> Iterator[str | Table]:
+        time, s = self.trajectory.time, self.statistics
+        yield f"Simulation: {time.size} rows, {time[0]:g} to {time[-1]:g} s, {s.accepted} steps ({s.method})"
+        table = self.trajectory
+        rows = [
+            (n, table.unit(n), float(v[0]), float(v[-1]), float(np.fmin.reduce(v)), float(np.fmax.reduce(v)))
+            for n, v in zip(table.names, table.values.T, strict=True)
+        ]
+        yield Table(("output", "unit", "first", "last", "smallest", "largest"), tuple(rows))
+        yield f"Derivatives by {', '.join(self.parameters)}: gradient(output), sensitivities" if self.parameters else ""
+
+    def to_dataframe(self) -> Any:
+        """Return the outputs as a pandas DataFrame over time in s. Raises InputError where pandas is not installed."""
+        return self.trajectory.to_dataframe()
+
+    def to_xarray(self) -> Any:
+        """Return the outputs as an xarray Dataset over time in s; `sensitivities` has the derivatives."""
+        return self.trajectory.to_xarray()
 
     def to_dict(self) -> dict[str, Any]:
         """The outputs, derivatives and statistics as plain lists and numbers."""

@@ -85,11 +85,10 @@ def values_of(
     found = {}
     for name, value in table.items():
         if name not in known and name not in others:
-            raise unknown_name(kind, name, known, where=f"model '{model.name}'")
-        if not isinstance(value, int | float | np.number) or not np.isfinite(value):
-            raise InputError(
-                f"the value of '{name}' is no finite number", where=f"model '{model.name}'", got=repr(value)[:60]
-            )
+            both = kind if kind == "input" else "parameter or input"
+            raise unknown_name(both, name, [*known, *others], where=f"model '{model.name}'")
+        if not isinstance(value, int | float | np.number):
+            raise InputError(f"the value of '{name}' is no number", where=f"model '{model.name}'", got=repr(value)[:60])
         found[name] = float(value)
     return found
 

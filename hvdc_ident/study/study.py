@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
@@ -15,6 +18,7 @@ from hvdc_ident.linearize.measured import MeasuredResponse
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
+from hvdc_ident.notebook import Shown, Table, axes_of
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear_analysis import check_linear
 from hvdc_ident.study.parse import parse_study
@@ -23,8 +27,8 @@ from hvdc_ident.study.responses import read_responses
 from hvdc_ident.study.unknowns import free_of, with_nuisances, with_unknowns
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
+@dataclass(frozen=True, eq=False, repr=False)
+class Study(Shown):
     """A study that holds together.
 
     model: with its parameterisation, effects, [model.values] and given values. candidates: what may be estimated, with
@@ -65,6 +69,34 @@ class Study:
         """Where a search begins, of the same parameters: what `start` says, else the given value. Nothing else rests on it."""
         stated = {n: line.start for n, line in self._listed.items()}
         return FrozenMap({n: g if (s := stated[n]) is None else s for n, g in self.given.items()})
+
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Study {self.name}: model {self.model.name}, {len(self.experiments)} experiments, {len(self.responses)} responses"
+        units = {n: self.model.parameters[n].unit for n in self.candidates}
+        rows = [(n, f.given, f.start, f.min, f.max, units[n]) for n, f in self.candidates.items()]
+        yield Table(("parameter", "given", "start", "min", "max", "unit"), tuple(rows)) if rows else ""
+        records = [
+            (
+                e.name,
+                e.role,
+                e.time.size,
+                float(e.time[0]),
+                float(e.time[-1]),
+                e.event,
+                ", ".join(e.inputs),
+                ", ".join(e.outputs),
+            )
+            for e in self.experiments
+        ]
+        header = ("experiment", "role", "rows", "from, s", "to, s", "event, s", "inputs", "outputs")
+        yield Table(header, tuple(records)) if records else ""
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the recorded outputs of every experiment, below each other, and return the axes."""
+        axes = np.atleast_1d(axes_of(ax, 7.0, 2.5 * max(len(self.experiments), 1), rows=max(len(self.experiments), 1)))
+        for one, experiment in zip(axes, self.experiments, strict=False):
+            experiment.plot(one)
+        return axes
 
     @property
     def _listed(self) -> dict[str, schema.Candidate]:

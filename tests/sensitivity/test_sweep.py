@@ -185,7 +185,7 @@ def test_it_draws_and_tells():
     found = sweep(MODEL, [RECORDED], listed("k", [1, 3]))
     assert found.plot().get_xlabel() == "k, 1/s"
     plt.close("all")
-    assert "k = 3" in str(found) and "<pre>" in found._repr_html_()
+    assert "k = 3" in str(found) and "<table>" in found._repr_html_()
 
 
 def test_a_further_point_of_a_sweep_is_a_simulation_and_no_more():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,6 +10,8 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fit.result import plain
 from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.notebook import Shown, data_frame
+from hvdc_ident.notebook import Table as TextTable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -117,8 +119,8 @@ class Gap:
     held_out: str = "experiments"
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown):
     """The outcome of a diagnosis; `to_dict` is the JSON.
 
     verdict: named, no-evidence, not-excited, ambiguous or unnameable; text: why, in one or two sentences.
@@ -186,11 +188,57 @@ class Diagnosis:
         about += f"; fitted values, with what was added to the model; given were {given}"
         return {AUGMENTED: write_card(replace(card, description=about))}
 
+    def _screen(self) -> Iterator[str | TextTable]:
+        yield f"Diagnosis: {self.verdict}. {self.text}"
+        rows = [
+            (e.effect, ", ".join(e.at), n, size.value, size.unit, _span(size.ci95))
+            for e in self.effects
+            for n, size in e.parameters.items()
+        ]
+        header = ("effect", "at", "parameter", "value", "unit", "95 % interval")
+        yield TextTable(header, tuple(rows)) if rows else ""
+        gaps = [
+            (words, self.gap.pooled[n]["fit"], self.gap.pooled[n]["holdout"])
+            for n, words in (("nominal", "given values"), ("refitted", "refitted"), ("augmented", "with effects"))
+        ]
+        yield TextTable(("residual in noise units", "fitted data", "held out"), tuple(gaps))
+        if self.gap.shrink_holdout is not None and self.effects:
+            yield f"The held-out gap shrinks by {100 * self.gap.shrink_holdout:.1f} %."
+        rivals = [
+            (r.effect, ", ".join(r.at), r.delta_bic) for group in self.ambiguity if len(group) > 1 for r in group[:8]
+        ]
+        yield TextTable(("as good", "at", "delta BIC"), tuple(rivals)) if rivals else ""
+        changed = [
+            (n, self.parameters_before[n], self.parameters_refitted[n], v) for n, v in self.parameters_after.items()
+        ]
+        yield TextTable(("parameter", "given", "refitted", "with effects"), tuple(changed)) if changed else ""
+        advice = (self.separating_experiment or {}).get("text")
+        yield f"Measure next: {advice}" if advice else ""
+        yield "\n".join(self.notes)
+
+    def to_dataframe(self) -> Any:
+        """Return the candidate effects as a pandas DataFrame, the best first. Raises InputError where pandas is missing."""
+        columns: dict[str, Any] = {
+            "effect": [c.effect for c in self.candidates],
+            "at": [", ".join(c.at) for c in self.candidates],
+            "score": [c.score for c in self.candidates],
+            "p": [c.p for c in self.candidates],
+            "delta_bic": [c.delta_bic for c in self.candidates],
+            "holdout_rmse": [c.holdout_rmse for c in self.candidates],
+            "status": [c.status for c in self.candidates],
+        }
+        return data_frame(columns)
+
     def plot(self) -> Figure:
         """The gap before and after by output, and the best candidates."""
         from hvdc_ident.discrepancy.findings.plots import overview
 
         return overview(self)
+
+
+def _span(ci95: tuple[float | None, float | None] | None) -> str:
+    low, high = ci95 or (None, None)
+    return "" if low is None or high is None else f"{low:.4g} to {high:.4g}"
 
 
 def _named(value: Found | Rival | Line) -> dict[str, Any]:

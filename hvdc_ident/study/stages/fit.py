@@ -93,9 +93,11 @@ def _head(study: Study, values: Mapping[str, float]) -> str:
 
 def told(data: Mapping[str, Any]) -> list[str]:
     """The status and the verdict on the residuals, then every estimate beside its given value, then what is held."""
+    from hvdc_ident.fit.result import FIT_WORDS
+
     lines = [f"{data['status']}: {data['message']}"]
     judged = data.get("adequacy") or {}
-    lines += [f"{WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
+    lines += [f"{FIT_WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
     lines += [f"Next: {judged['next']}"] if judged.get("next") else []
     from hvdc_ident.study.responses import response_lines
 
@@ -110,16 +112,6 @@ def told(data: Mapping[str, Any]) -> list[str]:
     lines += _conditions(data)
     lines += response_lines(data.get("responses", ()), "fitted")
     return lines + _searched(data)
-
-
-WORDS = {
-    "does-not-fit": "The model does not fit these records",
-    "noise-understated": "The noise may be understated",
-    "noise-overstated": "The noise is overstated",
-    "not-judged": "Not judged",
-    "fits": "The model fits",
-}
-"""What a verdict of `fit.adequacy` begins with on the screen."""
 
 
 def _beside(data: Mapping[str, Any]) -> str:
