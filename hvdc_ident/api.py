@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel, OperatingPoint
     from hvdc_ident.linearize.frequency import Response
     from hvdc_ident.linearize.jacobian import Side
+    from hvdc_ident.sensitivity.factors import Ranges
     from hvdc_ident.sensitivity.local import LocalSensitivities
     from hvdc_ident.sensitivity.sweep_result import SweepResult
     from hvdc_ident.simulate import Simulation, Tolerance
@@ -216,12 +217,14 @@ def sensitivities(
     outputs: Names = None,
     values: Values = None,
     omega: Sequence[float] | Array | None = None,
+    ranges: Ranges | None = None,
 ) -> LocalSensitivities:
     """Return the exact derivatives of trajectories, steady state, eigenvalues and frequency responses by parameters.
 
     data: times in s, an Experiment, several, or left out (then a study's own, if a study is given).
     parameters: names (default: all). inputs: where `data` are times, the input signals; else names of the inputs of the
     frequency response. values: where the derivatives are taken, if not at the model's values. omega: of the responses, rad/s.
+    ranges: (min, max) by parameter, as factors that normalise (default: its value, or its range where that is 0).
 
     Raises InputError for a model without equations (an FMU), UnknownNameError, SteadyStateError or SimulationError.
 
@@ -263,6 +266,7 @@ def sensitivities(
         inputs=seen or (tuple(moved) if moved else None),
         outputs=names_of(outputs, "output"),
         omega=None if omega is None else np.atleast_1d(np.asarray(omega, dtype=float)),
+        ranges=ranges,
     )
 
 
