@@ -180,7 +180,7 @@ def test_nothing_moves_nothing_is_excited() -> None:
 
 
 def test_the_verb_is_public_and_wrong_questions_are_refused() -> None:
-    assert hvdc_ident.diagnose is diagnose
+    assert hvdc_ident.Diagnosis is Diagnosis
     with pytest.raises(UnknownNameError, match="no effect 'lagg'"):
         diagnose(model(), experiments(), FREE, effects=["lagg"])
     with pytest.raises(UnknownNameError, match="no slot 'wx'"):
