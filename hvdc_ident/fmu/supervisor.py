@@ -5,8 +5,9 @@ a worker needs and forks one whenever the host asks, in a hundredth of the time 
 with which memory and in which call a worker ended. Where the host ends, however it does, it ends the workers, removes
 the unpacked FMU and ends too; where it is itself killed, the system ends the workers.
 
-A worker that crashes, leaves or is told to dumps its Python frames here before it goes (see `worker.begin`). It cannot
-go on before the dump is read, so the memory it has at that moment is known as well.
+A worker that crashes, leaves or is told to dumps its Python frames here before it goes (see `worker.main`). It cannot
+go on before the dump is read, so the memory it has at that moment is known as well. The system says of each part from
+which process it is: a trial that crashed in a process of its own tells nothing about the run after it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import os
 import pickle
 import signal
 import socket
+import struct
 import sys
 import time
 from collections.abc import Mapping
@@ -31,7 +33,8 @@ from hvdc_ident.fmu.messages import PROCESS, packed, progress_in, unpacked
 
 PATIENCE = 1.0  # s between looks after the host where the system does not tell of its end
 DUMP = 0.5  # s that a worker has to begin the dump it is asked for; it takes about a millisecond
-PAUSE = 0.05  # s of silence after which a dump is over
+PAUSE = 0.2  # s of silence after which a dump that was asked for is over: on a busy computer a process waits for its turn
+SENDER = struct.Struct("3i")  # process, user and group that the system puts to a message
 
 
 @dataclass(eq=False)
@@ -44,8 +47,7 @@ class _Child:
     progress: memoryview[float]
     space: int = 0
     resident: int = 0
-    dump: list[bytes] = field(default_factory=list)
-    heard: float = 0.0
+    dumped: dict[int, list[bytes]] = field(default_factory=dict)  # by process
 
     def processes(self) -> list[int]:
         """The worker and, where it keeps the FMU in a process of its own, that."""
@@ -60,14 +62,20 @@ class _Child:
 
     def read(self) -> bool:
         """Whether there was a part of a dump to read."""
-        now = time.monotonic()
-        if now - self.heard > PAUSE:  # a new dump: the worker waits in the middle of it
-            self.dump.clear()
+        part, control, _, _ = self.dumps.recvmsg(65536, socket.CMSG_SPACE(SENDER.size))
+        if not part:
+            return False
+        sender = next((SENDER.unpack(data)[0] for _, kind, data in control if kind == socket.SCM_CREDENTIALS), self.pid)
+        if sender not in self.dumped:  # it waits in the middle of its dump
             self.look()
-        self.heard = now
-        part = self.dumps.recv(65536)
-        self.dump.append(part)
-        return bool(part)
+        self.dumped.setdefault(sender, []).append(part)
+        return True
+
+    @property
+    def traces(self) -> str:
+        """The dumps of the processes that it last had, the innermost first; an earlier one's told of its own end only."""
+        last = dict.fromkeys((int(self.progress[PROCESS]), self.pid))
+        return b"".join(part for pid in last for part in self.dumped.get(pid, ())).decode("utf-8", "replace")
 
 
 class Supervisor:
@@ -122,6 +130,7 @@ class Supervisor:
     def _start(self, number: int, heading: Mapping[str, Any], descriptors: list[int]) -> None:
         """Fork a worker. descriptors: its connection to the host, its progress, and what its messages go to."""
         here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        here.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         there.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the least: a few lines, then it waits to be read
         own = os.getpid()
         pid = os.fork()
@@ -162,7 +171,7 @@ class Supervisor:
             "code": os.waitstatus_to_exitcode(status),
             "resident": max(child.resident, usage.ru_maxrss * 1024),
             "space": child.space,
-            "traces": b"".join(child.dump).decode("utf-8", "replace"),
+            "traces": child.traces,
         }
         self.host.send_bytes(packed(ended))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from c_fmu import COMPILER, FOLDER, build, needs_compiler
-from c_models import FAULTS, FAULTY, FAULTY_VARIABLES, broken
+from c_models import FAULTS, FAULTY, FAULTY_CODE, FAULTY_VARIABLES, broken
 from fmu_limits import PATIENT, QUICK
 
 from hvdc_ident import load_model, simulate
@@ -70,6 +70,23 @@ def test_a_sweep_over_faults_keeps_every_other_point(fmu):
     for fault in FAULTS:  # on a busy computer the memory may not be full before the deadline
         wanted = REASONS[fault] + (f"|{REASONS[2]}" if FAULTS[fault] == "endless memory" else "")
         assert re.search(wanted, reasons[fault])
+
+
+def test_the_call_is_told_of_an_fmu_that_takes_its_time_to_end(tmp_path):
+    code = FAULTY_CODE + "__attribute__((destructor)) static void late(void) { usleep(300000); }\n"
+    model = read_fmu(build(replace(FAULTY, name="late", code=code), tmp_path), interface="co-simulation", limits=PATIENT)
+    with pytest.raises(SimulationError, match=r"in fmi2DoStep: it ended itself with exit code 0 and no result"):
+        simulate(model, STEP, {"fault": 3})
+    model.host.close()
+
+
+def test_a_crash_in_a_trial_tells_nothing_about_the_run_after_it(tmp_path):
+    model = read_fmu(build(broken("resets", defines=("AT_RESET=abort()",)), tmp_path), interface="co-simulation")
+    assert np.abs(simulate(model, STEP)["out"] - answer(TIME)).max() < 1e-6
+    with pytest.raises(SimulationError, match=r"crashed in the run, in fmi2DoStep: its process was ended by SIGSEGV"):
+        simulate(model, STEP, {"fault": 1})
+    assert model.host.learned["restart"] == "instance" and model.host.started == 1
+    model.host.close()
 
 
 def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
