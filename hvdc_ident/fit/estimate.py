@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.assessment import assessed
@@ -68,9 +69,23 @@ def fit(
     begins = [first.start, *latin_hypercube(first.free, first.unknowns[len(first.free) :], count - 1, seed)]
     runs = _run_all(first, begins, method, executor, progress)
     if all(r.status == "failed" or r.cost is None for r in runs):
-        return _failed(first, begins, runs)
-    local = TrustRegion()
+        return _failed(first, begins, runs, f"no start reached an end: {runs[0].message}")
     runs = _continued(first, runs, method)
+    try:
+        problem, result = _result(first, begins, runs, whiten)
+    except SimulationError as e:
+        return _failed(first, begins, runs, f"the optimum could be simulated once and no more: {e}")
+    return assessed(problem, result) if assess else result
+
+
+def _result(
+    first: Problem, begins: Sequence[Array], runs: Sequence[OptimiserResult], whiten: str
+) -> tuple[Problem, FitResult]:
+    """The problem in its final weights, and what its optima say.
+
+    Raises SimulationError where a simulator fails at values at which it did not before.
+    """
+    local = TrustRegion()
     usable = _ends(runs)
     problem, best, rivals = weighted(first, usable, local)
     if has_clocks(problem):
@@ -95,7 +110,7 @@ def fit(
         problem, found, [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
     )
     squares = sum(float(b.residual @ b.residual) for b in blocks)
-    result = FitResult(
+    return problem, FitResult(
         status=status,
         message=message,
         fitted=tuple(f.name for f in problem.free),
@@ -121,7 +136,6 @@ def fit(
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
         covariance=Covariance(inner.names, inner.corrected, inner.dof),
     )
-    return assessed(problem, result) if assess else result
 
 
 def _method(optimiser: Optimiser | str | None, starts: int | None, seed: int) -> tuple[Optimiser, int]:
@@ -335,11 +349,11 @@ def _noise_text(problem: Problem, output: str) -> str:
     return source_text(problem.fitted_experiments, output, floor)
 
 
-def _failed(problem: Problem, begins: Sequence[Array], runs: Sequence[OptimiserResult]) -> FitResult:
-    """The result where no run reached an admissible end."""
+def _failed(problem: Problem, begins: Sequence[Array], runs: Sequence[OptimiserResult], message: str) -> FitResult:
+    """The result where no run reached an admissible end, or none can be repeated."""
     return FitResult(
         status="failed",
-        message=f"no start reached an end: {runs[0].message}",
+        message=message,
         fitted=tuple(f.name for f in problem.free),
         held=_held(problem),
         values=FrozenMap(problem.held),

@@ -82,13 +82,19 @@ def whitened_by_residuals(
 def _again(
     problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser
 ) -> tuple[Problem, Optimum, list[Optimum]]:
-    """The optima found again in the problem's weights, best first; of the rivals those that are optima there."""
+    """The optima found again in the problem's weights, best first; of the rivals those that are optima there.
+
+    Raises SimulationError where no simulation succeeds at any of them, though those that led there did.
+    """
     runs = [method.run(problem, r.theta) for r in (best, *rivals)]
     candidates = [
         runs[0].theta if runs[0].cost is not None else best.theta,
         *(m.theta for m in runs[1:] if m.status in ("converged", "stalled")),
     ]
     at = [Optimum(t, c) for t in candidates if (c := cost_of(problem, t)) is not None]
+    if not at:
+        problem.residual(candidates[0])  # raises what the simulation fails with
+        raise SimulationError("a simulation at the optimum failed, and another of the same values did not")
     first, *rest = best_first(at)
     return problem, first, rest
 

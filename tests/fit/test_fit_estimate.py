@@ -192,6 +192,24 @@ def test_a_fit_whose_every_start_fails_has_no_numbers():
     json.dumps(result.to_dict(), allow_nan=False)
 
 
+def test_a_simulator_that_fails_from_some_run_on_costs_no_more_than_the_reason():
+    """As an FMU that runs once: wherever in the fit it is, the result says so or is that of the runs before."""
+    sound = decaying(given=False)
+    whole = fit(sound, starts=2, assess=False)
+    messages = set()
+    for last in range(1, sound.simulator.runs):
+        worn = decaying(given=False)
+        worn.simulator.fails = lambda p, s=worn.simulator, last=last: s.runs > last
+        result = fit(worn, starts=2, assess=False)
+        assert result.status in ("failed", "not-converged", "converged")
+        if result.status == "failed":
+            assert "does not reach its end" in result.message and not result.estimates
+            messages.add(result.message.partition(":")[0])
+        if result.status == "converged":
+            assert result.estimates["k"].value == pytest.approx(whole.estimates["k"].value, rel=1e-6)
+    assert messages == {"no start reached an end", "the optimum could be simulated once and no more"}
+
+
 def test_an_optimum_in_reach_only_through_failing_runs_is_no_optimum():
     result = fit(decaying(fails=lambda p: p["k"] > 1.2, bounds=(0.0, 1.4)), starts=4)
     assert result.status == "failed"
