@@ -56,7 +56,7 @@ class Plan:
 
     def experiment(self, name: str = "run") -> Experiment:
         signals = {n: InputSignal(self.corners, v, self.jumps) for n, v in self.inputs.items()}
-        return Experiment(name, self.rows, FrozenMap(signals))
+        return Experiment(self.rows, name, inputs=signals)
 
 
 def _positive_nominals(kind: type) -> None:
