@@ -70,7 +70,9 @@ def _work(work: Callable[[Callable[[Part], None]], None], told: Connection) -> N
     try:
         work(lambda part: told.send_bytes(packed({"part": part[0]}, part[1])))
     except Exception as e:
-        end = {"ended": 1, "failed": failure(e).told()}
+        failed = failure(e)
+        failed.resident, failed.space = resident(), space()
+        end = {"ended": 1, "failed": failed.told()}
     told.send_bytes(packed(end))
     os._exit(0)
 
@@ -81,3 +83,19 @@ def end_with(parent: int) -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(0)
+
+
+def resident() -> int:
+    """Bytes of memory in use; 0 where the system does not tell."""
+    return _statm(1)
+
+
+def space() -> int:
+    """Bytes of address space in use, on which the limit is; 0 where the system does not tell."""
+    return _statm(0)
+
+
+def _statm(place: int) -> int:
+    with contextlib.suppress(OSError), open("/proc/self/statm", encoding="ascii") as sizes:
+        return int(sizes.read().split()[place]) * os.sysconf("SC_PAGESIZE")
+    return 0

@@ -20,8 +20,12 @@ class RunFailed(Exception):
     """A run that did not reach its end.
 
     what: what happened. t: the instant, s. hint: what to try. said: the FMU's own last message. fatal: the process is of
-    no more use. again: a new process may do better, where this one has made an instance before.
+    no more use. again: a new process may do better, where this one has made an instance before. resident, space: bytes of
+    memory and of address space in the process of its own that it was in; 0 where it was in none.
     """
+
+    resident = 0
+    space = 0
 
     def __init__(
         self,
@@ -40,14 +44,16 @@ class RunFailed(Exception):
         """Return the heading that tells it to another process."""
         return {
             "failed": self.what, "time": self.t, "hint": self.hint, "said": self.said, "fatal": self.fatal,
-            "again": int(self.again),
+            "again": int(self.again), "resident": self.resident, "space": self.space,
         }  # fmt: skip
 
     @classmethod
     def heard(cls, told: Mapping[str, Any]) -> RunFailed:
         """Return the failure that a heading tells."""
         again, fatal = bool(told["again"]), bool(told["fatal"])
-        return cls(told["failed"], told["time"], told["hint"], said=told["said"], fatal=fatal, again=again)
+        found = cls(told["failed"], told["time"], told["hint"], said=told["said"], fatal=fatal, again=again)
+        found.resident, found.space = told["resident"], told["space"]
+        return found
 
 
 class RunEnded(RunFailed):

@@ -18,7 +18,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
-from hvdc_ident.fmu.isolation import end_with
+from hvdc_ident.fmu.isolation import end_with, resident, space
 from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_in, unpacked
 
 
@@ -114,7 +114,8 @@ def _guarded(host: Connection, jobs: Any, work: Callable[[], Any], view: memoryv
         failed = jobs.failed(e)
         told, out, fatal = failed.told(), {}, failed.fatal
     view[PROCESS] = os.getpid()  # of those that the work was done in
-    host.send_bytes(packed({**told, "memory": resident(), "space": space()}, out))
+    taken = max(resident(), told.get("resident", 0)), max(space(), told.get("space", 0))
+    host.send_bytes(packed({**told, "memory": taken[0], "space": taken[1]}, out))
     if fatal:
         os._exit(0)
     return "done" in told
@@ -140,19 +141,3 @@ def _limit(memory: int | None) -> None:
             most = space() + memory
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def resident() -> int:
-    """Bytes of memory in use; 0 where the system does not tell."""
-    return _statm(1)
-
-
-def space() -> int:
-    """Bytes of address space in use, on which the limit is; 0 where the system does not tell."""
-    return _statm(0)
-
-
-def _statm(place: int) -> int:
-    with contextlib.suppress(OSError), open("/proc/self/statm", encoding="ascii") as sizes:
-        return int(sizes.read().split()[place]) * os.sysconf("SC_PAGESIZE")
-    return 0
