@@ -23,7 +23,6 @@ from fmpy.simulation import instantiate_fmu, simulate_fmu
 
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fmu.model import FmuModel, read_fmu
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 
 REAL = ("Real", "Float64", "Float32")
