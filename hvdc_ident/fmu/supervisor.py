@@ -33,7 +33,7 @@ from hvdc_ident.fmu.messages import PROCESS, packed, progress_in, unpacked
 
 PATIENCE = 1.0  # s between looks after the host where the system does not tell of its end
 DUMP = 0.5  # s that a worker has to begin the dump it is asked for; it takes about a millisecond
-PAUSE = 0.2  # s of silence after which a dump that was asked for is over: on a busy computer a process waits for its turn
+PAUSE = 0.2  # s of silence after which a dump that was asked for is over: a process may have to wait for its turn
 SENDER = struct.Struct("3i")  # process, user and group that the system puts to a message
 
 

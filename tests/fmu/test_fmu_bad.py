@@ -74,7 +74,9 @@ def test_a_sweep_over_faults_keeps_every_other_point(fmu):
 
 def test_the_call_is_told_of_an_fmu_that_takes_its_time_to_end(tmp_path):
     code = FAULTY_CODE + "__attribute__((destructor)) static void late(void) { usleep(300000); }\n"
-    model = read_fmu(build(replace(FAULTY, name="late", code=code), tmp_path), interface="co-simulation", limits=PATIENT)
+    model = read_fmu(
+        build(replace(FAULTY, name="late", code=code), tmp_path), interface="co-simulation", limits=PATIENT
+    )
     with pytest.raises(SimulationError, match=r"in fmi2DoStep: it ended itself with exit code 0 and no result"):
         simulate(model, STEP, {"fault": 3})
     model.host.close()
