@@ -1,6 +1,7 @@
 """Derivatives of whole runs by differences, as many runs as the accuracy asks for and no more.
 
-A run has noise (its integrator's, mostly): third differences over tiny steps of all parameters at once leave it alone.
+A run has noise (its integrator's, and that of rows which an event passes): fourth differences over short steps of all
+parameters at once show it.
 A pair of runs around a parameter then gives its derivative, and the bend from which the best step of a one-sided
 difference follows: from the second time on, a derivative costs one run. Where one side cannot be accurate, the step of a
 central difference is chosen against the noise. J. J. More and S. M. Wild, ACM TOMS 38 (2012) 19.
@@ -15,7 +16,7 @@ import numpy as np
 
 from hvdc_ident.trajectory import Array
 
-TINY = 1e-6  # step of the differences that show the noise, in sizes of the parameter: a bend leaves 1e-18 of them
+SHORT = 1e-3  # step of the differences that show the noise, in sizes of the parameter: as long as those of a search
 FARTHER = 4.0  # the second pair's step, in those of the first
 LEAST, MOST = 1e-6, 5e-2  # steps that are chosen from, in sizes of the parameter
 ENOUGH = 1e-3
@@ -36,14 +37,18 @@ class Step:
 
 
 def noise_of(runs: Runs, middle: Array) -> Array:
-    """Return the noise of each output, (outputs,) rms over rows, from three runs.
+    """Return the noise of each output, (outputs,) rms over rows, from six runs.
 
-    runs: runs at a number of tiny steps, all parameters moved at once: one that changes nothing shows no noise.
+    runs: runs at a number of short steps, all parameters moved at once: one that changes nothing shows no noise. Fourth
+    differences over half a step and over a whole one hold the same noise, and the bend 16 times: their squares tell
+    both. So what jumps over a few steps, as a row does that an event passes, counts as noise, and what bends does not.
     """
-    third = runs(3.0) - 3.0 * runs(2.0) + 3.0 * runs(1.0) - middle
+    at = {0.0: middle, **{k: runs(k) for k in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)}}
+    half, whole = (at[0.0] - 4.0 * at[k] + 6.0 * at[2 * k] - 4.0 * at[3 * k] + at[4 * k] for k in (0.5, 1.0))
     rounding = np.finfo(float).eps * np.abs(middle).max(axis=0, initial=0.0)
-    found = np.sqrt(np.mean(third**2, axis=0)) / np.sqrt(20.0)  # 1 + 9 + 9 + 1 variances of one run
-    return np.asarray(np.maximum(found, rounding))
+    # 1 + 16 + 36 + 16 + 1 times the square of one run's noise.
+    square = (256.0 * np.mean(half**2, axis=0) - np.mean(whole**2, axis=0)) / (255.0 * 70.0)
+    return np.asarray(np.sqrt(np.maximum(square, rounding**2)))
 
 
 def first(
@@ -58,8 +63,9 @@ def first(
     size = min(size, 10.0 * room) if np.isfinite(room) and room > 0 else size
     scale = _scale(middle)
     level = float((noise / scale).max(initial=0.0))
-    # The best step of a pair where the third derivative is of the order that the parameter's size makes it.
-    close = _clipped(float(np.cbrt(3.0 * level)) * size, size)
+    # A pair's best step is cbrt(3 level) sizes where the third derivative is as large as the parameter's size makes it:
+    # that is the second pair's. The first, closer one bears a third derivative sixteen times as large.
+    close = _clipped(float(np.cbrt(3.0 * level)) * size, size) / FARTHER
     near, bend = pair(runs, at, close, low, high, middle)
     strength, curve = _norm(near, scale), _norm(bend, scale)
     if strength == 0.0:

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.fmu import co_simulation, exchange
 from hvdc_ident.fmu.binding import Block, Failure
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.differences import ENOUGH, TINY, Step, derivative, first, noise_of, pair
+from hvdc_ident.fmu.differences import ENOUGH, SHORT, Step, derivative, first, noise_of, pair
 from hvdc_ident.fmu.isolation import result
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed, failure
 from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moves
@@ -442,18 +442,18 @@ class _Simulation:
         """(outputs,) noise of a run of this experiment."""
         found = self.jobs.noise.get(self.key)
         if found is None:
-            found = noise_of(self._tiny, outputs)
+            found = noise_of(self._aside, outputs)
             if len(self.jobs.noise) < KEPT_STEPS:
                 self.jobs.noise[self.key] = found
         return found
 
-    def _tiny(self, steps: float) -> Array:
-        """(n, outputs) of a run with every parameter so many tiny steps away, to the side where there is room."""
+    def _aside(self, steps: float) -> Array:
+        """(n, outputs) of a run with every parameter so many short steps away, to the side where there is room."""
         self.jobs.tell()
         moved = {}
         for name in self.parameters:
             at, (low, high) = self._now(name), self.bounds[name]
-            moved[name] = at + (steps if high - at >= at - low else -steps) * TINY * self.sizes[name]
+            moved[name] = at + (steps if high - at >= at - low else -steps) * SHORT * self.sizes[name]
         return self._run(*self._with(moved))
 
 

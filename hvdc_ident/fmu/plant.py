@@ -117,10 +117,9 @@ class Plant:
         given = {**back, **values}
         Block(b, [known[n] for n in given]).set(list(given.values()))
         self._set |= given.keys()
-        self.inputs.set(inputs)
         b.enter_initialization(start, until, tolerance)
         self._running = True
-        self.inputs.set(inputs)
+        self.inputs.set(inputs)  # some FMUs refuse inputs before this mode
         b.exit_initialization()
         self._check_taken(values, start)
         if b.exchange:
