@@ -15,8 +15,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from hashlib import sha256
+from itertools import islice
 from multiprocessing import reduction
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
@@ -43,7 +45,7 @@ STALL = 0.5  # s that a run at least stands still for: a busy computer lets a pr
 class Limits:
     """What an FMU may use. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
     runs: after which a worker is replaced by a new one, as it is where it keeps half of its memory; workers: processes
-    at once, None: as many as there are cores, or one in a process that is itself one of several."""
+    at once for differences of whole runs, None: as many as there are idle cores, or one in a process of a pool."""
 
     deadline: float = 60.0
     load: float = 60.0
@@ -82,6 +84,7 @@ class _Worker:
     progress: memoryview[float]
     budget: Budget
     runs: int = 0
+    known: int = 0  # how much of what workers found out it was told
     resident: int = 0
     space: int = 0
 
@@ -206,6 +209,11 @@ class Host:
         self._lock = Lock()
         self._processes: _Processes | None = None
         self._useless: SimulationError | None = None
+        self._single = False  # no second worker begins
+        self._loading = self._shared = 0.0  # s that a worker takes to begin, and that shareable requests have taken
+        self._busy = 1  # workers of the last request
+        self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.jobs`
+        self._base: tuple[bytes, Array] | None = None  # the last run, and its outputs
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
@@ -226,19 +234,19 @@ class Host:
         is replaced and asked once more, and only its answer counts.
         """
         with self._lock:
-            worker = self._ready(0)
-            fresh = worker.runs == 0
-            answer, out = self._asked(worker, heading, arrays)
-            if answer.get("again") and not fresh:
-                self._end(worker)
-                worker = self._ready(0)
-                answer, out = self._asked(worker, heading, arrays)
-            if "failed" in answer:
-                raise self._failure(worker, answer)
-            if answer.get("again"):
-                raise self._error("the FMU's worker wants a new process, and had one")
-            self.memory = worker.resident
-            self.learned |= answer.get("learned", {})
+            begun = time.monotonic()
+            shares = self._shares(heading)
+            run = _run_of(heading, arrays)
+            if len(shares) > 1 and self._prepared(len(shares)):
+                known = {"base": self._base[1]} if self._base is not None and self._base[0] == run else {}
+                parts = self._together([{**heading, "wanted": names} for names in shares], {**arrays, **known})
+                answer, out = _joined(heading["parameters"], shares, parts)
+            else:
+                answer, out = self._together([heading], arrays)[0]
+            if heading["do"] == "simulate":
+                self._base = (run, out["outputs"])
+            if len(shares) > 1:
+                self._shared += time.monotonic() - begun
             self.runs += int(answer.get("whole runs", 0))
             return answer, out
 
@@ -247,16 +255,85 @@ class Host:
         with self._lock:
             self._closed()
 
+    # --- shares of a request ---
+
+    def _shares(self, heading: Mapping[str, Any]) -> list[list[str]]:
+        """The parameters of each worker where derivatives come from differences of whole runs; empty for one worker.
+
+        Columns of one worker and of several are the same to the last digit: what a worker finds out about the noise of
+        runs and the steps of differences goes to all of them.
+        """
+        names: list[str] = heading.get("parameters", [])
+        if heading["do"] != "simulate" or len(names) < 2 or "restart" not in self.learned:
+            return []
+        d, confirmed = self.description, self.learned.get("derivatives", {})
+        if d.directional and d.states and any(confirmed.get(n, True) for n in names):
+            return []
+        count = min(self.limits.workers or idle_cores(self._busy), len(names))
+        return [names[i::count] for i in range(count)]
+
+    def _prepared(self, count: int) -> bool:
+        """Whether so many workers are there: they are started once as much time was spent as their start takes.
+
+        What is spent is then at most twice the least that it could have been. A number that was asked for is started
+        at once. An FMU that begins in one process only, as for its licence, stays in one.
+        """
+        if self._single or not (self.limits.workers or self._shared >= self._loading):
+            return False
+        try:
+            for number in range(count):
+                self._ready(number)
+        except SimulationError:
+            if 0 not in self._mine().workers:
+                raise
+            self._single, self._useless = True, None
+        return not self._single
+
+    def _together(self, headings: Sequence[Mapping[str, Any]], arrays: Mapping[str, Array]) -> list[Answer]:
+        """The answers of as many workers as headings, all asked at once. Raises the first failure among them."""
+        sent = [self._sent(self._ready(number), h, arrays) for number, h in enumerate(headings)]
+        self._busy = len(sent)
+        answers: list[Answer] = []
+        failures: list[SimulationError] = []
+        for number, (worker, h) in enumerate(zip(sent, headings, strict=True)):
+            try:
+                answers.append(self._answer(number, worker, h, arrays))
+            except SimulationError as e:  # the others are heard all the same, so that they can be asked again
+                failures.append(e)
+        if failures:
+            raise failures[0]
+        return answers
+
+    def _answer(self, number: int, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+        """The answer of a worker that was asked, or of the one that replaces it."""
+        fresh = worker.runs == 1
+        answer, out = self._heard(worker, "run")
+        if answer.get("again") and not fresh:
+            self._end(worker)
+            worker = self._sent(self._ready(number), heading, arrays)
+            answer, out = self._heard(worker, "run")
+        if "failed" in answer:
+            raise self._failure(worker, answer)
+        if answer.get("again"):
+            raise self._error("the FMU's worker wants a new process, and had one")
+        if number == 0:
+            self.memory = worker.resident
+        self.learned |= answer.get("learned", {})
+        for key, value in answer.get("found", {}).items():
+            self._found.setdefault(key, value)
+        return answer, out
+
     # --- one answer ---
 
-    def _asked(self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def _sent(self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _Worker:
+        """The worker, once it is asked, with what others have found out meanwhile."""
         worker.runs += 1
         worker.progress[BEGAN] = time.monotonic()
-        try:
-            worker.connection.send_bytes(packed(heading, arrays))
-        except OSError:
-            return self._lost(worker, "before the run")
-        return self._heard(worker, "run")
+        news = dict(islice(self._found.items(), worker.known, None))
+        worker.known = len(self._found)
+        with contextlib.suppress(OSError):  # it is gone: noticed when it is heard
+            worker.connection.send_bytes(packed({**heading, "found": news}, arrays))
+        return worker
 
     def _heard(self, worker: _Worker, what: str) -> Answer:
         """The answer of a worker. Raises SimulationError where it ends or hangs."""
@@ -285,7 +362,7 @@ class Host:
         t = heading.get("time")
         said = heading.get("said", "")
         what, hint = heading["failed"], heading.get("hint", "")
-        taken = worker.budget.taken(worker.resident, worker.space)
+        taken = worker.budget.taken(worker.resident, max(worker.space, int(heading.get("needed", 0))))
         if worker.budget.exhausted(taken):
             what, hint = f"{what}; {worker.budget.told(taken)}", worker.budget.hint
         return self._error(
@@ -359,6 +436,7 @@ class Host:
     def _start(self, number: int) -> _Worker:
         """A worker that has loaded the FMU."""
         supervisor = self._supervisor()
+        begun = time.monotonic()
         self.memory = 0
         self.started += 1
         worker: _Worker | None = None
@@ -380,6 +458,7 @@ class Host:
                 self._end(worker)
             self._useless = e
             raise
+        self._loading = time.monotonic() - begun
         return worker
 
     def _end(self, worker: _Worker) -> Ending | None:
@@ -435,11 +514,41 @@ class _Watch:
             self.at, self.moved = at, time.monotonic()
 
 
-def cores() -> int:
-    """Processes that may work at once: one for each core, or one in a process that a pool has started for its own."""
+def _run_of(heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
+    """What decides the outputs of a run, as a digest."""
+    own = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
+    return sha256(packed(own, arrays)).digest()
+
+
+def _joined(parameters: list[str], shares: list[list[str]], parts: list[Answer]) -> Answer:
+    """One answer with the columns that several workers have made."""
+    (first, out), notes = parts[0], dict(parts[0][0]["notes"])
+    gradients, errors = out["gradients"].copy(), out["errors"].copy()
+    for names, (answer, columns) in zip(shares[1:], parts[1:], strict=True):
+        places = [parameters.index(n) for n in names]
+        gradients[:, :, places], errors[places] = columns["gradients"][:, :, places], columns["errors"][places]
+        for name, text in answer["notes"].items():
+            if notes.setdefault(name, text) != text:  # both list some of the parameters
+                listed = {*notes[name].split(", "), *text.split(", ")}
+                notes[name] = ", ".join(n for n in parameters if n in listed)
+    runs = sum(answer["whole runs"] for answer, _ in parts)
+    return {**first, "notes": notes, "whole runs": runs}, {**out, "gradients": gradients, "errors": errors}
+
+
+def idle_cores(own: int) -> int:
+    """Processes that may work at once, 1 at least: one for each core that is not busy with anything else.
+
+    own: how many worked for the caller lately; they count as load. A process that a pool has started is one of several
+    that share the cores already.
+    """
     if multiprocessing.parent_process() is not None:
         return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        others = max(os.getloadavg()[0] - own, 0.0)
+    except OSError:
+        others = 0.0
+    return max(1, round(cores - others))
 
 
 def _last_line(said: IO[bytes]) -> str:
@@ -452,4 +561,4 @@ def _last_line(said: IO[bytes]) -> str:
     return ""
 
 
-__all__ = ["Answer", "Host", "Limits", "cores"]
+__all__ = ["Answer", "Host", "Limits", "idle_cores"]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -83,12 +84,25 @@ class Jobs:
     def do(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
         """Return the answer to a request, with what was learned."""
         self.runs = 0
+        self._take_over(heading.get("found", {}))
+        known = len(self.steps), len(self.noise)
         work = {"simulate": self._simulate, "point": self._point, "starts": self._starts}[heading["do"]]
         if heading["do"] != "simulate" and self.isolated:
             found, out = result(lambda: work(heading, arrays))
         else:
             found, out = work(heading, arrays)
-        return {**found, "learned": self.learned, "whole runs": self.runs}, out
+        news = {f"step {k.hex()}": astuple(s) for k, s in islice(self.steps.items(), known[0], None)}
+        news |= {f"noise {k.hex()}": n.tolist() for k, n in islice(self.noise.items(), known[1], None)}
+        return {**found, "found": news, "learned": self.learned, "whole runs": self.runs}, out
+
+    def _take_over(self, found: Mapping[str, Any]) -> None:
+        """Take over the steps of differences and the noise of runs that other workers have found."""
+        for name, value in found.items():
+            kind, _, key = name.partition(" ")
+            if kind == "step":
+                self.steps.setdefault(bytes.fromhex(key), Step(*value))
+            else:
+                self.noise.setdefault(bytes.fromhex(key), np.array(value))
 
     def _simulate(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
         return _Simulation(self, heading, arrays).answer()
@@ -136,6 +150,8 @@ class _Simulation:
         self.ended: tuple[float, int] | None = None  # when it ended this one, s, and the rows up to there
         self.notes: dict[str, str] = {}
         self.counts = exchange.Counts()
+        if "base" in arrays:
+            self.jobs.last = (self._key_of(self.values, self.signals), arrays["base"])
 
     def answer(self) -> Answer:
         if "restart" not in self.learned:
@@ -241,7 +257,7 @@ class _Simulation:
         """(n, outputs) of a run without derivatives, checked to be finite; the last one is kept for whoever asks again."""
         moved = self.signals if signals is None else signals
         own = values is self.values and moved is self.signals
-        key = self.key + moved.values.tobytes() + repr(sorted(values.items())).encode()
+        key = self._key_of(values, moved)
         if own and self.jobs.last is not None and self.jobs.last[0] == key:
             return self.jobs.last[1]
         counts = self.counts if own else exchange.Counts()
@@ -260,6 +276,10 @@ class _Simulation:
         if own and self.ended is None:
             self.jobs.last = (key, outputs)
         return outputs
+
+    def _key_of(self, values: Mapping[str, float], signals: Signals) -> bytes:
+        """What decides the outputs of a run."""
+        return self.key + signals.values.tobytes() + repr(sorted(values.items())).encode()
 
     def _in_its_own_process(self, run: Callable[[Plant], Array], counts: exchange.Counts) -> Array:
         """(n, outputs) of a run in a process made for it; what it finds out of the FMU is kept."""

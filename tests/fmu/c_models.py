@@ -223,6 +223,31 @@ def begun(name: str, *defines: str, more: tuple[Var, ...] = ()) -> CModel:
     return CModel(name, code, (*BEGUN_VARIABLES, *more), 1)
 
 
+# A lag with a gain and an offset: four parameters, and no derivatives but by differences of whole runs.
+FOUR = CModel(
+    "four",
+    PLAIN
+    + """
+#define NR 9
+#include <unistd.h>
+static void start(double *r) { r[2] = 0.1; r[3] = 1; r[4] = 2; r[5] = 0.5; r[6] = 0; }
+static void equations(double *r, double t) { r[1] = (r[3] * r[6] - r[0]) / r[2]; r[7] = r[4] * r[0] + r[5]; }
+""",
+    (
+        Var("y", 0),
+        Var("der(y)", 1, more=(("derivative", "y"),)),
+        *(
+            Var(n, 2 + k, "parameter", "tunable", (("start", str(x)),))
+            for k, (n, x) in enumerate({"T": 0.1, "k": 1.0, "b": 2.0, "c": 0.5}.items())
+        ),
+        Var("u", 6, "input", "continuous", (("start", "0"),)),
+        Var("out", 7, "output"),
+    ),
+    1,
+    kinds=("CoSimulation",),
+)
+
+
 TWIN = Model(
     name="twin",
     parameters={"m": 2.0, "d": 0.5, "k": 8.0, "b": 0.25},

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from c_fmu import build, needs_compiler
-from c_models import FAULTY, FAULTY_CODE
+from c_models import FAULTY, FAULTY_CODE, FOUR
 from fmu_limits import PATIENT
 
 from hvdc_ident import load_model, simulate
@@ -22,7 +22,7 @@ from hvdc_ident.errors import InputError, ModelError, SimulationError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
 from hvdc_ident.fmu.folder import joined, sweep, unpacked
-from hvdc_ident.fmu.host import Limits
+from hvdc_ident.fmu.host import Limits, idle_cores
 from hvdc_ident.fmu.model import read_fmu
 
 pytestmark = needs_compiler
@@ -222,3 +222,51 @@ def test_a_model_that_travels_uses_the_folder_it_finds(fmu):
     assert there.host._processes.folder.path == model.host._processes.folder.path
     there.host.close()
     assert np.array_equal(simulate(model, STEP)["out"], rows)
+
+
+# --- several workers ---
+
+
+def test_columns_are_the_same_from_one_worker_and_from_two(tmp_path):
+    """From the first request, whose steps one worker chose, to later ones, and after a worker was replaced."""
+    path, names = build(FOUR, tmp_path), ("T", "k", "b", "c")
+    one, two = (load_model(path, limits={"workers": n}) for n in (1, 2))
+    for i, lag in enumerate((0.1, 0.11, 0.25)):
+        if i == 2:
+            os.kill(two.host._processes.workers[1].pid, signal.SIGKILL)
+            wait_until_gone(two.host._processes.workers[1].pid)
+            with pytest.raises(SimulationError, match="SIGKILL"):
+                two.simulate(STEP, {"T": 0.11}, names)
+        runs = [m.simulate(STEP, {"T": lag}, names) for m in (one, two)]
+        assert np.array_equal(runs[0].sensitivities, runs[1].sensitivities)
+        assert np.array_equal(runs[0].trajectory.values, runs[1].trajectory.values)
+        assert dict(runs[0].notes) == dict(runs[1].notes)
+    assert len(one.host._processes.workers) == 1 and len(two.host._processes.workers) == 2
+    s = np.maximum(TIME - 0.1, 0.0)
+    exact = [-2.0 * s / lag**2 * np.exp(-s / lag), 2.0 * (1.0 - np.exp(-s / lag)), 1.0 - np.exp(-s / lag), np.ones(26)]
+    assert np.abs(runs[1].sensitivities[:, 0, :] - np.column_stack(exact)).max() < 1e-4
+    one.host.close()
+    two.host.close()
+
+
+def test_the_first_failure_of_several_workers_is_told_and_all_go_on(tmp_path):
+    """A value that one column's runs cannot take: T moves below where the model says error."""
+    code = FOUR.code + "#define AT_STEP(r) if (r[3] > 1) return 3\n"
+    path, names = build(replace(FOUR, name="edge", code=code), tmp_path), ("T", "k", "b", "c")
+    model = load_model(path, limits={"workers": 2})
+    model.simulate(STEP, {"k": 0.5}, names)
+    for _ in range(2):
+        with pytest.raises(SimulationError, match="fmi2DoStep returned error"):
+            model.simulate(STEP, {"k": 1.0}, names)
+        assert model.simulate(STEP, {"k": 0.5}, names).sensitivities.shape == (26, 1, 4)
+    model.host.close()
+
+
+def test_a_process_of_a_pool_uses_one_core(monkeypatch):
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: object())
+    assert idle_cores(1) == 1
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: None)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
+    for load, own, idle in ((0.5, 1, 8), (3.2, 1, 6), (8.0, 8, 8), (30.0, 1, 1)):
+        monkeypatch.setattr("os.getloadavg", lambda load=load: (load, 0.0, 0.0))
+        assert idle_cores(own) == idle
