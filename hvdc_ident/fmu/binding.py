@@ -8,8 +8,8 @@ from __future__ import annotations
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Sequence
-from ctypes import byref, c_double
+from collections.abc import Callable, Sequence
+from ctypes import CFUNCTYPE, addressof, byref, c_bool, c_double, c_int, c_size_t, c_void_p
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
@@ -24,7 +24,8 @@ from hvdc_ident.trajectory import Array
 
 Failure = FMICallException
 """What a call raises that returned discard, error or fatal; `.function`, `.status`."""
-DISCARD, ERROR, FATAL = 2, 3, 4
+WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
+Function = Callable[..., None]
 KEPT = 30  # messages of the FMU that are kept
 
 
@@ -85,12 +86,13 @@ class Update:
 class Vector:
     """A vector of doubles with its address."""
 
-    __slots__ = ("pointer", "size", "values")
+    __slots__ = ("address", "pointer", "size", "values")
 
     def __init__(self, size: int) -> None:
         self.values: Array = np.zeros(size)
         self.size = size
         self.pointer = (c_double * size).from_buffer(self.values.data) if size else (c_double * 1)()
+        self.address = addressof(self.pointer)
 
 
 class Block:
@@ -141,6 +143,77 @@ def _call_of(kind: str, version: int) -> str:
     return ("Integer" if version == 2 else "Int64") if kind == "Enumeration" else kind
 
 
+@dataclass(frozen=True)
+class Calls:
+    """The functions of an FMU that are called in every step, each of which raises Failure.
+
+    Vectors go in as addresses. They are bound here because FMPy's own way to them, which can log each call, takes as
+    long as a small FMU does.
+    """
+
+    get_reals: Function
+    set_reals: Function
+    directional: Function
+    set_time: Function
+    set_states: Function
+    get_states: Function
+    get_slopes: Function
+    get_indicators: Function
+    completed_step: Function
+    step: Function
+
+    @classmethod
+    def of(cls, library: Any, version: int, exchange: bool) -> Calls:
+        """Return those of a library; of what its interface has not, calls that raise."""
+        sized = [c_size_t] if version == 3 else []
+        real, slopes = ("Real", "Derivatives") if version == 2 else ("Float64", "ContinuousStateDerivatives")
+        vector, flag = [c_void_p, c_size_t], _flag(version)
+
+        def bound(name: str, *types: Any) -> Function:
+            return _bound(library, f"fmi{version}{name}", types)
+
+        def none(name: str, *types: Any) -> Function:
+            return _missing(f"fmi{version}{name}")
+
+        me, cs = (bound, none) if exchange else (none, bound)
+        return cls(
+            bound(f"Get{real}", *vector, c_void_p, *sized),
+            bound(f"Set{real}", *vector, c_void_p, *sized),
+            bound("GetDirectionalDerivative", *vector, *vector, c_void_p, *sized, c_void_p, *sized),
+            me("SetTime", c_double),
+            me("SetContinuousStates", *vector),
+            me("GetContinuousStates", *vector),
+            me(f"Get{slopes}", *vector),
+            me("GetEventIndicators", *vector),
+            me("CompletedIntegratorStep", flag, c_void_p, c_void_p),
+            cs("DoStep", c_double, c_double, c_int),
+        )
+
+
+def _flag(version: int) -> Any:
+    """Return the C type of a truth value, which FMI 2.0 has as a whole number."""
+    return c_int if version == 2 else c_bool
+
+
+def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
+    """Return a function of a library, whose first argument is the instance."""
+    function = CFUNCTYPE(c_int, c_void_p, *types)((name, library))
+
+    def call(*arguments: Any) -> None:
+        status = function(*arguments)
+        if status > WARNING:
+            raise Failure(function=name, status=status)
+
+    return call
+
+
+def _missing(name: str) -> Function:
+    def call(*arguments: Any) -> None:
+        raise Failure(function=name, status=ERROR)
+
+    return call
+
+
 class Binding:
     """An FMU's library with at most one instance. Methods are the calls of FMI, without their prefixes."""
 
@@ -161,6 +234,9 @@ class Binding:
             modelIdentifier=description.identifier,
             instanceName="hvdc_ident",
         )
+        self._call = Calls.of(self.fmu.dll, self.version, self.exchange)
+        self._flags = (_flag(self.version)(), _flag(self.version)())
+        self._sized = int(self.version == 3)  # FMI 3.0 gives the number of values, too
         self._callbacks = self._made_callbacks()
         self.component: Any = None
         self.nx = len(description.states)
@@ -248,59 +324,42 @@ class Binding:
         return (c_uint * len(numbers))(*numbers)
 
     def get_reals(self, references: Any, into: Vector) -> None:
-        if self.version == 2:
-            self.fmu.fmi2GetReal(self.component, references, into.size, into.pointer)
-        else:
-            self.fmu.fmi3GetFloat64(self.component, references, into.size, into.pointer, into.size)
+        n = into.size
+        self._call.get_reals(self.component, addressof(references), n, into.address, *(n,) * self._sized)
 
     def set_reals(self, references: Any, values: Vector) -> None:
-        if self.version == 2:
-            self.fmu.fmi2SetReal(self.component, references, values.size, values.pointer)
-        else:
-            self.fmu.fmi3SetFloat64(self.component, references, values.size, values.pointer, values.size)
+        n = values.size
+        self._call.set_reals(self.component, addressof(references), n, values.address, *(n,) * self._sized)
 
     def directional(self, unknowns: Any, n: int, knowns: Any, m: int, seed: Vector, into: Vector) -> None:
-        """Nothing; `into` has the derivatives of the unknowns along the seed."""
-        if self.version == 2:
-            self.fmu.fmi2GetDirectionalDerivative(self.component, unknowns, n, knowns, m, seed.pointer, into.pointer)
+        """Put the derivatives of the unknowns along the seed into `into`."""
+        u, k = addressof(unknowns), addressof(knowns)
+        if self._sized:
+            self._call.directional(self.component, u, n, k, m, seed.address, m, into.address, n)
         else:
-            self.fmu.fmi3GetDirectionalDerivative(
-                self.component, unknowns, n, knowns, m, seed.pointer, m, into.pointer, n
-            )
+            self._call.directional(self.component, u, n, k, m, seed.address, into.address)
 
     # --- model exchange ---
 
     def set_time(self, t: float) -> None:
         self.progress[NOW] = t
-        if self.version == 2:
-            self.fmu.fmi2SetTime(self.component, t)
-        else:
-            self.fmu.fmi3SetTime(self.component, t)
+        self._call.set_time(self.component, t)
 
     def set_states(self, x: Array) -> None:
         if self.nx:
             self.states.values[:] = x
-            if self.version == 2:
-                self.fmu.fmi2SetContinuousStates(self.component, self.states.pointer, self.nx)
-            else:
-                self.fmu.fmi3SetContinuousStates(self.component, self.states.pointer, self.nx)
+            self._call.set_states(self.component, self.states.address, self.nx)
 
     def get_states(self) -> Array:
         """(nx,), a copy."""
         if self.nx:
-            if self.version == 2:
-                self.fmu.fmi2GetContinuousStates(self.component, self.states.pointer, self.nx)
-            else:
-                self.fmu.fmi3GetContinuousStates(self.component, self.states.pointer, self.nx)
+            self._call.get_states(self.component, self.states.address, self.nx)
         return self.states.values.copy()
 
     def get_slopes(self) -> Array:
         """(nx,) the derivatives; the array is used again by the next call."""
         if self.nx:
-            if self.version == 2:
-                self.fmu.fmi2GetDerivatives(self.component, self.slopes.pointer, self.nx)
-            else:
-                self.fmu.fmi3GetContinuousStateDerivatives(self.component, self.slopes.pointer, self.nx)
+            self._call.get_slopes(self.component, self.slopes.address, self.nx)
         return self.slopes.values
 
     def get_nominals(self) -> Array:
@@ -316,10 +375,7 @@ class Binding:
     def get_indicators(self) -> Array:
         """(nz,), a copy."""
         if self.indicators.size:
-            if self.version == 2:
-                self.fmu.fmi2GetEventIndicators(self.component, self.indicators.pointer, self.indicators.size)
-            else:
-                self.fmu.fmi3GetEventIndicators(self.component, self.indicators.pointer, self.indicators.size)
+            self._call.get_indicators(self.component, self.indicators.address, self.indicators.size)
         return self.indicators.values.copy()
 
     def enter_events(self) -> None:
@@ -336,8 +392,9 @@ class Binding:
 
     def completed_step(self) -> tuple[bool, bool]:
         """Whether the FMU wants an event, and whether it wants to end."""
-        event, end = self.fmu.completedIntegratorStep()
-        return bool(event), bool(end)
+        event, end = self._flags
+        self._call.completed_step(self.component, 1, addressof(event), addressof(end))
+        return bool(event.value), bool(end.value)
 
     # --- co-simulation ---
 
@@ -350,7 +407,7 @@ class Binding:
         self.progress[NOW] = t
         if self.version == 2:
             try:
-                self.fmu.fmi2DoStep(self.component, t, h, 1)
+                self._call.step(self.component, t, h, 1)
             except FMICallException as e:
                 if e.status != DISCARD:
                     raise

@@ -34,6 +34,7 @@ Reading = Literal["restored", "recomputed", "never"]
 READINGS: tuple[Reading, ...] = ("restored", "recomputed", "never")
 """How a step is prepared after outputs were read with inputs that the last step had not: the inputs of that step are set
 again; they are set again and outputs computed with them; or no such reading is made."""
+Inputs = tuple[float, ...]
 Slopes = Literal["followed", "ignored", "needless"]
 """Whether slopes of inputs are followed; needless: held inputs were as good where it was tried."""
 
@@ -226,24 +227,27 @@ def _go(
     tolerance: float,
     calls: Calls,
 ) -> Array:
-    before, after = signals.at(stops, "left"), signals.at(stops, "right")
-    plant.begin(values, before[0], float(time[0]), float(stops[-1]), tolerance)
+    rows = signals.at(stops, "left"), signals.at(stops, "right")
+    plant.begin(values, rows[0][0], float(time[0]), float(stops[-1]), tolerance)
+    before, after = (list(map(tuple, side.tolist())) for side in rows)  # compared in every step: tuples are quickest
     seen = plant.block(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
     stepper = _Stepper(plant, calls, before[0], seen.get)
     shows = calls.reading != "never"
-    for k, t in enumerate(stops.tolist()):
+    instants = stops.tolist()
+    for k, t in enumerate(instants):
         if k:
             try:
-                stepper.step(float(stops[k - 1]), t, after[k - 1], before[k])
+                stepper.step(instants[k - 1], t, after[k - 1], before[k])
             except RunEnded as e:
                 e.rows = _rows(time[time <= stops[k - 1]], stops[:k], left[:k], right[:k])
                 raise
         plain = calls.plain or not shows or stepper.stands_at(before[k])
-        left[k] = right[k] = seen.get() if plain else stepper.show(before[k])
+        left[k] = seen.get() if plain else stepper.show(before[k])
         if calls.plain and shows and not stepper.stands_at(before[k]):
             stepper.show(before[k])
-        if shows and (before[k] != after[k]).any():
+        right[k] = left[k]
+        if shows and before[k] != after[k]:
             shown = stepper.show(after[k])
             if not calls.plain:
                 right[k] = shown
@@ -303,11 +307,11 @@ def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
 class _Stepper:
     """The steps of one run. behind: by how much the outputs of a step were older than its end at most, s."""
 
-    def __init__(self, plant: Plant, calls: Calls, inputs: Array, compute: Callable[[], Array]) -> None:
+    def __init__(self, plant: Plant, calls: Calls, inputs: Inputs, compute: Callable[[], Array]) -> None:
         self.plant, self.calls, self.compute = plant, calls, compute
         self.behind = 0.0
-        self._stepped = np.array(inputs)  # inputs at the end of the last step
-        self._now = np.array(inputs)
+        self._stepped = inputs  # at the end of the last step
+        self._now: Inputs | None = inputs
         self._shown = False  # whether others were set since
         self._sloping = False
         if calls.sloping:
@@ -316,23 +320,23 @@ class _Stepper:
             self._orders = (c_int * len(inputs_))(*([1] * len(inputs_)))
             self._slopes = Vector(len(inputs_))
 
-    def stands_at(self, u: Array) -> bool:
+    def stands_at(self, u: Inputs) -> bool:
         """Return whether the FMU has these inputs."""
-        return bool((self._now == u).all())
+        return self._now == u
 
-    def show(self, u: Array) -> Array:
+    def show(self, u: Inputs) -> Array:
         """Return the outputs with these inputs."""
         self._set(u)
         self._shown = True
         return self.compute()
 
-    def _set(self, u: Array) -> None:
+    def _set(self, u: Inputs) -> None:
         self.plant.inputs.set(u)
-        self._now[:] = u
+        self._now = u
 
-    def step(self, a: float, b: float, first: Array, last: Array) -> None:
+    def step(self, a: float, b: float, first: Inputs, last: Inputs) -> None:
         """Bring the FMU from a to b while its inputs go from `first` to `last`."""
-        moves = bool((first != last).any())
+        moves = first != last
         if self._shown:
             self._set(self._stepped)
             if self.calls.reading == "recomputed":
@@ -340,35 +344,35 @@ class _Stepper:
             self._shown = False
         if moves and not self.calls.sloping:
             for x, y in pairwise(np.linspace(0.0, 1.0, self.calls.parts + 1).tolist()):
-                self._apply(first + 0.5 * (x + y) * (last - first))
+                share = 0.5 * (x + y)
+                self._apply(tuple(u + share * (v - u) for u, v in zip(first, last, strict=True)))
                 self._advance(a + x * (b - a), b if y == 1.0 else a + y * (b - a))
             return
         self._apply(first)
         if moves or self._sloping:
-            self._slopes.values[:] = (last - first) / (b - a)
+            self._slopes.values[:] = (np.array(last) - np.array(first)) / (b - a)
             self.plant.binding.set_slopes_of_inputs(self._references, self._orders, self._slopes)
             self._sloping = moves
         self._advance(a, b)
-        self._stepped[:] = last
-        self._now[:] = np.nan  # an FMU may have moved its inputs along the slopes, or not
+        self._stepped = last
+        self._now = None  # an FMU may have moved its inputs along the slopes, or not
 
-    def _apply(self, u: Array) -> None:
+    def _apply(self, u: Inputs) -> None:
         """Have the inputs stand at u in the next step."""
-        if not self.stands_at(u):
+        if self._now != u:
             self._set(u)
-        self._stepped[:] = u
+        self._stepped = u
 
     def _advance(self, a: float, b: float) -> None:
-        t = a
+        t, rounding = a, 1e-12 * max(abs(b), 1.0)
         for _ in range(EARLY):
             try:
                 reached, computed = self.plant.binding.step(t, b - t)
             except RuntimeError as e:
                 raise RunEnded(t) from e
-            if reached >= b - 1e-12 * max(abs(b), 1.0):
-                behind = b - computed
-                if behind > 1e-9 * max(abs(b), b - a):
-                    self.behind = max(self.behind, behind)
+            if reached >= b - rounding:
+                if computed < b - rounding and b - computed > 1e-9 * max(abs(b), b - a):
+                    self.behind = max(self.behind, b - computed)
                 return
             t = reached
         raise RunFailed(f"the FMU returned early {EARLY} times in one step", t)

@@ -72,6 +72,7 @@ class Run:
         self.columns = self.tangent.count if self.tangent else 0
         self.outputs = np.empty((self.time.size, len(self.names)))
         self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
+        self.set: list[float] | None = None  # what the inputs that are followed stand at
         self.row = 0
         self.end = float(self.time[-1])
         self.segment_end = self.end
@@ -114,15 +115,21 @@ class Run:
     # --- between stops ---
 
     def _segment(self, t: float, y: Array, end: float) -> tuple[float, Array]:
-        """Where the integration stopped, at `end` or at an event before it, with the event done."""
+        """Return where the integration stopped, at `end` or at an event before it, with the event done."""
         self.counts.segments += 1
         self.positive = self.b.get_indicators() > 0.0
+        with warnings.catch_warnings(record=True) as said:  # of the integrator, told where it gives up
+            warnings.simplefilter("always")
+            return self._steps(t, y, end, said)
+
+    def _steps(self, t: float, y: Array, end: float, said: list[warnings.WarningMessage]) -> tuple[float, Array]:
         solver = self._solver(t, y, end)
+        rows, completed = self.time.tolist(), self.plant.description.completed_step
         retries = 0
         while solver.status == "running":
             before = float(solver.t)
             try:
-                self._advance(solver)
+                self._advance(solver, said)
             except Failure as e:
                 if e.status != DISCARD or retries == RETRIES:
                     raise
@@ -130,17 +137,18 @@ class Run:
                 solver = self._solver(before, y, end, (end - before) * 10.0**-retries)
                 continue
             y = solver.y.copy() if self.nx else y
-            if not np.isfinite(y).all():
+            if not np.isfinite(y.sum()):
                 raise RunFailed("a state is not finite", float(solver.t), "check parameter values and limits")
             event = self._crossing(solver, before)
             t = float(solver.t) if event is None else event
-            dense = solver.dense_output() if self.row < self.time.size and self.time[self.row] <= t else None
-            self._record_until(dense, t)
+            if self.row < len(rows) and rows[self.row] <= t:
+                self._record_until(solver.dense_output(), t)
             if event is not None:
                 y = np.asarray(solver.dense_output()(event), dtype=float) if self.nx else y
                 return event, self._state_event(event, y)
-            self._place(t, y[: self.nx], before_jump=t >= end)
-            if self.plant.description.completed_step:
+            if completed or t >= end:
+                self._place(t, y[: self.nx], before_jump=t >= end)
+            if completed:
                 wanted, over = self.b.completed_step()
                 if over:
                     raise RunEnded(t)
@@ -167,10 +175,8 @@ class Run:
             max_step=most,
         )
 
-    def _advance(self, solver: Any) -> None:
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            message = solver.step()
+    def _advance(self, solver: Any, said: list[warnings.WarningMessage]) -> None:
+        message = solver.step()
         self.counts.accepted += 1
         if solver.status == "failed":
             text = "; ".join([str(message or ""), *(str(w.message) for w in said)])
@@ -185,7 +191,10 @@ class Run:
         self.b.set_time(t)
         self.b.set_states(x)
         if self.follow:
-            self.followed.set([self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.follow])
+            u = [self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.follow]
+            if u != self.set:  # held inputs, as stairs, stand for thousands of calls
+                self.followed.set(u)
+                self.set = u
 
     def _slopes(self, t: float, y: Array) -> Array:
         self.counts.evaluations += 1
@@ -273,6 +282,7 @@ class Run:
         self.b.enter_events()
         if u is not None:
             self.plant.inputs.set(u)
+            self.set = None
         changed = self.plant.iterate(t)
         self.b.enter_continuous()
         x = self.b.get_states() if changed else y[: self.nx]
