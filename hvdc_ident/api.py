@@ -52,6 +52,7 @@ def simulate(
     tolerance: Tolerance | None = None,
     rtol: float | None = None,
     method: Literal["auto", "explicit", "rosenbrock"] = "auto",
+    partial: bool = False,
 ) -> Simulation:
     """Return the model's outputs over time and, exactly, their derivatives by the named parameters.
 
@@ -61,6 +62,7 @@ def simulate(
     inputs: by name a number, a signal (`step`, `ramp`, `multisine`) or samples at the times; others keep the model's value.
     outputs: names of outputs or signals (default: all outputs).
     tolerance: of the integration; rtol: shorthand for one with atol = rtol / 100.
+    partial: of a run that an FMU ends, the rows up to there, with status "ended"; else such a run has failed.
     The start is the steady state of the inputs' first values unless a state says otherwise.
 
     Raises UnknownNameError, SteadyStateError where there is no steady start, SimulationError where the run stops early.
@@ -87,6 +89,7 @@ def simulate(
         tolerance=tolerance,
         rtol=rtol,
         method=method,
+        partial=partial,
     )
 
 

@@ -204,6 +204,7 @@ def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
         if status > WARNING:
             raise Failure(function=name, status=status)
 
+    call.__code__ = call.__code__.replace(co_name=name)  # by which a crash or a hang tells where it was
     return call
 
 

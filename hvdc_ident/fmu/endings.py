@@ -14,7 +14,8 @@ MIB = 2**20
 EXHAUSTED = 0.5
 """Share of its memory from which an FMU may have run out of it: one that grows by doubling is refused from half on."""
 CALL = re.compile(r"\b(fmi[23][A-Z]\w*)\s*\(|\b_(dlopen)\(")
-FRAME = re.compile(r'^\s*File "(?P<file>.*)", line (?P<line>\d+) in ')
+FRAME = re.compile(r'^\s*File "(?P<file>.*)", line (?P<line>\d+) in (?P<name>\w*)')
+BOUND = re.compile(r"fmi[23][A-Z]\w*")  # the name of a function bound by `fmu.binding`
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,8 @@ def where(traces: str) -> str:
         found = FRAME.match(line)
         if found is None:
             continue
+        if BOUND.fullmatch(found["name"]):
+            return f"in {found['name']}"
         call = CALL.search(linecache.getline(found["file"], int(found["line"])))
         if call is not None:
             return f"in {call[1]}" if call[1] else "in loading its library"
