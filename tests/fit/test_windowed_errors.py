@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hvdc_ident.fit.windowed as windowed
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.experiment import InputSignal
+from hvdc_ident.fit import windowed
 from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.tolerance import shipped, tolerance
 from hvdc_ident.fit.windowed import event_end, windowed_errors
