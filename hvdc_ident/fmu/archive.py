@@ -1,4 +1,4 @@
-"""What an FMU's file may be before anything of it is unpacked, parsed or run.
+"""Checks of an FMU's file before anything of it is unpacked, parsed or run.
 
 An FMU is a zip archive with machine code inside. The checks here and the process it runs in contain accidents: damaged
 archives, crashes, endless loops. They do not contain malice: load only FMUs you trust.
@@ -37,7 +37,7 @@ DAMAGE = (
     OSError,
     ValueError,
 )
-"""What reading a damaged archive raises."""
+"""Errors that reading a damaged archive raises."""
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -106,7 +106,7 @@ def first_bytes(path: Path, name: str, count: int = 64) -> bytes:
 
 
 def unpack(path: Path, folder: Path) -> None:
-    """Nothing; the archive's files are in the folder. It was checked before; a file that is damaged is a ModelError."""
+    """Unpack a checked archive into the folder. Raises ModelError where a file is damaged."""
     with _opened(path) as archive:
         for entry in archive.infolist():
             target = folder.joinpath(*PurePosixPath(_plain(entry.filename)).parts)

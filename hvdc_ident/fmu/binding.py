@@ -23,7 +23,7 @@ from hvdc_ident.fmu.messages import NOW, START, STOP, no_progress
 from hvdc_ident.trajectory import Array
 
 Failure = FMICallException
-"""What a call raises that returned discard, error or fatal; `.function`, `.status`."""
+"""Raised by a call that returned discard, error or fatal; `.function`, `.status`."""
 WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
 Function = Callable[..., None]
 KEPT = 30  # messages of the FMU that are kept
@@ -75,7 +75,7 @@ def refusal(d: Description, said: str) -> str:
 
 @dataclass(frozen=True)
 class Update:
-    """What an event brought: another iteration wanted, the end, states or nominals changed, the next time event, s."""
+    """Result of one event iteration: another iteration wanted, the end, states or nominals changed, the next time event, s."""
 
     again: bool
     end: bool
@@ -124,7 +124,7 @@ class Block:
         return self.values
 
     def set(self, values: Array | Sequence[float]) -> None:
-        """Nothing; the FMU has the values."""
+        """Set the variables to the values."""
         if self._fast:
             if self._vector.size:
                 self._vector.values[:] = values
@@ -139,7 +139,7 @@ class Block:
 
 
 def _call_of(kind: str, version: int) -> str:
-    """How FMPy names the type in its getters and setters: an enumeration has those of whole numbers."""
+    """Name of the type in FMPy's getters and setters; an enumeration has those of whole numbers."""
     return ("Integer" if version == 2 else "Int64") if kind == "Enumeration" else kind
 
 
@@ -273,7 +273,7 @@ class Binding:
     # --- instances ---
 
     def instantiate(self) -> None:
-        """Nothing; there is an instance. Raises RuntimeError where the FMU gives none."""
+        """Make an instance. Raises RuntimeError where the FMU gives none."""
         fmu = self.fmu
         try:
             if self.version == 2:
@@ -287,7 +287,7 @@ class Binding:
         self.component = fmu.component
 
     def free(self) -> None:
-        """Nothing; there is no instance."""
+        """Free the instance, where there is one."""
         if self.component is not None:
             (self.fmu.fmi2FreeInstance if self.version == 2 else self.fmu.fmi3FreeInstance)(self.component)
             self.component = self.fmu.component = None
@@ -392,7 +392,7 @@ class Binding:
         return Update(bool(again), bool(end), bool(states), float(when) if defined else None)
 
     def completed_step(self) -> tuple[bool, bool]:
-        """Whether the FMU wants an event, and whether it wants to end."""
+        """Return whether the FMU wants an event, and whether it wants to end."""
         event, end = self._flags
         self._call.completed_step(self.component, 1, addressof(event), addressof(end))
         return bool(event.value), bool(end.value)

@@ -32,16 +32,16 @@ SAME = 1e-9  # share of an output's range that rounding alone may change in a re
 
 Reading = Literal["restored", "recomputed", "never"]
 READINGS: tuple[Reading, ...] = ("restored", "recomputed", "never")
-"""How a step is prepared after outputs were read with inputs that the last step had not: the inputs of that step are set
+"""Ways to prepare a step after outputs were read with inputs that the last step had not: the inputs of that step are set
 again; they are set again and outputs computed with them; or no such reading is made."""
 Inputs = tuple[float, ...]
 Slopes = Literal["followed", "ignored", "needless"]
-"""Whether slopes of inputs are followed; needless: held inputs were as good where it was tried."""
+"""Treatment of the slopes of inputs; needless: held inputs were as good where it was tried."""
 
 
 @dataclass(frozen=True)
 class Calls:
-    """How an FMU is called.
+    """The way in which an FMU is called.
 
     reading: see `READINGS`. sloping: moving inputs are set with their slopes; else they are held at their mean over a
     step. parts: of each step with a moving input. plain: rows are as read right after each step, with its inputs.

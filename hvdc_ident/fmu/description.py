@@ -59,7 +59,7 @@ class Variable:
 
     @property
     def whole(self) -> bool:
-        """Whether only whole numbers can be set; a Boolean is 0 or 1."""
+        """True where only whole numbers can be set; a Boolean is 0 or 1."""
         return self.kind in WHOLE
 
 

@@ -29,7 +29,7 @@ Runs = Callable[[float], Array]
 
 @dataclass(frozen=True)
 class Step:
-    """How a derivative is had. h: step in the parameter's unit. error: relative, that it leaves. sides: 1 or 2."""
+    """A difference step. h: step in the parameter's unit. error: relative, that it leaves. sides: 1 or 2."""
 
     h: float
     error: float

@@ -1,4 +1,4 @@
-"""How a run of an FMU ended badly, told from what the system says of its process: a crash, a hang, slowness, memory."""
+"""Ends of an FMU's process in words: crash, hang, slow run or exhausted memory, from what the system says of it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BOUND = re.compile(r"fmi[23][A-Z]\w*")  # the name of a function bound by `fmu.b
 
 @dataclass(frozen=True)
 class Ending:
-    """What is known of a process that ended.
+    """A process that ended.
 
     code: its exit code, negative where a signal ended it. resident, space: the most bytes of memory and of address space
     that it had; 0 where the system did not tell. traces: Python's frames when it crashed or was ended, innermost first.
@@ -55,7 +55,7 @@ class Budget:
         return max(resident - self.resident if resident else 0, space - self.space if space else 0, 0)
 
     def exhausted(self, taken: int) -> bool:
-        """Whether the FMU may have run out of it."""
+        """Return whether the FMU may have run out of it."""
         return self.most is not None and taken >= EXHAUSTED * self.most
 
     def told(self, taken: int) -> str:
@@ -65,14 +65,14 @@ class Budget:
 
     @property
     def hint(self) -> str:
-        """How to give more."""
+        """The way to give more, in words."""
         assert self.most is not None
         more = math.ceil(2 * self.most / MIB)
         return f"a larger limit in MiB, if it needs that much: {key('memory', more)}"
 
 
 def key(name: str, value: float) -> str:
-    """How a limit is given: in the study, on the command line and in Python."""
+    """Return how a limit is given: in the study, on the command line and in Python."""
     text = f"{value:.10g}"
     return f'`{name} = {text}` in the study\'s [model], --{name} {text}, or limits={{"{name}": {text}}} in Python'
 

@@ -60,7 +60,7 @@ def with_effects(model: FmuModel, uses: Iterable[Any]) -> FmuModel:
 
 
 def _free_prefix(model: FmuModel, use: EffectUse) -> str:
-    """What the effect's parameters are called after, so that none takes a name of the model's."""
+    """Return the prefix of the names of an effect's parameters, such that none takes a name of the model's."""
     place = re.sub(r"\W+", "_", use.at[0].removeprefix("outputs.")).strip("_")  # der(mass.v), a[1]
     first = use.prefix or f"{use.label}_{place}"
     names = effects()[use.effect].parameters
@@ -131,7 +131,7 @@ class _Ends:
     def _inputs(
         self, sensitivities: tuple[str, ...] = (), values: Mapping[str, float] | None = None
     ) -> tuple[dict[str, InputSignal], dict[str, dict[str, InputSignal]]]:
-        """What enters the FMU, by input; and how it moves by each parameter of the entrance, jumps staying in place.
+        """Return the signals that enter the FMU, by input, and their derivatives by each parameter of the entrance, jumps staying in place.
 
         values: of all parameters, where they are not this run's.
         """
@@ -189,7 +189,7 @@ class _Ends:
     def _leave(
         self, raw: Array, gradients: Mapping[str, Array], sensitivities: tuple[str, ...]
     ) -> tuple[Array, dict[str, Array]]:
-        """What is recorded, (n, names), and its derivative by each parameter."""
+        """Return the recorded values, (n, names), and their derivative by each parameter."""
         if not self.leaves:
             return raw, {n: gradients[n] for n in sensitivities}
         at_exit = tuple(n for n in sensitivities if n in self.exit.parameters)
@@ -227,7 +227,7 @@ class _Ends:
 
 
 def _brief(slope: InputSignal) -> bool:
-    """Whether a slope is a few spikes: small enough to be a slope, they are lost in the tolerance of the FMU's run."""
+    """Return whether a slope is a few spikes: small enough to be a slope, they are lost in the tolerance of the FMU's run."""
     size = np.abs(slope.values)
     span = float(slope.times[-1] - slope.times[0])
     return bool(span > 0 and np.trapezoid(size, slope.times) < BRIEF * span * size.max())

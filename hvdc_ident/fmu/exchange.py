@@ -32,7 +32,7 @@ class SensitivitiesLost(Exception):
 
 @dataclass
 class Counts:
-    """What a run cost."""
+    """Counts of steps, events and evaluations of a run."""
 
     accepted: int = 0
     events: int = 0
@@ -187,7 +187,7 @@ class Run:
             raise RunFailed(f"more than {self.most} steps", float(solver.t), "look for a very fast part of the model")
 
     def _place(self, t: float, x: Array, *, before_jump: bool = False) -> None:
-        """Nothing; the FMU stands at an instant and a state, its continuous inputs with it."""
+        """Set the instant, the state and the continuous inputs."""
         self.b.set_time(t)
         self.b.set_states(x)
         if self.follow:
@@ -316,7 +316,7 @@ class Run:
     # --- rows ---
 
     def _record_until(self, dense: Any, t: float) -> None:
-        """Nothing; the rows of a step before t are read; those at a stop are left to it."""
+        """Read the rows of a step that lie before t; those at a stop are left to it."""
         while self.row < self.time.size and self.time[self.row] < t:
             s = float(self.time[self.row])
             y = np.asarray(dense(s), dtype=float) if self.nx else np.zeros(0)
@@ -324,7 +324,7 @@ class Run:
             self._record(y)
 
     def _record(self, y: Array) -> None:
-        """Nothing; the row is filled: the FMU stands where it is to be read."""
+        """Fill the next row, the FMU standing at its instant."""
         self.outputs[self.row] = self.seen.get()
         if self.tangent is not None:
             for j in range(self.columns):

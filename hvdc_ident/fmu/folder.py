@@ -98,7 +98,7 @@ def _share(lock: int) -> None:
 
 
 def _alone(lock: int) -> bool:
-    """Whether nobody else holds the lock, which is then held alone."""
+    """Return whether nobody else holds the lock, which is then held alone."""
     import fcntl
 
     try:

@@ -43,7 +43,7 @@ STALL = 0.5  # s that a run at least stands still for: a busy computer lets a pr
 
 @dataclass(frozen=True)
 class Limits:
-    """What an FMU may use. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
+    """Limits of an FMU. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
     runs: after which a worker is replaced by a new one, as it is where it keeps half of its memory; workers: processes
     at once for differences of whole runs, None: as many as there are idle cores, or one in a process of a pool."""
 
@@ -142,7 +142,7 @@ class _Supervisor:
         return worker
 
     def end(self, worker: _Worker) -> Ending | None:
-        """How a worker ended, which it is made to do where it has not; None where the supervisor is gone."""
+        """Return how a worker ended, which it is made to do where it has not; None where the supervisor is gone."""
         with contextlib.suppress(OSError, EOFError):
             self.connection.send_bytes(packed({"end": worker.number}))
             while worker.number not in self.ended and self.connection.poll(PATIENCE):
@@ -164,13 +164,13 @@ class _Supervisor:
 
     @property
     def gone(self) -> bool:
-        """Whether it has ended."""
+        """True once it has ended."""
         return self.process.poll() is not None
 
 
 @dataclass(eq=False)
 class _Processes:
-    """What of a host is no value: its supervisor, workers and folder. It ends with the host."""
+    """The processes of a host: its supervisor, workers and folder. It ends with the host."""
 
     owner: int
     folder: Folder
@@ -273,7 +273,7 @@ class Host:
         return [names[i::count] for i in range(count)]
 
     def _prepared(self, count: int) -> bool:
-        """Whether so many workers are there: they are started once as much time was spent as their start takes.
+        """Return whether so many workers are there: they are started once as much time was spent as their start takes.
 
         What is spent is then at most twice the least that it could have been. A number that was asked for is started
         at once. An FMU that begins in one process only, as for its licence, stays in one.
@@ -413,7 +413,7 @@ class Host:
         return worker or self._start(number)
 
     def _leaks(self, worker: _Worker) -> bool:
-        """Whether the worker kept so much memory that the next run may find too little."""
+        """Return whether the worker kept so much memory that the next run may find too little."""
         return worker.budget.exhausted(worker.budget.taken(worker.resident, worker.space))
 
     def _mine(self) -> _Processes:
@@ -495,7 +495,7 @@ class _Watch:
         return max(0.0, min(self.progress[BEGAN] + self.deadline - time.monotonic(), self.deadline / LOOKS))
 
     def over(self) -> bool:
-        """Whether the run is past its deadline."""
+        """Return whether the run is past its deadline."""
         self._look()
         return time.monotonic() >= self.progress[BEGAN] + self.deadline
 
@@ -515,7 +515,7 @@ class _Watch:
 
 
 def _run_of(heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
-    """What decides the outputs of a run, as a digest."""
+    """Return a digest of everything that decides the outputs of a run."""
     own = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
     return sha256(packed(own, arrays)).digest()
 

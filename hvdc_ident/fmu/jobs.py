@@ -63,7 +63,7 @@ class Jobs:
 
     @property
     def isolated(self) -> bool:
-        """Whether the FMU is kept out of this process: each of its runs has one, or how it restarts is not known yet."""
+        """True where the FMU is kept out of this process: each of its runs has one, or how it restarts is not known yet."""
         return self.learned.get("restart", "process") == "process"
 
     def load(self) -> Answer:
@@ -278,7 +278,7 @@ class _Simulation:
         return outputs
 
     def _key_of(self, values: Mapping[str, float], signals: Signals) -> bytes:
-        """What decides the outputs of a run."""
+        """Return everything that decides the outputs of a run."""
         return self.key + signals.values.tobytes() + repr(sorted(values.items())).encode()
 
     def _in_its_own_process(self, run: Callable[[Plant], Array], counts: exchange.Counts) -> Array:

@@ -1,4 +1,4 @@
-"""What travels between a process and its worker: a JSON heading and arrays of doubles, which cannot run code; and
+"""Messages between a process and its worker: a JSON heading and arrays of doubles, which cannot run code; and
 memory that both see, in which the worker notes how far it is."""
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class FmuModel:
 
     @property
     def fmu(self) -> Description:
-        """What the FMU says of itself."""
+        """The FMU's own description."""
         return self.host.description
 
     @property
@@ -74,7 +74,7 @@ class FmuModel:
 
     @property
     def has_equations(self) -> bool:
-        """Whether derivatives can be asked for: model exchange."""
+        """True for model exchange, whose derivatives can be asked for."""
         return self.fmu.interface == "model-exchange"
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What passes signals to an FMU and from it, as models with the effects in them: u0, u1 ... come in, y0, y1 ... go out."""
+"""Models that pass signals to an FMU and from it, with the effects in them: u0, u1 ... come in, y0, y1 ... go out."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def added(model: FmuModel, use: EffectUse) -> dict[str, Parameter]:
 
 
 def _check(model: FmuModel, use: EffectUse) -> None:
-    """Nothing. Raises what `added` says of places, of the signal brought in, and of parameters that are given by name."""
+    """Check an effect; raises what `added` says of places, of the signal brought in, and of parameters that are given by name."""
     where = f"effect '{use.effect}' at {', '.join(use.at)}"
     for place in use.at:
         if end_of(model, place) is None:
@@ -86,7 +86,7 @@ def _check(model: FmuModel, use: EffectUse) -> None:
 
 
 def _check_reading(model: FmuModel, place: str, name: str, where: str) -> None:
-    """Nothing. Raises where an effect at a place cannot see a signal."""
+    """Raise where an effect at a place cannot see a signal."""
     here, there = end_of(model, place), end_of(model, name)
     assert here is not None
     if there is None:

@@ -159,7 +159,7 @@ class Plant:
 
     @property
     def _resets(self) -> bool:
-        """Whether the instance is kept over a reset; before that was tried, only where a second one cannot be made."""
+        """True where the instance is kept over a reset; before that was tried, only where a second one cannot be made."""
         way = self.learned.get("restart")
         return way == "reset" or (way is None and self.description.once_per_process)
 
@@ -180,14 +180,14 @@ class Plant:
         self._made += 1
 
     def abandon(self) -> None:
-        """Nothing; the instance is forgotten, for after a failure it cannot be trusted even to free itself."""
+        """Forget the instance: after a failure it cannot be trusted even to free itself."""
         self.binding.component = self.binding.fmu.component = None
         self._running = False
 
     # --- events, model exchange ---
 
     def iterate(self, t: float) -> bool:
-        """Whether the states changed; the discrete part has come to rest, in event mode before and after."""
+        """Return whether the states changed, once the discrete part has come to rest; in event mode before and after."""
         changed = False
         for _ in range(ITERATIONS):
             found: Update = self.binding.update()

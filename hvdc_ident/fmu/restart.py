@@ -1,4 +1,4 @@
-"""How an FMU is brought back to the start of a run: by a reset, by a new instance, or by a new process. In the worker alone.
+"""The way an FMU is brought back to the start of a run: by a reset, by a new instance, or by a new process. In the worker alone.
 
 The cheapest way is taken whose second run repeats the first run of a fresh process, over a whole run and in every
 output. It is found once for an FMU, for values at the start alone do not tell: FMUs were seen whose reset brings the

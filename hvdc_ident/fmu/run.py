@@ -147,7 +147,7 @@ def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
 
 
 def about(model: FmuModel, sensitivities: Sequence[str]) -> dict[str, list[object]]:
-    """What differences need to know of parameters and inputs: typical sizes, bounds, where they stand if nobody sets them."""
+    """Return what differences need of parameters and inputs: typical sizes, bounds, where they stand if nobody sets them."""
     sizes, bounds, starts = [], [], []
     for name in sensitivities:
         variable = model.fmu.parameters.get(name) or model.fmu.inputs[name]

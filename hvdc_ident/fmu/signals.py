@@ -1,4 +1,4 @@
-"""What the inputs do over a run, as plain arrays that travel to the worker."""
+"""Inputs over a run, as plain arrays that travel to the worker."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class _Child:
             self.space, self.resident = max(self.space, space), max(self.resident, resident)
 
     def read(self) -> bool:
-        """Whether there was a part of a dump to read."""
+        """Return whether there was a part of a dump to read."""
         part, control, _, _ = self.dumps.recvmsg(65536, socket.CMSG_SPACE(SENDER.size))
         if not part:
             return False

@@ -38,7 +38,7 @@ def folder(version: str) -> str:
 
 
 def suffix() -> str:
-    """What a shared library's name ends with here."""
+    """Ending of a shared library's name on this system."""
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 

@@ -34,7 +34,7 @@ def modelica(model: Model, name: str = "", steady: bool | None = None) -> str:
 
 
 def output_name(model: Model, name: str) -> str:
-    """What an output is called in the Modelica text: NAME_output where NAME is another variable."""
+    """Return the name of an output in the Modelica text: NAME_output where NAME is another variable."""
     own = name in model.states or name in model.signals or name in model.algebraic
     shown = own and model.outputs[name].value == symbol(name)
     return name if shown or name not in model.names else f"{name}_output"

@@ -78,7 +78,7 @@ class Variables:
 
     @property
     def unknown_at_start(self) -> tuple[Variable, ...]:
-        """What initialisation computes: outputs, states and derivatives."""
+        """Variables that initialisation computes: outputs, states and derivatives."""
         states = range(self.first["states"], self.first["outputs"])
         return tuple(v for v in self.all if v.causality == "output" or v.reference in states)
 
@@ -101,7 +101,7 @@ class Variables:
         return self._known(node)
 
     def indicator_dependencies(self, index: int) -> tuple[int, ...]:
-        """The same for an event indicator."""
+        """References of the time, inputs and states that an event indicator may depend on, ascending."""
         return self._known(self.program.structure.graph.switches[index])
 
     def _known(self, node: int) -> tuple[int, ...]:
