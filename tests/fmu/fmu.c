@@ -1,8 +1,9 @@
 /* The calls of FMI 2.0 or 3.0 around a small model. The model defines, before this file is included:
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
-   faults AT_INSTANTIATE, AT_SETUP, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r), AT_SET(r, reference, value), BEGIN(t, has_end,
-   end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s; STOPS_AT(t, h), the instant that a step reaches;
-   SLOPE(r, reference, slope); ENDS(r, t) asks for the end. States are r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
+   faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r),
+   AT_SET(r, reference, value), BEGIN(t, has_end, end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s;
+   STOPS_AT(t, h), the instant that a step reaches; SLOPE(r, reference, slope); ENDS(r, t) asks for the end. States are
+   r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -13,6 +14,9 @@ typedef void *Instance;
 typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*log)(); void *env; } Model;
 #define M ((Model *)c)
 #define N (NX > 0 ? NX : 1)
+#ifndef AT_ENTER
+#define AT_ENTER(r)
+#endif
 #ifndef ENDS
 #define ENDS(r, t) 0
 #endif
@@ -130,7 +134,7 @@ int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double e
 #endif
     return begin(M, t, e, end);
 }
-int fmi2EnterInitializationMode(Instance c) { return 0; }
+int fmi2EnterInitializationMode(Instance c) { AT_ENTER(M->r); return 0; }
 int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi2Terminate(Instance c) { return 0; }
 int fmi2Reset(Instance c) {
@@ -206,7 +210,7 @@ static Instance made(const char *token, void *env, void (*log)()) {
 Instance fmi3InstantiateModelExchange(const char *n, const char *token, const char *p, bool v, bool l, void *env, void (*log)()) { return made(token, env, log); }
 Instance fmi3InstantiateCoSimulation(const char *n, const char *token, const char *p, bool v, bool l, bool e, bool r, const unsigned *q, size_t nq, void *env, void (*log)(), void (*i)()) { return made(token, env, log); }
 void fmi3FreeInstance(Instance c) { free(c); }
-int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { return begin(M, t, e, end); }
+int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { AT_ENTER(M->r); return begin(M, t, e, end); }
 int fmi3ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi3EnterEventMode(Instance c) { return 0; }
 int fmi3Terminate(Instance c) { return 0; }

@@ -54,6 +54,17 @@ def test_the_cheapest_restart_that_repeats_a_run_is_taken(tmp_path, way, model, 
     found.host.close()
 
 
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("interface", BOTH)
+def test_an_fmu_that_takes_its_input_from_the_initialization_on_is_given_it_there(tmp_path, interface, version):
+    picky = "AT_SET(r, v, x) do { if (v == 3 && r[6] == 0) return 3; } while (0)"
+    model = begun("picky", picky, "AT_ENTER(r) (r[6] = 1)")
+    found = read_fmu(build(model, tmp_path, version), interface=interface, limits=PATIENT)
+    held = FREE.with_(inputs={"u": InputSignal.constant(0.5)})
+    assert np.abs(simulate(found, held, outputs=["out"])["out"] - 0.5 * (1.0 + np.exp(-TIME / 0.1))).max() < 1e-6
+    found.host.close()
+
+
 def test_a_run_at_rest_does_not_judge_a_reset(tmp_path):
     """At 0 with no input the frozen lag repeats itself: an input that moves tells it."""
     model = begun("rest", "INITIALIZE(r) (r[0] = 0)", *FROZEN)
