@@ -20,11 +20,18 @@ from typing import Any
 import numpy as np
 from foreign_cases import REAL, RTOL, Array, Peer, Plan, Told, ranges
 
+from hvdc_ident import load_study
+from hvdc_ident.fit.optimisers.trust_region import TrustRegion
+from hvdc_ident.study.fitting import problem_of
+
 NOISE, PLANTED, GAIN = 1e-3, 1.1, 1.05
 FINER = 5  # parts of a row's interval in which a lagged input is given
 SHARE = 50  # of the record
 MOVES = 0.02  # of the range, the least that a planted parameter has to move an output by
+DIVERGED = 100.0  # ranges: a parameter that moves an output by more has made the FMU's own solver unstable
+FITTED, APART = 4, 0.98  # parameters of which runs are counted; cosine between responses above which two are one
 SEEN = 0.005  # of the range, the least that what is hidden has to move an output by
+LONG = 8  # iterations of a fit from which the runs of its first derivative count among them
 MOST_OUTPUTS, MOST_TRIED, SECONDS_TRIED = 4, 40, 60.0
 COMMAND = "from hvdc_ident.cli import main; main()"
 
@@ -159,7 +166,7 @@ def movers(peer: Peer, inputs: Mapping[str, Array]) -> tuple[Array, Array, list[
             continue
         if np.isfinite(moved).sum() == np.isfinite(y).sum():
             found.append(Mover(v.name, start, (low, high), (moved - y) / scale))
-    return y, scale, sorted((m for m in found if m.size > MOVES), key=lambda m: -m.size)
+    return y, scale, sorted((m for m in found if MOVES < m.size < DIVERGED), key=lambda m: -m.size)
 
 
 def _text(names: Mapping[str, str]) -> str:
@@ -254,6 +261,35 @@ def fit(path: Path, interface: str, told: Told) -> None:
     told({"outcome": "ok" if inside else "outside", "sigmas": off, "detail": detail, "stage": "done"})
 
 
+def runs(path: Path, interface: str, told: Told) -> None:
+    """Whole runs of the FMU that an iteration of a fit of four parameters takes, the first derivative's among them."""
+    told({"stage": "fmpy"})
+    peer = Peer(path, interface)
+    inputs = stairs(peer, None)
+    _, scale, moving = movers(peer, inputs)
+    free: list[Mover] = []
+    for m in moving:
+        if len(free) < FITTED and all(_alike(m.response, other.response) < APART for other in free):
+            free.append(m)
+    if len(free) < FITTED:
+        told({"not_applicable": f"{len(free)} parameters that move outputs each in its own way", "stage": "done"})
+        return
+    record = recorded(peer, inputs, {m.name: PLANTED * m.start for m in free})
+    told({"stage": "run", "parameter": ", ".join(m.name for m in free)})
+    with tempfile.TemporaryDirectory() as folder:
+        study = load_study(write_study(Path(folder), peer, [record], scale, free, "[fit]"))
+        problem, host = problem_of(study), study.model.host
+        problem.residual(problem.start)
+        first = host.runs
+        end = TrustRegion().run(problem, problem.start)
+        iterations = end.evaluations
+        each = host.runs / iterations if iterations >= LONG else (host.runs - first) / iterations
+        detail = f"{host.runs} runs in {iterations} iterations, {first} for the first derivative; {end.status}"
+        told({"iterations": iterations, "runs": host.runs, "first": first, "each": each, "detail": detail})
+        told({"outcome": "ok" if each <= FITTED + 2 else "more runs", "stage": "done"})
+        host.close()
+
+
 def lag(path: Path, interface: str, told: Told) -> None:
     """A lag hidden at an input."""
     diagnosed(path, interface, told, "lag")
@@ -337,4 +373,4 @@ def _alike(a: Array, b: Array) -> float:
     return float(abs(x @ y) / size) if size > 0.0 else 0.0
 
 
-__all__ = ["RTOL", "delay", "fit", "gain", "lag"]
+__all__ = ["RTOL", "delay", "fit", "gain", "lag", "runs"]
