@@ -277,10 +277,13 @@ def runs(path: Path, interface: str, told: Told) -> None:
     record = recorded(peer, inputs, {m.name: PLANTED * m.start for m in free})
     told({"stage": "run", "parameter": ", ".join(m.name for m in free)})
     with tempfile.TemporaryDirectory() as folder:
-        study = load_study(write_study(Path(folder), peer, [record], scale, free, "[fit]"))
+        path_of = write_study(Path(folder), peer, [record], scale, free, "[fit]")
+        alone = load_study(path_of)
+        problem_of(alone).residual(problem_of(alone).start)
+        first = alone.model.host.runs
+        alone.model.host.close()
+        study = load_study(path_of)
         problem, host = problem_of(study), study.model.host
-        problem.residual(problem.start)
-        first = host.runs
         end = TrustRegion().run(problem, problem.start)
         iterations = end.evaluations
         each = host.runs / iterations if iterations >= LONG else (host.runs - first) / iterations

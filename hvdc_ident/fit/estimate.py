@@ -74,7 +74,7 @@ def fit(
     try:
         problem, result = _result(first, begins, runs, whiten)
     except SimulationError as e:
-        return _failed(first, begins, runs, f"the optimum could be simulated once and no more: {e}")
+        return _failed(first, begins, runs, f"the optimum cannot be simulated again: {e}")
     return assessed(problem, result) if assess else result
 
 
