@@ -16,7 +16,7 @@ import numpy as np
 
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.locus import root_locus
-from hvdc_ident.linearize.schur import eliminate
+from hvdc_ident.linearize.matrices import eliminate
 from hvdc_ident.linearize.system import System, system
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.structure import torn

@@ -36,22 +36,23 @@ if TYPE_CHECKING:
     from hvdc_ident.fit.result import FitResult
     from hvdc_ident.formats import read_waveforms
     from hvdc_ident.identifiability import IdentifiabilityReport
-    from hvdc_ident.linearize.compare import compare
-    from hvdc_ident.linearize.gap import gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.compare import compare, gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.impedance import (
+        MeasuredResponse,
+        Port,
+        port_admittance,
+        port_impedance,
+        response_at_tones,
+        response_from_record,
+        simulated_response,
+    )
     from hvdc_ident.linearize.jacobian import one_sided
     from hvdc_ident.linearize.linear_model import LinearModel
     from hvdc_ident.linearize.locus import root_locus
     from hvdc_ident.linearize.loop import loop, plant_and_controller
     from hvdc_ident.linearize.margins import loop_margins, margins
-    from hvdc_ident.linearize.measured import (
-        MeasuredResponse,
-        response_at_tones,
-        response_from_record,
-        simulated_response,
-    )
     from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
     from hvdc_ident.linearize.operating_point import OperatingPoint, continuation, point_at
-    from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
     from hvdc_ident.linearize.reduce import balanced
     from hvdc_ident.linearize.response_file import read_response
     from hvdc_ident.linearize.symbolic import symbolic_transfer
@@ -139,17 +140,16 @@ _imported = offered(
         "fit.result": "FitResult",
         "formats": "read_waveforms",
         "identifiability": "IdentifiabilityReport",
-        "linearize.compare": "compare",
-        "linearize.gap": "gap ncf_margin nu_gap",
+        "linearize.compare": "compare gap ncf_margin nu_gap",
+        "linearize.impedance": "MeasuredResponse Port port_admittance port_impedance response_at_tones response_from_record "
+        "simulated_response",
         "linearize.jacobian": "one_sided",
         "linearize.linear_model": "LinearModel",
         "linearize.locus": "root_locus",
         "linearize.loop": "loop plant_and_controller",
         "linearize.margins": "loop_margins margins",
-        "linearize.measured": "MeasuredResponse response_at_tones response_from_record simulated_response",
         "linearize.norms": "h2_norm hinf_norm linf_norm",
         "linearize.operating_point": "OperatingPoint continuation point_at",
-        "linearize.port": "Port port_admittance port_impedance",
         "linearize.reduce": "balanced",
         "linearize.response_file": "read_response",
         "linearize.symbolic": "symbolic_transfer",

@@ -11,7 +11,7 @@ from hvdc_ident.errors import LinearizationError, SimulationError, SteadyStateEr
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.simulator import Simulation, Simulator
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.measured import MeasuredResponse
+from hvdc_ident.linearize.impedance import MeasuredResponse
 from hvdc_ident.model.definition import State
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.parameters import Input, Parameter

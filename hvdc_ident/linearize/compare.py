@@ -1,19 +1,317 @@
-"""Two linear models against each other: how far apart they are, for feedback and in their responses."""
+"""Distances between two linear models for feedback, nu-gap and gap, and the margin they are compared with."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.gap import NuGap, gap, ncf_margin, nu_gap, same_channels
+from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.norms import Peak, linf_norm
-from hvdc_ident.linearize.reduce import without_sliding_means
+from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.norms import Peak, linf_norm, refined
+from hvdc_ident.linearize.reduce import hankel, on_axis, visible, without_sliding_means
+
+Complex = NDArray[np.complex128]
+StateSpace = tuple[Array, Array, Array, Array]
+LARGEST = 512
+"""Coefficients of the truncated operator behind the gap."""
+
+
+@dataclass(frozen=True)
+class NuGap:
+    """The nu-gap between two models: value in [0, 1], where the largest chordal distance is, and the winding condition.
+
+    winding: the count that must be 0; where it is not, no controller that suits one model is sure to suit the other
+    and the value is 1. distance: the largest chordal distance between the frequency responses.
+    """
+
+    value: float
+    omega: float
+    winding: int
+    distance: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The gap as plain numbers."""
+        return {"nu_gap": self.value, "omega": self.omega, "winding": self.winding, "chordal_distance": self.distance}
+
+
+def same_channels(first: LinearModel, second: LinearModel) -> None:
+    """Raise LinearizationError where two models differ in their number of inputs or outputs."""
+    shapes = [(len(m.output_names), len(m.input_names)) for m in (first, second)]
+    if shapes[0] != shapes[1]:
+        raise LinearizationError(
+            "the models have other inputs or outputs",
+            where=f"'{first.name}' against '{second.name}'",
+            expected=f"{shapes[0][0]} outputs and {shapes[0][1]} inputs",
+            got=f"{shapes[1][0]} and {shapes[1][1]}",
+        )
+
+
+def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
+    """Return the nu-gap metric with its winding condition (Vinnicombe 1993, doi 10.1109/9.231459); delays exact on the axis.
+
+    Scale inputs and outputs first so that 1 has equal weight in each (`LinearModel.scaled`). Raises LinearizationError
+    where the numbers of channels differ.
+    """
+    same_channels(first, second)
+    grid = np.unique(np.concatenate([default_omega(first, 2000), default_omega(second, 2000)]))
+    far = 1e6 * grid[-1]
+    grid = np.concatenate([grid[0] * np.logspace(-8, -0.01, 100), grid, [far]])
+
+    def distances(w: Array) -> Array:
+        return _chordal(transfer(first, 1j * w), transfer(second, 1j * w))
+
+    values = distances(grid)
+    k = int(np.argmax(values))
+    low, high = np.log(grid[max(k - 1, 0)]), np.log(grid[min(k + 1, grid.size - 1)])
+    found = minimize_scalar(
+        lambda x: -float(distances(np.array([np.exp(x)]))[0]),
+        bounds=(low, high),
+        method="bounded",
+        options={"xatol": 1e-10},
+    )
+    value, omega = max((float(values[k]), float(grid[k])), (-float(found.fun), float(np.exp(found.x))))
+    winding = winding_count(first, second)
+    value = min(value, 1.0)
+    return NuGap(1.0 if winding else value, omega, winding, value)
+
+
+def _chordal(p1: Array, p2: Array) -> Array:
+    """(points,) largest singular value of (1 + P2 P2*)^-1/2 (P1 - P2) (1 + P1* P1)^-1/2."""
+    u, s2, _ = np.linalg.svd(p2)
+    _, s1, v = np.linalg.svd(p1)
+    inner = np.conj(np.swapaxes(u, 1, 2)) @ (p1 - p2) @ np.conj(np.swapaxes(v, 1, 2))
+    inner = inner / np.sqrt(1.0 + _padded(s2, u.shape[1]) ** 2)[:, :, None]
+    inner = inner / np.sqrt(1.0 + _padded(s1, v.shape[1]) ** 2)[:, None, :]
+    return np.asarray(np.linalg.svd(inner, compute_uv=False)[:, 0])
+
+
+def _padded(values: Array, size: int) -> Array:
+    """Singular values with the zeros of a matrix that is not square."""
+    return np.concatenate([values, np.zeros((values.shape[0], size - values.shape[1]))], axis=1)
+
+
+def winding_count(first: LinearModel, second: LinearModel) -> int:
+    """wno det(1 + P2~ P1) + eta(P1) - eta(P2) - eta0(P2), the count that must be 0; delays in their Pade form.
+
+    The contour passes poles on the axis on their right, so that wno counts zeros less poles right of it; modes that are
+    hidden from inputs or outputs do not belong to the transfer functions and are left out.
+    """
+    a1, b1, c1, d1 = visible(first)
+    a2, b2, c2, d2 = visible(second)
+    # P2~(s) = P2(-s)^T, in series behind P1, with unit negative feedback.
+    at, bt, ct, dt = -a2.T, -c2.T, b2.T, d2.T
+    through = np.eye(d1.shape[1]) + dt @ d1
+    if np.linalg.cond(through) > 1e12:
+        return 1_000_000
+    series_a = np.block([[a1, np.zeros((a1.shape[0], at.shape[0]))], [bt @ c1, at]])
+    series_b = np.concatenate([b1, bt @ d1])
+    series_c = np.concatenate([dt @ c1, ct], axis=1)
+    closed = series_a - series_b @ np.linalg.solve(through, series_c)
+    right1 = _count(a1)[0]
+    right2, axis2 = _count(a2)
+    zeros, poles = _count(closed)[0], right1 + _count(at)[0]
+    return zeros - poles + right1 - right2 - axis2
+
+
+def _count(a: Array) -> tuple[int, int]:
+    """(eigenvalues right of the axis, eigenvalues on it)."""
+    if a.shape[0] == 0:
+        return 0, 0
+    values = np.linalg.eigvals(a)
+    axis = on_axis(values, a)
+    return int(((values.real > 0) & ~axis).sum()), int(axis.sum())
+
+
+def gap(first: LinearModel, second: LinearModel, tolerance: float = 1e-4) -> float:
+    """Return the gap (Georgiou 1988), in [0, 1]: 0 for equal plants, never below the nu-gap, and 1 where that is 1.
+
+    The graph of a plant is the range of G = [M; N], its normalised right coprime factors. The directed gap is
+    sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of G2* G1, here over inputs of a finite
+    number of coefficients: a bound from below that is raised until less than the tolerance is still to come. Delays are in
+    their Pade form. Raises LinearizationError for models of other sizes, or where it does not settle.
+    """
+    near = nu_gap(first, second).value
+    if near >= 1.0:
+        return 1.0
+    graphs = [_graph(m) for m in (first, second)]
+    scale = _scale(graphs)
+    first_on, second_on = (_on_circle(graph, scale) for graph in graphs)
+    there = _directed(first_on, second_on, tolerance, near)
+    return max(there, _directed(second_on, first_on, tolerance, near))
+
+
+def _graph(model: LinearModel) -> StateSpace:
+    """A, B, C, D of the normalised right coprime factors [M; N], from the Riccati equation (Vidyasagar 1988)."""
+    a, b, c, d = visible(model)
+    m = b.shape[1]
+    r = np.eye(m) + d.T @ d
+    root = np.linalg.inv(np.real(scipy.linalg.sqrtm(r)))
+    if a.shape[0] == 0:
+        return a, b @ root, np.zeros((m + c.shape[0], 0)), np.vstack([root, d @ root])
+    try:
+        x = scipy.linalg.solve_continuous_are(a, b, c.T @ c, r, s=c.T @ d)
+    except np.linalg.LinAlgError as e:
+        raise LinearizationError(
+            "the Riccati equation of the plant's normalised coprime factors has no solution",
+            where=f"linear model '{model.name}'",
+            got=str(e),
+            hint="reduce the model first (`reduce`), or scale its inputs and outputs",
+        ) from None
+    f = -np.linalg.solve(r, d.T @ c + b.T @ x)
+    return a + b @ f, b @ root, np.vstack([f, c + d @ f]), np.vstack([root, d @ root])
+
+
+def _scale(graphs: list[StateSpace]) -> float:
+    """The frequency that the bilinear map sends to the middle of the circle: between the graphs' poles, rad/s."""
+    poles = np.concatenate([np.abs(np.linalg.eigvals(a)) for a, _, _, _ in graphs if a.shape[0]] or [np.ones(1)])
+    poles = poles[poles > 0]
+    return float(np.exp(np.mean(np.log(poles)))) if poles.size else 1.0
+
+
+def _on_circle(graph: StateSpace, scale: float) -> Complex:
+    """(points, rows, inputs) of [M; N] over the whole circle: the upper half, then its conjugate, mirrored."""
+    a, b, c, d = graph
+    points = 8 * LARGEST
+    omega = scale * np.tan((np.arange(points // 2) + 0.5) * np.pi / points)
+    if a.shape[0] == 0:
+        upper = np.broadcast_to(d.astype(complex), (omega.size, *d.shape))
+    else:
+        inner = 1j * omega[:, None, None] * np.eye(a.shape[0]) - a
+        upper = c @ np.linalg.solve(inner, np.broadcast_to(b, (omega.size, *b.shape))) + d
+    return np.concatenate([np.conj(upper[::-1]), upper])
+
+
+def _directed(graph: Complex, other: Complex, tolerance: float, least: float) -> float:
+    """sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of other* graph, and not below `least`.
+
+    Where the operator's spectrum reaches down to s no sequence attains it and the bound rises as 1/size^2 at worst, so
+    that a third of the last rise is still to come: where that does not lead above the nu-gap, the gap is the nu-gap.
+    """
+    product = np.conj(np.swapaxes(other, 1, 2)) @ graph
+    points = product.shape[0]
+    squared = np.conj(np.swapaxes(product, 1, 2)) @ product
+    # T'T = Toeplitz(product* product) - H'H, H the Hankel operator of the coefficients before 0: all rows of T at once.
+    symbol, whole = _coefficients(product), _coefficients(squared)
+    m, best, size, settled = product.shape[1], -np.inf, 16, 0
+    while True:
+        lag = np.subtract.outer(np.arange(size), np.arange(size))
+        toeplitz = whole[lag % points].transpose(0, 2, 1, 3).reshape(size * m, size * m)
+        before_zero = -1 - np.add.outer(np.arange(LARGEST), np.arange(size))
+        rows = symbol[before_zero % points].transpose(0, 2, 1, 3).reshape(LARGEST * m, size * m)
+        smallest = float(np.linalg.eigvalsh(toeplitz - rows.T @ rows)[0])
+        before, best = best, float(np.sqrt(1.0 - min(max(smallest, 0.0), 1.0)))
+        to_come = abs(best - before) / 3.0
+        settled = settled + 1 if min(to_come, best + to_come - least) < tolerance else 0
+        if settled == 2:
+            return max(best, least)
+        if size == LARGEST:
+            break
+        size *= 2
+    raise LinearizationError(
+        "the gap does not settle",
+        expected=f"a value that stands still with {LARGEST} coefficients",
+        got=f"{best:.6g}, {abs(best - before):.2g} from the one before",
+        hint="ask for a coarser tolerance, compare reduced models, or use nu_gap",
+    )
+
+
+def _coefficients(values: Complex) -> Array:
+    """Fourier coefficients over the circle, those of negative order at the end.
+
+    s = scale (1 - z)/(1 + z) makes stable factors power series in z.
+    """
+    n = values.shape[0]
+    order = np.fft.fftfreq(n, 1.0 / n)
+    shift = np.exp(1j * order * (np.pi / n - np.pi))
+    return np.real(shift[:, None, None] * np.fft.ifft(values, axis=0))
+
+
+# --- the margin ---
+
+
+def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Peak:
+    """Return the normalised coprime factor margin b(P, C) of a negative feedback loop, in [0, 1], and where it is least.
+
+    1/b is the H-infinity norm of [I; C] (I + P C)^-1 [I, P]; b is 0 where the loop is not stable. A controller with
+    margin b suits every plant within a gap or nu-gap below b of P. Without a controller: the largest margin that any
+    controller attains, sqrt(1 - |[M; N]|_H^2) (Glover and McFarlane 1989), whose omega is nan. Scale first, as for
+    `nu_gap`. Raises LinearizationError where the sizes do not fit, or the loop is ill-posed.
+    """
+    if controller is None:
+        a, b, c, _ = _graph(plant)
+        values = hankel(a, b, c)[0] if a.shape[0] else np.zeros(1)
+        return Peak(float(np.sqrt(max(1.0 - float(values[0]) ** 2, 0.0))), float("nan"))
+    outputs, inputs = len(plant.output_names), len(plant.input_names)
+    if (len(controller.output_names), len(controller.input_names)) != (inputs, outputs):
+        raise LinearizationError(
+            "the controller does not fit the plant",
+            where=f"'{plant.name}' with '{controller.name}'",
+            expected=f"a controller of {outputs} inputs and {inputs} outputs",
+            got=f"{len(controller.input_names)} inputs and {len(controller.output_names)} outputs",
+        )
+    closed = _four_blocks(plant, controller)
+    poles = closed.poles()
+    if (poles.real >= 0).any():
+        return Peak(0.0, float(abs(poles[np.argmax(poles.real)].imag)))
+    if plant.delay_free is None and controller.delay_free is None:
+        peak = linf_norm(closed)
+    else:
+        peak = _exact_peak(plant, controller)
+    return Peak(1.0 / peak.value, peak.omega)
+
+
+def _four_blocks(plant: LinearModel, controller: LinearModel) -> LinearModel:
+    """[I; C] (I + P C)^-1 [I, P] in state space: v = w1 + P (w2 - C v), seen as v and C v."""
+    a1, b1, c1, d1 = visible(plant)
+    a2, b2, c2, d2 = visible(controller)
+    p, m, n1, n2 = c1.shape[0], b1.shape[1], a1.shape[0], a2.shape[0]
+    loop = np.block([[np.eye(p), d1], [-d2, np.eye(m)]])
+    if np.linalg.cond(loop) > 1e12:
+        raise LinearizationError("the loop is ill-posed: I + D_P D_C is singular", where=f"'{plant.name}'")
+    # [v; C v] from the states and [w1; w2].
+    right = np.block([[c1, np.zeros((p, n2)), np.eye(p), d1], [np.zeros((m, n1)), c2, np.zeros((m, p + m))]])
+    seen = np.linalg.solve(loop, right)
+    v, cv = seen[:p], seen[p:]
+    drive = np.concatenate([np.zeros((m, n1 + n2 + p)), np.eye(m)], axis=1) - cv
+    rates = np.concatenate([b1 @ drive, b2 @ v])
+    rates[:n1, :n1] += a1
+    rates[n1:, n1 : n1 + n2] += a2
+    n = n1 + n2
+    return replace(
+        plant, A=rates[:, :n], B=rates[:, n:], C=seen[:, :n], D=seen[:, n:], E=np.eye(n),
+        state_names=tuple(f"x{k + 1}" for k in range(n)), state_units=(), x0=(0.0,) * n,
+        input_names=tuple(f"w{k + 1}" for k in range(p + m)), input_units=(), u0=(0.0,) * (p + m),
+        output_names=tuple(f"z{k + 1}" for k in range(p + m)), output_units=(), y0=(0.0,) * (p + m),
+        point=None, gradients=FrozenMap(), delay_free=None, name=f"loop of {plant.name} and {controller.name}",
+    )  # fmt: skip
+
+
+def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
+    """The peak of the four blocks on a grid and beside its maximum, delays exact."""
+
+    def blocks(w: Array) -> Array:
+        p, c = transfer(plant, 1j * w), transfer(controller, 1j * w)
+        eye = np.broadcast_to(np.eye(p.shape[1]), (w.size, p.shape[1], p.shape[1]))
+        middle = np.linalg.solve(eye + p @ c, np.concatenate([eye, p], axis=2))
+        return np.linalg.svd(np.concatenate([middle, c @ middle], axis=1), compute_uv=False)[:, 0]
+
+    return peak_over(blocks, np.unique(np.concatenate([default_omega(m, 4000) for m in (plant, controller)])))
+
+
+def peak_over(values: Callable[[Array], Array], grid: Array) -> Peak:
+    """Return the largest of some positive values over the frequencies of a grid, refined beside the largest."""
+    found = values(grid)
+    k = int(np.argmax(found))
+    return refined(lambda w: float(values(np.array([w]))[0]), float(found[k]), float(grid[k]))
 
 
 @dataclass(frozen=True)

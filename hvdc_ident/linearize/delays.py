@@ -1,17 +1,77 @@
-"""A linear model before its delays are approximated: what its exact frequency response is computed from."""
+"""Delays as rational functions: Pade approximants of exp(-sT) in state space, and their exact response."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.arrays import Array
-from hvdc_ident.linearize.pade import response, response_slopes
-from hvdc_ident.linearize.schur import eliminate
+from hvdc_ident.linearize.matrices import Array, eliminate
 from hvdc_ident.linearize.system import Layout, System
 from hvdc_ident.model.definition import Model
+
+MAX_ORDER = 12
+
+
+def pade(order: int) -> tuple[Array, Array, Array, float]:
+    """(A, B, C, D) of the diagonal Pade approximant of exp(-s), scaled so that all entries are of the size of 1 to 30.
+
+    For exp(-sT) divide A and B by T. It is all-pass: gain 1 at every frequency, phase right to about `order` radians.
+    Raises LinearizationError for an order outside 1 to 12. Source: Golub and Van Loan, Matrix Computations, 11.3.
+    """
+    if not 1 <= order <= MAX_ORDER:
+        raise LinearizationError(
+            "the order of a Pade approximant is out of range", expected=f"1 to {MAX_ORDER}", got=f"{order}"
+        )
+    n = order
+    c = np.array(
+        [
+            factorial(2 * n - k) * factorial(n) / (factorial(2 * n) * factorial(k) * factorial(n - k))
+            for k in range(n + 1)
+        ]
+    )
+    denominator, numerator = c / c[n], c * (-1.0) ** np.arange(n + 1) / c[n]
+    through = float(numerator[n])
+    rest = numerator - through * denominator
+    a = np.zeros((n, n))
+    a[range(n - 1), range(1, n)] = 1.0
+    a[n - 1] = -denominator[:n]
+    b, output = np.zeros(n), rest[:n].copy()
+    b[n - 1] = 1.0
+    # Scale the companion form's states: powers of the typical root size make the entries alike.
+    size = denominator[0] ** (1.0 / n)
+    scale = size ** np.arange(n)
+    a = a * scale[None, :] / scale[:, None]
+    b = b / scale * scale[n - 1]
+    output = output * scale / scale[n - 1]
+    return a, b, output, through
+
+
+def response(kind: str, time: float, compute: float, s: Array) -> Array:
+    """The exact transfer of a delay, exp(-s T), or of a sampled block: hold over one period, then the compute time.
+
+    A sampled block's aliases are left out: it is the part at the frequency of the excitation, which below half the
+    sampling frequency is what matters. time, compute: s; s: complex frequencies, rad/s.
+    """
+    if kind == "delay":
+        return np.asarray(np.exp(-s * time))
+    x = s * time
+    small = np.abs(x) < 1e-6
+    hold = np.where(small, 1.0 - x / 2 + x * x / 6, (1.0 - np.exp(-x)) / np.where(small, 1.0, x))
+    return np.asarray(hold * np.exp(-s * compute))
+
+
+def response_slopes(kind: str, time: float, compute: float, s: Array) -> tuple[Array, Array]:
+    """The derivatives of `response` by its time (period) and by the compute time."""
+    value = response(kind, time, compute, s)
+    if kind == "delay":
+        return -s * value, np.zeros_like(value)
+    x = s * time
+    small = np.abs(x) < 1e-4
+    inner = np.where(small, -0.5 + x / 3, (np.exp(-x) * (1.0 + x) - 1.0) / np.where(small, 1.0, x * x))
+    return np.asarray(s * inner * np.exp(-s * compute)), np.asarray(-s * value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,3 +203,76 @@ class DelayFree:
         d_read = np.concatenate([change[out, x], change[out, fed]], axis=1)
         d_right = np.linalg.solve(unknown, d_given - d_unknown @ right)
         return np.asarray(change[out, inp] - d_read @ right - read @ d_right)
+
+
+class Blocks:
+    """Where states, Pade states, inputs, unknowns and delayed values stand in the matrix that is reduced."""
+
+    def __init__(self, s: System, found: tuple[Channel, ...], order: int) -> None:
+        self.size, self.channels, self.order = s.layout, found, order
+        self.pade = pade(order) if found else (np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0)
+        self.n_pade = order * len(found)
+        self.n = self.size.nx + self.n_pade
+        self.rows, self.columns = self.n + self.size.no, self.n + self.size.nu
+
+    def spread(self, jac: Array) -> Array:
+        """The Jacobian's rows f, outputs, g and columns [x, Pade, u, z, e] in place; Pade and delay rows are 0."""
+        z, k = self.size, self.n_pade
+        total = np.zeros((*jac.shape[:-2], z.nx + k + z.no + z.nz + z.ne, z.nx + k + z.nu + z.nz + z.ne))
+        rows = [*range(z.nx), *range(z.n + z.ne, z.main), *range(z.nx, z.n)]
+        to_rows = [*range(z.nx), *range(self.n, self.n + z.no + z.nz)]
+        columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
+        to_columns = [*range(z.nx), *range(self.n, self.n + z.nu + z.nz + z.ne)]
+        total[..., np.array(to_rows)[:, None], to_columns] = jac[..., np.array(rows)[:, None], columns]
+        return total
+
+    def sources(self, jac: Array) -> Array:
+        """The rows of what is delayed, over the columns [x, Pade, u, z, e]."""
+        z = self.size
+        total = np.zeros((*jac.shape[:-2], z.ne, z.nx + self.n_pade + z.nu + z.nz + z.ne))
+        columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
+        to_columns = [*range(z.nx), *range(self.n, self.n + z.nu + z.nz + z.ne)]
+        total[..., to_columns] = jac[..., z.n : z.n + z.ne, columns]
+        return total
+
+    def matrix(self, jac: Array) -> Array:
+        """The matrix to reduce: rows [x', Pade', outputs | g, delays], columns [x, Pade, u | z, e]."""
+        total = self.spread(jac)
+        if self.channels:
+            a, _, c, through = self.pade
+            z, sources = self.size, self.sources(jac)
+            self._add_sources(total, sources, through)
+            for i, channel in enumerate(self.channels):
+                block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
+                total[block, block] += a / channel.total
+                total[-z.ne + i, block] += c
+                total[-z.ne + i, -z.ne + i] -= 1.0
+        return total
+
+    def _add_sources(self, total: Array, sources: Array, through: float) -> None:
+        z, b = self.size, self.pade[1]
+        for i, channel in enumerate(self.channels):
+            block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
+            total[..., block, :] += b[:, None] / channel.total * sources[..., i : i + 1, :]
+            total[..., total.shape[-2] - z.ne + i, :] += through * sources[..., i, :]
+
+    def matrix_along(self, djac: Array, jac: Array, dtime: Array) -> Array:
+        """(directions, ...) the derivative of `matrix`; djac: of the Jacobian; dtime: (channels, directions)."""
+        total = self.spread(djac)
+        if self.channels:
+            a, b, _, through = self.pade
+            z = self.size
+            self._add_sources(total, self.sources(djac), through)
+            sources = self.sources(jac)
+            for i, channel in enumerate(self.channels):
+                block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
+                change = -dtime[i] / channel.total**2
+                total[:, block, block] += change[:, None, None] * a
+                total[:, block, :] += change[:, None, None] * b[:, None] * sources[i]
+        return total
+
+    def split(self, total: Array, inputs: list[int]) -> tuple[Array, Array, Array, Array]:
+        """A, B, C, D of a reduced matrix for the chosen inputs."""
+        n = self.n
+        through = [n + k for k in inputs]
+        return total[..., :n, :n], total[..., :n, through], total[..., n:, :n], total[..., n:, through]

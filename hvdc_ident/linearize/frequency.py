@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.notebook import data_frame
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class Response:
 
     def plot(self, ax: Any = None) -> Any:
         """The two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""
-        from hvdc_ident.linearize.plots.bode import bode
+        from hvdc_ident.linearize.plot import bode
 
         return bode([self], ax=ax)
 

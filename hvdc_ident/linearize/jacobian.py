@@ -9,13 +9,11 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.arrays import Array
-from hvdc_ident.linearize.blocks import Blocks
-from hvdc_ident.linearize.delays import DelayFree, channels
+from hvdc_ident.linearize.delays import Blocks, DelayFree, channels
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
+from hvdc_ident.linearize.matrices import Array, Eliminated, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
-from hvdc_ident.linearize.schur import Eliminated, eliminate
 from hvdc_ident.linearize.system import System, system
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
@@ -57,7 +55,7 @@ def linearize(
     inputs = [inputs] if isinstance(inputs, str) else inputs
     outputs = [outputs] if isinstance(outputs, str) else outputs
     if not isinstance(model, Model):
-        from hvdc_ident.linearize.external import linear_model
+        from hvdc_ident.linearize.fmu_linear import linear_model
 
         return linear_model(model, at, inputs, outputs, sensitivities)
     s = system(model, outputs)
@@ -152,7 +150,7 @@ def one_sided(
 def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
     """The largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
     if not isinstance(model, Model):
-        from hvdc_ident.linearize.external import error_of
+        from hvdc_ident.linearize.fmu_linear import error_of
 
         return error_of(model, point, outputs)
     s = system(model, outputs)

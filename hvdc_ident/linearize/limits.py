@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.expression.printer import to_text
-from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.simulate.structure import Structure
 
 

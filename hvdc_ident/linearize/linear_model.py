@@ -11,8 +11,8 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.delays import DelayFree
+from hvdc_ident.linearize.matrices import Array, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint
 from hvdc_ident.notebook import Shown, Table
 
@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
     from hvdc_ident.linearize.frequency import Response
     from hvdc_ident.linearize.margins import LoopMargins, Margins
-    from hvdc_ident.linearize.modal import Mode
+    from hvdc_ident.linearize.modal import Mode, TransferFunction
     from hvdc_ident.linearize.reduce import Reduction
-    from hvdc_ident.linearize.zeros import TransferFunction
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,16 +104,40 @@ class LinearModel(Shown):
 
     @property
     def is_descriptor(self) -> bool:
-        """Whether E is not the identity."""
+        """True where E is not the identity."""
         return not np.array_equal(self.E, np.eye(self.A.shape[0]))
 
     def standard(self) -> tuple[Array, Array, Array, Array]:
-        """A, B, C, D with E = 1. Raises LinearizationError for a descriptor whose algebraic part must stay."""
+        """Return A, B, C, D of the model with E = 1: its algebraic part eliminated, or E inverted.
+
+        The zero rows of E = diag(1, ..., 0, ...) are eliminated; any other E is inverted. Raises LinearizationError
+        where the matrix to invert is singular.
+        """
         if not self.is_descriptor:
             return self.A, self.B, self.C, self.D
-        from hvdc_ident.linearize.descriptor import standard
-
-        return standard(self)
+        e, n = self.E, self.A.shape[0]
+        k = int(np.count_nonzero(np.diag(e)))
+        if np.array_equal(e, np.diag([1.0] * k + [0.0] * (n - k))):
+            top = np.block([[self.A[:k, :k], self.B[:k]], [self.C[:, :k], self.D]])
+            right = np.concatenate([self.A[:k, k:], self.C[:, k:]])
+            bottom = np.concatenate([self.A[k:, :k], self.B[k:]], axis=1)
+            reduced = eliminate(
+                np.block([[top, right], [bottom, self.A[k:, k:]]]), k + self.C.shape[0], k + self.B.shape[1]
+            )
+            if reduced.condition < 1e14:
+                r = reduced.result
+                return r[:k, :k], r[:k, k:], r[k:, :k], r[k:, k:]
+            condition = reduced.condition
+        else:
+            condition = float(np.linalg.cond(e))
+            if condition < 1e12:
+                return np.linalg.solve(e, self.A), np.linalg.solve(e, self.B), self.C, self.D
+        raise LinearizationError(
+            "the algebraic part cannot be eliminated",
+            where=f"linear model '{self.name}'",
+            got=f"condition number {condition:.2g}",
+            hint="use poles(), zeros of the pencil and the frequency response, which take E as it is",
+        )
 
     def channel(self, inputs: Sequence[str] | str, outputs: Sequence[str] | str) -> LinearModel:
         """The model between some of its inputs and outputs; the states stay."""
@@ -224,7 +247,7 @@ class LinearModel(Shown):
 
     def zeros(self) -> Array:
         """Complex invariant zeros of the whole system, rad/s."""
-        from hvdc_ident.linearize.zeros import zeros
+        from hvdc_ident.linearize.modal import zeros
 
         return zeros(*self.standard())
 
@@ -236,7 +259,7 @@ class LinearModel(Shown):
 
     def transfer_function(self, input: str | None = None, output: str | None = None) -> TransferFunction:
         """Zeros, poles and gain from an input to an output; the names may be left out where there is only one."""
-        from hvdc_ident.linearize.zeros import transfer_function
+        from hvdc_ident.linearize.modal import transfer_function
 
         return transfer_function(self, input or self._only("input"), output or self._only("output"))
 
@@ -322,7 +345,7 @@ class LinearModel(Shown):
 
     def plot(self, kind: str = "bode", ax: Any = None) -> Any:
         """The axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation"."""
-        from hvdc_ident.linearize.plots import draw
+        from hvdc_ident.linearize.plot import draw
 
         return draw(self, kind, ax)
 

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
-from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.equilibrium import Search
 from hvdc_ident.linearize.jacobian import state_matrix
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.modal import ZERO, eigen
 from hvdc_ident.linearize.operating_point import steady
-from hvdc_ident.linearize.search import Search
 from hvdc_ident.model.definition import Model
 
 
@@ -47,7 +47,7 @@ class Locus:
 
     def plot(self, ax: Any = None) -> Any:
         """The axes with the locus."""
-        from hvdc_ident.linearize.plots.locus import locus
+        from hvdc_ident.linearize.plot import locus
 
         return locus(self, ax=ax)
 

@@ -10,10 +10,10 @@ import numpy as np
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.frequency import Response, default_omega, transfer
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
 from hvdc_ident.linearize.reduce import without_sliding_means
 from hvdc_ident.model.definition import Model, Output, State

@@ -11,9 +11,9 @@ import scipy.linalg
 from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.reduce import on_axis, visible
 
 

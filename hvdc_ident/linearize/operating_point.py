@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.errors import SteadyStateError, unknown_name
+from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.equilibrium import ACCURACY, At, Root, Search, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
-from hvdc_ident.linearize.newton import ACCURACY, Root, homotopy, newton, weights
-from hvdc_ident.linearize.search import At, Search
+from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.modal import ZERO
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 from hvdc_ident.notebook import table_html
-from hvdc_ident.simulate.steady_state import equilibria, resting
+from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]
@@ -66,16 +67,12 @@ class OperatingPoint:
     @cached_property
     def stable(self) -> bool | None:
         """Return whether no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
-        from hvdc_ident.linearize.standing import is_stable
-
-        return is_stable(self)
+        return None if self.search is None else _stable(self, self.y, self.w)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the point: that it is unstable, not the model's own one, or far off; with the other one's place."""
-        from hvdc_ident.linearize.standing import notes
-
-        return notes(self)
+        return _notes(self)
 
     @property
     def y(self) -> Array:
@@ -163,7 +160,7 @@ def find_operating_point(
             guess = {**base.states, **base.unknowns, **base.extras, **(guess or {})}
         fixed = {**fixed, **(outputs or {})}
     if not isinstance(model, Model):
-        from hvdc_ident.linearize.external import find_point
+        from hvdc_ident.linearize.fmu_linear import find_point
 
         return find_point(model, fixed or {}, free, bounds or {}, guess or {}, at, moving, time)
     search = Search.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
@@ -347,3 +344,85 @@ def _step_to(
         return _step_to(
             model, name, 0.5 * (last + value), value, fixed, {**half.states, **half.unknowns, **half.extras}, depth + 1
         )
+
+
+def _notes(point: OperatingPoint) -> tuple[str, ...]:
+    """Sentences on a point that is unstable, not the model's own steady state, or far outside its states' own range.
+
+    Each names the other steady state where one is found: the model's own one, or those that the model runs to from here.
+    """
+    model = point.model
+    if point.search is None or point.at != "steady" or not isinstance(model, Model):
+        return ()
+    model = resting(model)
+    at = equilibria(model)
+    v = np.array([*point.y, *point.extras.values()])
+    found = []
+    if point.branch == "unconnected":
+        found.append(
+            "Followed from the model's own values, its steady state ends at a jump before these: this one is from a new search."
+        )
+    if point.branch == "other":
+        own = at.unknowns(at.start(model, point.p, point.w[1 : 1 + len(point.inputs)], point.time))
+        found.append(f"This is not the model's own steady state, which stands at {at.text(own)}.")
+    far = at.far(v)
+    if far:
+        shown = ", ".join(f"'{n}' at {point.states[n]:.4g} (guess {model.states[n].guess:g})" for n in far)
+        found.append(f"Far outside the states' own range: {shown}.")
+    if point.stable is False:
+        found.append(f"Unstable: {_fastest(point)}. {_elsewhere(at, point, v)}")
+    return tuple(found)
+
+
+def _matrix(point: OperatingPoint, y: Array, w: Array) -> Array | None:
+    from hvdc_ident.linearize.jacobian import state_matrix
+
+    assert point.search is not None and isinstance(point.model, Model)
+    try:
+        return state_matrix(point.model, point.search.system, y, w, point.p)
+    except LinearizationError:
+        return None
+
+
+def _stable(point: OperatingPoint, y: Array, w: Array) -> bool | None:
+    matrix = _matrix(point, y, w)
+    if matrix is None or not matrix.size:
+        return None if matrix is None else True
+    values = np.linalg.eigvals(matrix)
+    return bool(values.real.max() <= ZERO * max(1.0, float(np.abs(values).max())))
+
+
+def _fastest(point: OperatingPoint) -> str:
+    matrix = _matrix(point, point.y, point.w)
+    assert matrix is not None
+    values = np.linalg.eigvals(matrix)
+    worst = values[np.argmax(values.real)]
+    turning = f" +- {abs(worst.imag):.3g}j" if worst.imag else ""
+    return f"the eigenvalue {worst.real:.3g}{turning} 1/s grows"
+
+
+def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
+    """The nearest of the stable steady states that the model runs to from here, or that its guesses lead to."""
+    matrix = _matrix(point, point.y, point.w)
+    assert matrix is not None
+    values, vectors = np.linalg.eig(matrix)
+    nx = len(point.states)
+    direction = vectors[:nx, np.argmax(values.real)].real
+    size = np.maximum(np.abs(point.y[:nx]), 1e-2)
+    direction = 1e-2 * direction / max(float(np.abs(direction / size).max()), 1e-300)
+    u = point.w[1 : 1 + len(point.inputs)]
+    others = at.neighbours(point.p, u, point.time, v, direction)
+    with suppress(SteadyStateError):  # then the guesses offer none
+        others.append(at.unknowns(at.search(point.p, u, point.time)))
+    stable = [
+        x for x in others if not np.allclose(x, v, rtol=1e-6, atol=1e-6) and _stable(point, *_split(at, point, x))
+    ]
+    stable.sort(key=lambda x: float(np.abs((x[:nx] - v[:nx]) / size).max()))  # of a machine's turns the nearest
+    if not stable:
+        return "No stable steady state was found nearby."
+    return f"A stable one stands at {at.text(stable[0])}; a `guess` there in the model's states leads to it."
+
+
+def _split(at: Equilibria, point: OperatingPoint, x: Array) -> tuple[Array, Array]:
+    n = at.n
+    return x[:n].copy(), np.concatenate([point.w[: 1 + len(point.inputs)], x[n:]])

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.matrices import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.norms import Peak

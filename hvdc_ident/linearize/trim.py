@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from hvdc_ident.errors import SteadyStateError, unknown_name
-from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import OperatingPoint
 from hvdc_ident.model.external import AnyModel
 

@@ -12,7 +12,7 @@ from hvdc_ident.study import schema
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel, OperatingPoint
-    from hvdc_ident.linearize.port import Port
+    from hvdc_ident.linearize.impedance import Port
     from hvdc_ident.study.study import Study
 
 MOST_NORMS = 12
@@ -173,7 +173,7 @@ def _trimmed(trim: schema.Trim, linear: LinearModel) -> dict[str, Any]:
 
 
 def _margins(asked: schema.Linearize, linear: LinearModel) -> dict[str, Any]:
-    from hvdc_ident.linearize.gap import ncf_margin
+    from hvdc_ident.linearize.compare import ncf_margin
     from hvdc_ident.linearize.loop import loop, plant_and_controller
     from hvdc_ident.linearize.margins import loop_margins
 
@@ -249,7 +249,7 @@ def _locus(asked: schema.Locus, linear: LinearModel) -> dict[str, Any]:
 
 def port_of(table: schema.Port) -> Port:
     """Return the port that a table of the study describes."""
-    from hvdc_ident.linearize.port import Port
+    from hvdc_ident.linearize.impedance import Port
 
     source, voltage, current = (
         (v[0], v[1]) if len(v) == 2 else (v[0],) for v in (table.source, table.voltage, table.current)
@@ -262,7 +262,7 @@ def _ports(tables: list[schema.Port], linear: LinearModel) -> tuple[list[dict[st
     import numpy as np
 
     from hvdc_ident.linearize.export.csv_response import text
-    from hvdc_ident.linearize.port import port_impedance
+    from hvdc_ident.linearize.impedance import port_impedance
 
     point = linear.point
     assert point is not None and isinstance(point.model, Model)

@@ -15,8 +15,7 @@ from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.frequency import Response
-from hvdc_ident.linearize.measured import MeasuredResponse, response_at_tones, response_from_record
-from hvdc_ident.linearize.port import Port
+from hvdc_ident.linearize.impedance import MeasuredResponse, Port, response_at_tones, response_from_record
 from hvdc_ident.linearize.response_file import ResponseFile, read_response
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel

@@ -14,7 +14,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.measured import MeasuredResponse
+from hvdc_ident.linearize.impedance import MeasuredResponse
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models

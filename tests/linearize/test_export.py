@@ -124,7 +124,7 @@ def test_values_show_themselves_in_notebooks(known):
 
 
 def test_other_figures(known, tmp_path):
-    from hvdc_ident.linearize.plots.shapes import shapes
+    from hvdc_ident.linearize.plot import shapes
 
     locus = root_locus(load_model("vsc-hvdc-link"), "KIVDC", np.linspace(250, 1500, 5)).plot()
     assert "rad/s" in locus.get_xlabel()

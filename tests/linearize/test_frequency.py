@@ -9,19 +9,24 @@ from hypothesis import strategies as st
 
 from hvdc_ident.errors import LinearizationError, UnknownNameError, WaveformError
 from hvdc_ident.linearize import find_operating_point, linearize
+from hvdc_ident.linearize.delays import pade, response
 from hvdc_ident.linearize.frequency import (
     bands,
     frequency_response,
     sensitivity,
     sigma,
 )
+from hvdc_ident.linearize.impedance import (
+    Port,
+    port_admittance,
+    port_impedance,
+    response_from_record,
+    simulated_response,
+)
 from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins
-from hvdc_ident.linearize.measured import response_from_record, simulated_response
-from hvdc_ident.linearize.pade import pade, response
-from hvdc_ident.linearize.port import Port, port_admittance, port_impedance
+from hvdc_ident.linearize.modal import zeros
 from hvdc_ident.linearize.symbolic import symbolic_transfer
-from hvdc_ident.linearize.zeros import zeros
 from hvdc_ident.models import load_model
 
 DELAY = [{"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}}]

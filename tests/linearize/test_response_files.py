@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.linearize.measured import response_at_tones
+from hvdc_ident.linearize.impedance import response_at_tones
 from hvdc_ident.linearize.response_file import read_response
 
 W = np.array([1.0, 2.0, 5.0]) * 2 * np.pi

@@ -7,8 +7,7 @@ from helpers import linear, stable
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize import find_operating_point
-from hvdc_ident.linearize.compare import compare, difference
-from hvdc_ident.linearize.gap import gap, ncf_margin, nu_gap
+from hvdc_ident.linearize.compare import compare, difference, gap, ncf_margin, nu_gap
 from hvdc_ident.linearize.loop import loop, plant_and_controller
 from hvdc_ident.linearize.margins import loop_margins, margins, structured_singular_value
 from hvdc_ident.linearize.norms import hinf_norm, linf_norm, norms

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.linearize import linearize
-from hvdc_ident.linearize.compare import difference
-from hvdc_ident.linearize.gap import nu_gap
+from hvdc_ident.linearize.compare import difference, nu_gap
 from hvdc_ident.linearize.locus import root_locus
 from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins

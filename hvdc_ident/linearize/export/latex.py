@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.files import write_text
-from hvdc_ident.linearize.arrays import Array
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.zeros import TransferFunction
+from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.modal import TransferFunction
 
 SUFFIX = ".tex"
 SUMMARY = "the transfer functions in LaTeX, zeros and poles with six digits"

@@ -1,12 +1,14 @@
-"""Eliminating unknowns from a block matrix, with the derivatives of the result."""
+"""The arrays of this folder: real or complex."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.linearize.arrays import Array
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,10 @@ from hvdc_ident.errors import LinearizationError, ModelError, SimulationError, S
 from hvdc_ident.fmu.model import FmuModel
 from hvdc_ident.fmu.point import FmuPoint, at_point, smooth_inputs
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.arrays import Array
+from hvdc_ident.linearize.equilibrium import At, newton
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.newton import newton
+from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import Bounds, OperatingPoint
-from hvdc_ident.linearize.search import At
 from hvdc_ident.model.external import External
 
 ACCURACY = 1e-9
