@@ -1,14 +1,22 @@
-"""The functions of the grammar that sympy lacks, and the one kind of symbol that models are made of."""
+"""The table of the grammar's functions, which every back end reads, and the one kind of symbol that models are made of.
+
+A new function is one entry of `FUNCTIONS`: cards read and write it, models run in machine code with its derivatives,
+and linearisation, Modelica export and rank analysis know it.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
 
+import numpy as np
 import sympy as sp
 
 
 def symbol(name: str) -> sp.Symbol:
-    """The symbol of a model variable: real, so that sympy may simplify as engineers do."""
+    """Symbol of a model variable: real, so that sympy may simplify as engineers do."""
     return sp.Symbol(name, real=True)
 
 
@@ -36,5 +44,119 @@ class clip(sp.Function):
 
 
 def where(condition: Any, a: Any, b: Any) -> sp.Expr:
-    """a where the condition holds, else b."""
+    """Expression that is a where the condition holds, else b."""
     return sp.Piecewise((a, condition), (b, True))
+
+
+class Algebra(Protocol):
+    """Arithmetic on the nodes of a graph, in which derivatives and series are written."""
+
+    one: int
+
+    def constant(self, value: float) -> int: ...
+    def add(self, a: int, b: int) -> int: ...
+    def sub(self, a: int, b: int) -> int: ...
+    def mul(self, a: int, b: int) -> int: ...
+    def div(self, a: int, b: int) -> int: ...
+    def neg(self, a: int) -> int: ...
+    def call(self, name: str, *arguments: int) -> int: ...
+
+
+Slopes = Callable[..., tuple[int, ...]]
+"""Called with an Algebra, the node of the value and those of the arguments: the derivative with respect to each."""
+
+
+@dataclass(frozen=True)
+class GrammarFunction:
+    """One function of the grammar.
+
+    name: in cards, in the graph, in the C library and in Modelica. head: the class of its applications in sympy; None
+    where the parser writes the function with others. number: its value in doubles; ValueError or OverflowError where it
+    has none. arity: least and largest number of arguments. Without `slopes` the back ends write the function as a
+    choice between its arguments; with them it is elementary, and these are needed:
+    array: the function of NumPy, real and complex. slopes: its derivatives. intrinsic: True where LLVM has an
+    instruction for it; else it is called in the C library. series: the function of one argument written with functions
+    that rank analysis has Taylor series of; None for one that is among them.
+    """
+
+    name: str
+    head: Any
+    number: Callable[..., float]
+    arity: tuple[int, int] = (1, 1)
+    array: Callable[..., Any] | None = None
+    slopes: Slopes | None = None
+    intrinsic: bool = False
+    series: Callable[[Algebra, int], int] | None = None
+
+
+MANY = 32
+"""Arguments that min and max take at most."""
+
+
+def _cosine_of(g: Algebra, sine: int) -> int:
+    return g.call("sqrt", g.sub(g.one, g.mul(sine, sine)))
+
+
+def _sqrt_slopes(g: Algebra, n: int, x: int) -> tuple[int, ...]:
+    # sqrt(max(0, x)) is flat where its argument is cut at 0: the slope there must be 0, not 0 times infinity.
+    return (g.mul(g.constant(0.5), g.call("inverse", n)),)
+
+
+def _atan2_slopes(g: Algebra, n: int, y: int, x: int) -> tuple[int, ...]:
+    square = g.add(g.mul(y, y), g.mul(x, x))
+    return g.div(x, square), g.neg(g.div(y, square))
+
+
+def _asin_series(g: Algebra, x: int) -> int:
+    return g.call("atan", g.div(x, _cosine_of(g, x)))
+
+
+_TABLE = (
+    GrammarFunction("abs", sp.Abs, abs),
+    GrammarFunction("sign", sp.sign, lambda x: float((x > 0) - (x < 0))),
+    GrammarFunction("sqrt", None, math.sqrt, array=np.sqrt, slopes=_sqrt_slopes, intrinsic=True),
+    GrammarFunction("exp", sp.exp, math.exp, array=np.exp, slopes=lambda g, n, x: (n,), intrinsic=True),
+    GrammarFunction("log", sp.log, math.log, array=np.log, slopes=lambda g, n, x: (g.div(g.one, x),), intrinsic=True),
+    GrammarFunction("sin", sp.sin, math.sin, array=np.sin, slopes=lambda g, n, x: (g.call("cos", x),), intrinsic=True),
+    GrammarFunction(
+        "cos", sp.cos, math.cos, array=np.cos, slopes=lambda g, n, x: (g.neg(g.call("sin", x)),), intrinsic=True
+    ),
+    GrammarFunction("tan", sp.tan, math.tan, array=np.tan, slopes=lambda g, n, x: (g.add(g.one, g.mul(n, n)),)),
+    GrammarFunction("tanh", sp.tanh, math.tanh, array=np.tanh, slopes=lambda g, n, x: (g.sub(g.one, g.mul(n, n)),)),
+    GrammarFunction(
+        "asin",
+        sp.asin,
+        math.asin,
+        array=np.arcsin,
+        slopes=lambda g, n, x: (g.div(g.one, _cosine_of(g, x)),),
+        series=_asin_series,
+    ),
+    GrammarFunction(
+        "acos",
+        sp.acos,
+        math.acos,
+        array=np.arccos,
+        slopes=lambda g, n, x: (g.neg(g.div(g.one, _cosine_of(g, x))),),
+        series=lambda g, x: g.sub(g.constant(math.pi / 2), _asin_series(g, x)),
+    ),
+    GrammarFunction(
+        "atan", sp.atan, math.atan, array=np.arctan, slopes=lambda g, n, x: (g.div(g.one, g.add(g.one, g.mul(x, x))),)
+    ),
+    GrammarFunction("atan2", sp.atan2, math.atan2, (2, 2), array=np.arctan2, slopes=_atan2_slopes),
+    GrammarFunction("where", None, lambda condition, a, b: a if condition else b, (3, 3)),
+    GrammarFunction("clip", clip, lambda x, low, high: min(max(x, low), high), (3, 3)),
+    GrammarFunction("min", sp.Min, min, (1, MANY)),
+    GrammarFunction("max", sp.Max, max, (1, MANY)),
+)
+FUNCTIONS: Mapping[str, GrammarFunction] = {f.name: f for f in _TABLE}
+
+
+def function_of(head: Any) -> GrammarFunction | None:
+    """Function of the grammar whose applications are of a class of sympy; None where there is none."""
+    return next((f for f in FUNCTIONS.values() if f.head is head), None)
+
+
+def elementary(head: Any) -> GrammarFunction | None:
+    """Function with derivatives of its own whose applications are of a class of sympy; None where there is none."""
+    found = function_of(head)
+    return found if found is not None and found.slopes is not None else None

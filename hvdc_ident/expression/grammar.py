@@ -16,24 +16,14 @@ from dataclasses import dataclass
 from typing import NamedTuple, NoReturn
 
 from hvdc_ident.errors import ExpressionError
+from hvdc_ident.expression.functions import FUNCTIONS
 
 MAX_LENGTH = 100_000
 MAX_TOKENS = 10_000
 MAX_DEPTH = 100
 MAX_CALLS = 32
 MAX_COMPARISONS = 1024
-MANY = 32
-
-ARITY: dict[str, tuple[int, int]] = {
-    **dict.fromkeys(("abs", "sign", "sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan"), (1, 1)),
-    "atan2": (2, 2),
-    "where": (3, 3),
-    "clip": (3, 3),
-    "min": (1, MANY),
-    "max": (1, MANY),
-}
 CONSTANTS = ("pi", "time")
-RESERVED = frozenset((*ARITY, *CONSTANTS))
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 # A quantifier that gives nothing back: no text makes the scan slower than linear.
@@ -49,6 +39,11 @@ _TOKEN = re.compile(
 def is_identifier(name: object) -> bool:
     """True for a text that can name a variable: letters, digits and _, no digit first."""
     return isinstance(name, str) and IDENTIFIER.fullmatch(name) is not None
+
+
+def is_reserved(name: object) -> bool:
+    """True for the name of a function or a constant of the grammar, which no variable can have."""
+    return name in FUNCTIONS or name in CONSTANTS
 
 
 class Token(NamedTuple):
@@ -284,14 +279,14 @@ class TreeBuilder:
         return inside
 
     def _name(self, token: Token) -> Node:
-        if token.text in ARITY:
+        if token.text in FUNCTIONS:
             self.source.fail(f"'{token.text}' is a function and cannot stand alone", token.position)
         return Name(token.text, token.position)
 
     def _call(self, token: Token) -> Node:
-        if token.text not in ARITY:
-            near = difflib.get_close_matches(token.text, ARITY, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(ARITY)}"
+        if token.text not in FUNCTIONS:
+            near = difflib.get_close_matches(token.text, FUNCTIONS, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(FUNCTIONS)}"
             self.source.fail(f"no function '{token.text[:40]}' ({hint})", token.position)
         self._deeper_call(token.position)
         arguments: list[Node] = []
@@ -301,7 +296,7 @@ class TreeBuilder:
                 arguments.append(self._comparison())
             self._expect(")", "',' or ')'")
         self._leave_call()
-        low, high = ARITY[token.text]
+        low, high = FUNCTIONS[token.text].arity
         if not low <= len(arguments) <= high:
             counts = f"{low}" if low == high else f"{low} to {high}"
             self.source.fail(f"'{token.text}' takes {counts} arguments, got {len(arguments)}", token.position)

@@ -10,7 +10,7 @@ from typing import Any
 import sympy as sp
 
 from hvdc_ident.errors import ExpressionError
-from hvdc_ident.expression.functions import clip, symbol
+from hvdc_ident.expression.functions import FUNCTIONS, function_of, symbol
 from hvdc_ident.expression.grammar import (
     MAX_COMPARISONS,
     Call,
@@ -35,25 +35,11 @@ _RELATIONS: dict[str, tuple[Any, Callable[[float, float], bool]]] = {
     "==": (sp.Eq, operator.eq),
     "!=": (sp.Ne, operator.ne),
 }
-_NUMERIC: dict[Any, Callable[..., float]] = {
-    sp.exp: math.exp,
-    sp.log: math.log,
-    sp.sin: math.sin,
-    sp.cos: math.cos,
-    sp.tan: math.tan,
-    sp.cot: lambda x: 1 / math.tan(x),
-    sp.tanh: math.tanh,
-    sp.asin: math.asin,
-    sp.acos: math.acos,
-    sp.atan: math.atan,
-    sp.atan2: math.atan2,
-    sp.Abs: abs,
-    sp.sign: lambda x: float((x > 0) - (x < 0)),
-    sp.Min: min,
-    sp.Max: max,
-    sp.Pow: math.pow,
-    sp.Mul: lambda *a: math.prod(a),
+_ARITHMETIC: dict[Any, Callable[..., float]] = {
     sp.Add: lambda *a: math.fsum(a),
+    sp.Mul: lambda *a: math.prod(a),
+    sp.Pow: math.pow,
+    sp.cot: lambda x: 1 / math.tan(x),
 }
 _NOT_REAL = "the value is not a finite real number: a division by zero, or a function outside its range"
 
@@ -208,19 +194,11 @@ def call(function: str, arguments: list[sp.Expr]) -> sp.Expr:
     match function:
         case "sqrt":
             return power(arguments[0], sp.Rational(1, 2))
-        case "abs":
-            return sp.Abs(*arguments)
-        case "min":
-            return sp.Min(*arguments)
-        case "max":
-            return sp.Max(*arguments)
-        case "clip":
-            return clip(*arguments)
         case "exp":
             return _exponential(arguments[0])
         case "tan" if arguments[0].is_number:
             constant(arguments[0])
-    return _within(getattr(sp, function)(*arguments))
+    return _within(FUNCTIONS[function].head(*arguments))
 
 
 def _within(expression: sp.Expr) -> sp.Expr:
@@ -302,8 +280,8 @@ def constant(expression: sp.Expr) -> float:
     """The value of an expression without variables, in doubles; OverflowError or ValueError where it has none."""
     if expression.is_Rational or expression.is_Float or expression in (sp.pi, sp.E):
         value = float(expression)
-    elif expression.func in _NUMERIC:
-        value = _NUMERIC[expression.func](*(constant(a) for a in expression.args))
+    elif number := _number_of(expression.func):
+        value = number(*(constant(a) for a in expression.args))
     elif isinstance(expression, sp.Piecewise):
         value = constant(next(e for e, c in expression.args if c == True or sp.simplify(c) == True))  # noqa: E712
     else:
@@ -311,6 +289,12 @@ def constant(expression: sp.Expr) -> float:
     if not math.isfinite(value):
         raise _Unfit("the number is not finite: too large for a double")
     return value
+
+
+def _number_of(head: Any) -> Callable[..., float] | None:
+    """Function of doubles that a class of sympy stands for."""
+    function = function_of(head)
+    return _ARITHMETIC.get(head) if function is None else function.number
 
 
 def checked(expression: sp.Expr) -> sp.Expr:

@@ -10,21 +10,13 @@ import sympy as sp
 from sympy.logic.boolalg import And, Not, Or
 
 from hvdc_ident.errors import ExpressionError
-from hvdc_ident.expression.functions import clip
-from hvdc_ident.expression.grammar import IDENTIFIER, RESERVED
+from hvdc_ident.expression.functions import function_of
+from hvdc_ident.expression.grammar import IDENTIFIER, is_reserved
 from hvdc_ident.expression.normal import EXACT
 
 SUM, PRODUCT, POWER, ATOM = range(4)
 """How tightly a text holds together: what binds looser than its surroundings is put in parentheses."""
 
-_FUNCTIONS: dict[Any, str] = {
-    **{f: f.__name__ for f in (sp.sign, sp.exp, sp.log, sp.sin, sp.cos, sp.tan, sp.tanh, sp.asin, sp.acos, sp.atan)},
-    sp.atan2: "atan2",
-    sp.Abs: "abs",
-    sp.Max: "max",
-    sp.Min: "min",
-    clip: "clip",
-}
 _RELATIONS = {sp.Lt: "<", sp.Le: "<=", sp.Gt: ">", sp.Ge: ">=", sp.Eq: "==", sp.Ne: "!="}
 
 Text = tuple[str, int]
@@ -57,8 +49,8 @@ def _text(e: Any) -> Text:
         return "pi", ATOM
     if e is sp.E:
         return "exp(1)", ATOM
-    if e.func in _FUNCTIONS:
-        return _call(_FUNCTIONS[e.func], e.args)
+    if function := function_of(e.func):
+        return _call(function.name, e.args)
     kind_name = getattr(e.func, "__name__", str(e.func)) if e.args else str(e)
     raise ExpressionError(
         f"model cards have no word for '{kind_name}'", hint="write it with the functions of the grammar"
@@ -71,7 +63,7 @@ def _inside(e: Any, at_least: int) -> str:
 
 
 def _name(name: str) -> str:
-    if IDENTIFIER.fullmatch(name) is None or (name in RESERVED and name != "time"):
+    if IDENTIFIER.fullmatch(name) is None or (is_reserved(name) and name != "time"):
         raise ExpressionError(
             f"the symbol {name!r} cannot be written", expected="letters, digits and _, no function's name"
         )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import ModelError
+from hvdc_ident.expression.functions import FUNCTIONS
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.model.definition import Model
@@ -43,7 +44,8 @@ def _node(graph: Graph, n: int, values: dict[int, Any], leaves: Mapping[int, Any
                 if k not in values:
                     values[k] = _node(graph, k, values, leaves)
         return np.real(values[source]) < 0.0
-    return _OPERATIONS[op](*(values[k] for k in a))
+    operation = _OPERATIONS[op] if op in _OPERATIONS else _complex(FUNCTIONS[op].array)
+    return operation(*(values[k] for k in a))
 
 
 def _cut_root(x: Any) -> Any:
@@ -61,7 +63,7 @@ def _atan2(y: Any, x: Any) -> Any:
 
 
 def _complex(function: Any) -> Any:
-    return lambda x: function(np.asarray(x, dtype=complex))
+    return lambda *x: function(*(np.asarray(v, dtype=complex) for v in x))
 
 
 _OPERATIONS: dict[str, Any] = {
@@ -73,21 +75,11 @@ _OPERATIONS: dict[str, Any] = {
     "pow": _power,
     "atan2": _atan2,
     "inverse": lambda x: np.where(np.real(x) == 0.0, 0.0, 1.0 / np.where(np.real(x) == 0.0, 1.0, x)),
-    "sqrt": _complex(np.sqrt),
     "sqrt0": _cut_root,
     "select": lambda c, x, y: np.where(c, x, y),
     "and": np.logical_and,
     "or": np.logical_or,
     "not": np.logical_not,
-    "exp": _complex(np.exp),
-    "log": _complex(np.log),
-    "sin": _complex(np.sin),
-    "cos": _complex(np.cos),
-    "tan": _complex(np.tan),
-    "tanh": _complex(np.tanh),
-    "asin": _complex(np.arcsin),
-    "acos": _complex(np.arccos),
-    "atan": _complex(np.arctan),
 }
 
 

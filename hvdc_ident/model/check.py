@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import sympy as sp
 
 from hvdc_ident.errors import ModelError, UnknownNameError, unknown_name
-from hvdc_ident.expression.grammar import ARITY, RESERVED, is_identifier
+from hvdc_ident.expression.functions import FUNCTIONS
+from hvdc_ident.expression.grammar import is_identifier, is_reserved
 from hvdc_ident.model.coerce import SECTIONS, coerced
 
 if TYPE_CHECKING:
@@ -67,8 +68,8 @@ def _check_name(name: object, place: str) -> None:
         raise ModelError(
             f"{name!r} cannot name a variable", where=place, expected="letters, digits and _, no digit first"
         )
-    if name in RESERVED:
-        what = "function" if name in ARITY else "constant" if name == "pi" else "clock"
+    if is_reserved(name):
+        what = "function" if name in FUNCTIONS else "constant" if name == "pi" else "clock"
         raise ModelError(f"the name '{name}' is the {what} of expressions", where=place, expected="another name")
 
 

@@ -13,16 +13,9 @@ from collections.abc import Container, Iterable, Mapping
 import sympy as sp
 
 from hvdc_ident.errors import ModelError
+from hvdc_ident.expression.functions import FUNCTIONS, elementary
 
 Key = tuple
-_UNARY = {
-    sp.exp: "exp", sp.log: "log", sp.sin: "sin", sp.cos: "cos", sp.tan: "tan", sp.tanh: "tanh",
-    sp.asin: "asin", sp.acos: "acos", sp.atan: "atan",
-}  # fmt: skip
-_FOLD = {
-    "exp": math.exp, "log": math.log, "sin": math.sin, "cos": math.cos, "tan": math.tan, "tanh": math.tanh,
-    "asin": math.asin, "acos": math.acos, "atan": math.atan, "sqrt": math.sqrt,
-}  # fmt: skip
 
 
 class Graph:
@@ -157,9 +150,9 @@ class Graph:
 
     def call(self, name: str, *arguments: int) -> int:
         values = [self.value(a) for a in arguments]
-        if len(values) == 1 and values[0] is not None and name in _FOLD:
+        if len(values) == 1 and values[0] is not None and name in FUNCTIONS:
             try:
-                return self.constant(_FOLD[name](values[0]))
+                return self.constant(FUNCTIONS[name].number(values[0]))
             except (ValueError, OverflowError):
                 return self.constant(math.nan)
         if name == "sqrt" and self._cut_at_zero(arguments[0]):
@@ -229,10 +222,8 @@ class Graph:
         if e.is_Pow:
             return self.call("exp", sub(e.exp)) if e.base is sp.E else self.power(sub(e.base), sub(e.exp))
         kind = e.func
-        if kind in _UNARY:
-            return self.call(_UNARY[kind], sub(e.args[0]))
-        if kind is sp.atan2:
-            return self.call("atan2", *map(sub, e.args))
+        if function := elementary(kind):
+            return self.call(function.name, *map(sub, e.args))
         if kind is sp.Abs:
             x = sub(e.args[0])
             return self.select(self.negative(x), self.neg(x), x)
@@ -363,7 +354,7 @@ class Graph:
     def _slopes(self, n: int, op: str, a: list[int]) -> list[tuple[int, int]]:
         """(argument, derivative of n with respect to it) pairs."""
         x = a[0]
-        square = self.mul(x, x)
+        self.mul(x, x)  # before anything else: operands stand in the order in which nodes are made
         if op == "mul":
             return [(a[0], a[1]), (a[1], a[0])]
         if op == "div":
@@ -375,26 +366,11 @@ class Graph:
                 return [(x, slope)]
             # x^a log(x) is 0 at x = 0, not 0 times infinity: the least normal number is lost in any x that is not 0.
             return [(x, slope), (a[1], self.mul(n, self.call("log", self.add(x, self.constant(sys.float_info.min)))))]
-        if op in ("sqrt", "sqrt0"):
-            # sqrt(max(0, x)) is flat where its argument is cut at 0: the slope there must be 0, not 0 times infinity.
-            return [(x, self.mul(self.constant(0.5), self.call("inverse", n)))]
         if op == "inverse":
             return [(x, self.neg(self.mul(n, n)))]
-        if op == "atan2":
-            y, r2 = a[1], self.add(square, self.mul(a[1], a[1]))
-            return [(x, self.div(y, r2)), (y, self.neg(self.div(x, r2)))]
-        slope = {
-            "exp": lambda: n,
-            "log": lambda: self.div(self.one, x),
-            "sin": lambda: self.call("cos", x),
-            "cos": lambda: self.neg(self.call("sin", x)),
-            "tan": lambda: self.add(self.one, self.mul(n, n)),
-            "tanh": lambda: self.sub(self.one, self.mul(n, n)),
-            "asin": lambda: self.div(self.one, self.call("sqrt", self.sub(self.one, square))),
-            "acos": lambda: self.neg(self.div(self.one, self.call("sqrt", self.sub(self.one, square)))),
-            "atan": lambda: self.div(self.one, self.add(self.one, square)),
-        }[op]()
-        return [(x, slope)]
+        slopes = FUNCTIONS["sqrt" if op == "sqrt0" else op].slopes
+        assert slopes is not None
+        return list(zip(a, slopes(self, n, *a), strict=True))
 
     def evaluate(self, roots: Iterable[int], leaves: Mapping[int, float]) -> list[float]:
         """The roots' values for given leaf values, in Python numbers, conditions by comparison: slow, for checks."""
@@ -423,11 +399,11 @@ def _evaluate(graph: Graph, n: int, values: dict[int, float], leaves: Mapping[in
     x = [values[k] for k in a]
     if op == "select":
         return x[1] if x[0] else x[2]
-    if op in _FOLD:
-        return _FOLD[op](x[0])
+    if op in FUNCTIONS:
+        return FUNCTIONS[op].number(*x)
     return {
         "add": lambda: x[0] + x[1], "sub": lambda: x[0] - x[1], "mul": lambda: x[0] * x[1], "div": lambda: x[0] / x[1],
         "neg": lambda: -x[0], "inverse": lambda: 1.0 / x[0] if x[0] else 0.0, "sqrt0": lambda: math.sqrt(max(x[0], 0.0)),
-        "pow": lambda: x[0] ** x[1], "atan2": lambda: math.atan2(x[0], x[1]),
+        "pow": lambda: x[0] ** x[1],
         "and": lambda: x[0] and x[1], "or": lambda: x[0] or x[1], "not": lambda: not x[0],
     }[op]()  # fmt: skip

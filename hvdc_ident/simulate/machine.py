@@ -16,13 +16,12 @@ from dataclasses import dataclass, field
 import llvmlite.binding as llvm
 import numpy as np
 
+from hvdc_ident.expression.functions import FUNCTIONS
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.objects import compiled, kept, loaded
 from hvdc_ident.trajectory import Array
 
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
-_LIBM = ("tan", "tanh", "asin", "acos", "atan", "atan2")
-_INTRINSIC = ("sqrt", "exp", "log", "sin", "cos", "fabs")
 LANES = 4  # instants that a function over several of them takes at once
 BLOCK = 300  # instructions of a block of a long function
 LONG = 4000  # instructions; a shorter function is one block
@@ -92,10 +91,18 @@ def _engine(text: str, hot: bool) -> llvm.ExecutionEngine:
 
 
 def _declarations() -> list[str]:
-    lines = [f"declare double @llvm.{f}.f64(double)" for f in _INTRINSIC]
-    lines += ["declare double @llvm.pow.f64(double, double)", "declare double @atan2(double, double)"]
+    lines = ["declare double @llvm.fabs.f64(double)", "declare double @llvm.pow.f64(double, double)"]
     lines += [f"declare <{LANES} x double> @llvm.sqrt.v{LANES}f64(<{LANES} x double>)"]
-    return lines + [f"declare double @{f}(double)" for f in _LIBM if f != "atan2"]
+    for function in FUNCTIONS.values():
+        if function.slopes is not None:
+            arguments = ", ".join(["double"] * function.arity[0])
+            lines.append(f"declare double @{_linked(function.name)}({arguments})")
+    return lines
+
+
+def _linked(op: str) -> str:
+    """Name that an operation of the graph has for the linker: an instruction of LLVM, or a function of the C library."""
+    return f"llvm.{op}.f64" if op in ("pow", "fabs") or FUNCTIONS[op].intrinsic else op
 
 
 def body(lines: Sequence[str]) -> str:
@@ -211,8 +218,7 @@ class _Emitter:
         return self._emit(f"load double, ptr {self._pointer(argument, index)}, align 8")
 
     def _function(self, op: str, x: list[str]) -> str:
-        name = f"llvm.{op}.f64" if op in _INTRINSIC or op == "pow" else op
-        return self._emit(f"call double @{name}(" + ", ".join(f"double {v}" for v in x) + ")")
+        return self._emit(f"call double @{_linked(op)}(" + ", ".join(f"double {v}" for v in x) + ")")
 
     def _instruction(self, n: int) -> str:
         op, *a = self.graph.nodes[n]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hvdc_ident.discrepancy.signatures.march import hold, march
 from hvdc_ident.effects import Effect, EffectUse, alone
 from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression.functions import FUNCTIONS, symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.check import ordered_signals
 from hvdc_ident.model.definition import Model
@@ -30,9 +30,7 @@ FINE = 2.5e-4
 PARTS = 8
 """The most that it takes where nothing else is said."""
 _NUMPY: dict[str, Any] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "sqrt": np.sqrt,
-    "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "asin": np.arcsin,
-    "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2, "pow": np.power, "not": np.logical_not,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "pow": np.power, "not": np.logical_not,
     "and": np.logical_and, "or": np.logical_or, "select": np.where,
     "sqrt0": lambda x: np.sqrt(np.maximum(x, 0.0)),
     "inverse": lambda x: np.where(x == 0.0, 0.0, 1.0 / np.where(x == 0.0, 1.0, x)),
@@ -106,7 +104,8 @@ class Block:
             elif op == "switch":
                 known[n] = known[g.switches[a[0]]] < 0.0
             else:
-                known[n] = _NUMPY[op](*(known[k] for k in a))
+                operation: Any = _NUMPY[op] if op in _NUMPY else FUNCTIONS[op].array
+                known[n] = operation(*(known[k] for k in a))
         return [known[n] for n in nodes]
 
     def run(

@@ -9,7 +9,7 @@ import sympy as sp
 from sympy.logic.boolalg import And, Not, Or
 
 from hvdc_ident.errors import ExpressionError
-from hvdc_ident.expression.functions import clip
+from hvdc_ident.expression.functions import clip, elementary
 
 KEYWORDS = frozenset(
     """algorithm and annotation assert block break class connect connector constant constrainedby der discrete each else
@@ -20,18 +20,6 @@ KEYWORDS = frozenset(
     homotopy delay cardinality terminal smooth noEvent sample pre edge change reinit time max min sum product Real Integer
     Boolean String""".split()  # noqa: SIM905 - one list of words, read as such
 )
-_CALLS: dict[Any, str] = {
-    sp.exp: "exp",
-    sp.log: "log",
-    sp.sin: "sin",
-    sp.cos: "cos",
-    sp.tan: "tan",
-    sp.tanh: "tanh",
-    sp.asin: "asin",
-    sp.acos: "acos",
-    sp.atan: "atan",
-    sp.atan2: "atan2",
-}
 
 
 def identifier(name: str) -> str:
@@ -61,8 +49,8 @@ class Printer:
             return self._product(e)
         if isinstance(e, sp.Pow):
             return self._power(e)
-        if e.func in _CALLS:
-            return f"{_CALLS[e.func]}({', '.join(map(self, e.args))})"
+        if function := elementary(e.func):
+            return f"{function.name}({', '.join(map(self, e.args))})"
         return self._choice(e)
 
     def _product(self, e: Any) -> str:

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import InputError, SteadyStateError, unknown_name
+from hvdc_ident.expression.functions import FUNCTIONS
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.rank.prime_field import Array, NotRational
 from hvdc_ident.simulate.engine import engine
@@ -237,13 +238,10 @@ class _Branches:
             return getattr(g, op)(*x)
         if op == "pow":
             return g.call("exp", g.mul(x[1], g.call("log", x[0])))
-        if op == "asin":
-            return g.call("atan", g.div(x[0], g.call("sqrt", g.sub(g.one, g.mul(x[0], x[0])))))
-        if op == "acos":
-            quarter = g.constant(math.pi / 2)
-            return g.sub(quarter, g.call("atan", g.div(x[0], g.call("sqrt", g.sub(g.one, g.mul(x[0], x[0]))))))
         if op == "atan2":
             return g.add(g.call("atan", g.div(*x)), g.constant(self._turns(*a)))
+        if op in FUNCTIONS and (series := FUNCTIONS[op].series) is not None:
+            return series(g, x[0])
         return g.call("sqrt" if op == "sqrt0" else op, *x)
 
     def _turns(self, y: int, x: int) -> float:

@@ -1,0 +1,82 @@
+"""One table of functions: an entry reaches the parser, the printer, machine code with derivatives, and every export."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import hvdc_ident as hi
+from hvdc_ident.expression import functions, parse, symbol, to_text
+from hvdc_ident.expression.functions import FUNCTIONS, GrammarFunction
+from hvdc_ident.fmu.export.modelica_text import Printer
+from hvdc_ident.linearize.system import evaluate
+from hvdc_ident.simulate.graph import Graph
+
+ELEMENTARY = [f for f in FUNCTIONS.values() if f.slopes is not None]
+AT = (0.37, 0.81)
+
+
+@pytest.mark.parametrize("function", ELEMENTARY, ids=lambda f: f.name)
+def test_slopes_are_the_derivatives_that_sympy_takes(function: GrammarFunction) -> None:
+    graph, names = Graph(), [symbol("a"), symbol("b")][: function.arity[0]]
+    leaves = [graph.leaf("y", k) for k in range(len(names))]
+    expression = parse(f"{function.name}({', '.join(map(str, names))})")
+    node = graph.expression(expression, dict(zip(map(str, names), leaves, strict=True)), {})
+    gradient = graph.gradient(node)
+    point = dict(zip(leaves, AT, strict=False))
+    for name, leaf in zip(names, leaves, strict=True):
+        expected = float(sp.diff(expression, name).evalf(30, subs=dict(zip(names, AT, strict=False))))
+        assert graph.evaluate([gradient[leaf]], point)[0] == pytest.approx(expected, rel=1e-14)
+        [slope] = evaluate(graph, [gradient[leaf]], {n: np.array([v]) for n, v in point.items()}, 1)
+        assert slope[0] == pytest.approx(expected, rel=1e-14)
+
+
+@pytest.mark.parametrize("function", [f for f in ELEMENTARY if f.series], ids=lambda f: f.name)
+def test_the_form_with_taylor_series_has_the_value_of_the_function(function: GrammarFunction) -> None:
+    graph = Graph()
+    x = graph.leaf("y", 0)
+    assert function.series is not None
+    [value] = graph.evaluate([function.series(graph, x)], {x: AT[0]})
+    assert value == pytest.approx(function.number(AT[0]), rel=1e-14)
+
+
+def test_a_new_function_is_one_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sinh = GrammarFunction(
+        "sinh",
+        sp.sinh,
+        math.sinh,
+        array=np.sinh,
+        slopes=lambda g, n, x: (g.call("sqrt", g.add(g.one, g.mul(n, n))),),
+        series=lambda g, x: g.div(g.sub(g.call("exp", x), g.call("exp", g.neg(x))), g.constant(2.0)),
+    )
+    monkeypatch.setitem(functions.FUNCTIONS, "sinh", sinh)  # type: ignore[arg-type]
+    assert to_text(parse("2*sinh(x)")) == "2*sinh(x)"
+    assert Printer(lambda: "h")(parse("sinh(x)")) == "sinh(x)"
+    model = hi.load_model(_card(tmp_path))
+    result = hi.simulate(model, hi.Experiment(np.linspace(0.0, 1.0, 11)))
+    # dx/dt = -sinh x has the solution tanh(x/2) = tanh(x0/2) exp(-t)
+    expected = 2 * math.atanh(math.tanh(0.5) * math.exp(-1.0))
+    assert result["x"][-1] == pytest.approx(expected, rel=1e-5)
+    linear = hi.linearize(model)
+    assert linear.A[0, 0] == pytest.approx(-1.0, rel=1e-9)
+
+
+def _card(folder: Path) -> Path:
+    path = folder / "sinh.toml"
+    path.write_text(
+        """schema = 1
+name = "sinh"
+[inputs]
+u = {value = 0.0}
+[states]
+x = {derivative = "u - sinh(x)", start = 1.0}
+[outputs]
+x = "x"
+""",
+        encoding="utf-8",
+    )
+    return path
