@@ -2,25 +2,27 @@
 
 The effects are those of the catalogue, put on a model that passes signals through, and run by the engine. What passes
 between it and the FMU are signals joined by lines: inputs on a grid refined until lines hold to 1e-5 of their range,
-outputs on at least FINE rows. An effect at an input that looks at an output would close a loop around the FMU: it is
-refused.
+outputs on the experiment's rows, or on at least FINE where an effect remembers what was between them. An effect at an
+input that looks at an output would close a loop around the FMU: it is refused.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fmu.grid import joined, kept_rows, refined, signal_of
 from hvdc_ident.fmu.passage import ALONG, added, entrance, exit_
-from hvdc_ident.fmu.run import bare, inputs_of
+from hvdc_ident.fmu.run import Direction, bare, changed, inputs_of
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.engine import simulate as engine_run
@@ -33,9 +35,11 @@ if TYPE_CHECKING:
 
 FINE = 4000
 """Rows, at least, on which outputs are taken where an effect filters them."""
-NUDGE = 1e-3
-"""Size of the change, in ranges of the signal, by which derivatives enter the FMU."""
+KEPT = 12
+"""Runs of an FMU that are kept: refits of what sits at its outputs ask for the same ones many times over."""
 
+JUMP = 2.0
+"""How many times as large as on the other side a change is where a jump is in it, at a row that one passes over."""
 BRIEF = 0.02
 """Share of the run that the largest value of a slope would have to last for as much as the slope comes to in all."""
 
@@ -93,25 +97,34 @@ class _Ends:
     ) -> None:
         self.model, self.experiment, self.tolerance, self.names = model, experiment, tolerance, names
         self.given = dict(given)
+        self.plain = inputs_of(model, experiment, self.given)
         self.values = {n: float(given.get(n, p.value)) for n, p in model.parameters.items()}
         self.entrance, self.exit = entrance(model), exit_(model)
         self.enters, self.leaves = bool(self.entrance.parameters), bool(self.exit.parameters)
         breaks = [b for s in experiment.inputs.values() for b in s.breaks.tolist()]
         self.breaks = np.unique(np.array(breaks))
-        self.time = joined(experiment.time, self.breaks, FINE) if self.leaves else experiment.time
+        remembers = bool(self.exit.states or self.exit.delays or self.exit.sampled)
+        self.time = joined(experiment.time, self.breaks, FINE) if remembers else experiment.time
         self.raw = tuple(model.outputs) if self.leaves else names
 
     def simulation(self, sensitivities: tuple[str, ...]) -> Simulation:
-        own = tuple(n for n in sensitivities if n in self.model.fmu.parameters)
-        at_entrance = [n for n in sensitivities if n in self.entrance.parameters]
-        inputs, slopes = self._inputs(tuple(at_entrance))
-        inside = self._inside(inputs, own)
-        raw = inside.trajectory.values
-        gradients = {n: inside.gradients[:, :, k] for k, n in enumerate(own)}
+        fixed = () if self.enters else tuple(self.model.inputs)
+        own = tuple(n for n in sensitivities if n in self.model.fmu.parameters or n in fixed)
+        at_entrance = tuple(
+            n for n in sensitivities if n in self.entrance.parameters or (n in self.model.inputs and n not in own)
+        )
+        inputs, slopes = self._inputs(at_entrance)
+        # A parameter may move a jump, as a delay does, or an edge: no slope says that. A constant of an input moves none.
         jumps = any(np.setdiff1d(s.breaks, self.breaks).size for s in inputs.values())
-        for n in at_entrance:  # a parameter may move a jump, as a delay does, or an edge: no slope says that
-            moves = jumps or any(_brief(s) for s in slopes[n].values())
-            gradients[n] = self._moving(n) if moves else self._entering(inputs, slopes[n])
+        edges = [n for n in at_entrance if n in self.entrance.parameters and (jumps or _brief(slopes[n].values()))]
+        ways = {n: _direction(inputs, slopes[n]) for n in at_entrance if n not in edges}
+        inside = self._inside(inputs, own, {n: d for n, (d, size) in ways.items() if size > 0.0})
+        raw = inside.trajectory.values
+        gradients = {n: inside.gradients[:, :, k] for k, n in enumerate(inside.parameters)}
+        for n, (_, size) in ways.items():
+            gradients[n] = gradients[n] * size if size > 0.0 else np.zeros(raw.shape)
+        for n in edges:
+            gradients[n] = self._moving(n, inputs, raw)
         values, found = self._leave(raw, gradients, sensitivities)
         shape = (self.experiment.time.size, len(self.names), len(sensitivities))
         table = np.empty(shape)
@@ -135,16 +148,16 @@ class _Ends:
 
         values: of all parameters, where they are not this run's.
         """
-        model, e = self.model, self.experiment
-        plain = inputs_of(model, e, self.given)
+        model, e, plain = self.model, self.experiment, self.plain
         if not self.enters:
             return plain, {}
+        asked = tuple(f"u{list(plain).index(n)}" if n in plain else n for n in sensitivities)
         given = {f"u{k}": s for k, s in enumerate(plain.values())}
         chosen = {n: (values or self.values)[n] for n in self.entrance.parameters}
 
         def run(time: Array) -> Simulation:
             passing = Experiment(time, "entrance", inputs=FrozenMap(given))
-            return engine_run(self.entrance, passing, chosen, sensitivities, tolerance=self.tolerance)
+            return engine_run(self.entrance, passing, chosen, asked, tolerance=self.tolerance)
 
         grid = refined(lambda time: run(time).trajectory.values, e.time, self.breaks)
         found = run(grid)
@@ -156,33 +169,65 @@ class _Ends:
                 slopes[n][name] = InputSignal(inputs[name].times, column[kept_rows(grid, found[f"y{k}"])], np.empty(0))
         return inputs, slopes
 
-    def _inside(self, inputs: Mapping[str, InputSignal], sensitivities: tuple[str, ...]) -> Simulation:
-        inner = Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs))
-        return bare(self.model, inner, self.given, sensitivities, self.raw, self.tolerance)
+    def _inside(
+        self,
+        inputs: Mapping[str, InputSignal],
+        sensitivities: tuple[str, ...] = (),
+        directions: Mapping[str, Direction] | None = None,
+    ) -> Simulation:
+        """The run of the FMU on what enters it, with derivatives by its parameters and along directions of its inputs.
 
-    def _moving(self, name: str) -> Array:
-        """(n, raw) the derivative by a parameter of the entrance, from runs with it a hundredth of its size apart."""
+        The last KEPT are had without running it again.
+        """
+        along = directions or {}
+        inner = Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs))
+        kept: dict[bytes, Simulation] = self.model.host.kept
+        key = self._key(inputs, along)
+        found = kept.pop(key, None)
+        names = (*sensitivities, *along)
+        if found is None or not set(names) <= set(found.parameters):
+            found = bare(
+                self.model, inner, self.given, sensitivities, self.raw, self.tolerance,
+                kin=_digest(self.plain), directions=along,
+            )  # fmt: skip
+        kept[key] = found
+        while len(kept) > KEPT:
+            del kept[next(iter(kept))]
+        columns = [found.parameters.index(n) for n in names]
+        return replace(found, parameters=names, gradients=found.gradients[:, :, columns])
+
+    def _key(self, inputs: Mapping[str, InputSignal], along: Mapping[str, Direction]) -> bytes:
+        """What decides a run, and in which ways its inputs move."""
+        values = sorted(changed(self.model, self.given).items())
+        text = repr((values, self.raw, self.tolerance.rtol, _digest(inputs), sorted(along))).encode()
+        return b"".join([self.time.tobytes(), text, *(along[n].points.tobytes() for n in sorted(along))])
+
+    def _moving(self, name: str, inputs: Mapping[str, InputSignal], raw: Array) -> Array:
+        """(n, raw) the derivative by a parameter of the entrance, from runs with it a hundredth of its size apart.
+
+        An output that jumps with an input shows the jump, not a derivative, at a row over which it passes between two of
+        the runs: there, the difference is that of the side on which none passes.
+        """
         parameter = self.model.parameters[name]
         h = 0.01 * parameter.size
-        low, high = max(self.values[name] - h, parameter.min), min(self.values[name] + h, parameter.max)
-        ends = []
+        at = self.values[name]
+        low, high = max(at - h, parameter.min), min(at + h, parameter.max)
+        runs, passed = {}, {}
         for value in (low, high):
-            inputs, _ = self._inputs((), {**self.values, name: value})
-            ends.append(self._inside(inputs, ()).trajectory.values)
-        return np.asarray((ends[1] - ends[0]) / (high - low))
-
-    def _entering(self, inputs: Mapping[str, InputSignal], slope: Mapping[str, InputSignal]) -> Array:
-        """(n, raw) change of what comes out of the FMU as its inputs move along the slopes."""
-        ranges = [(max(np.ptp(s.values), 1e-6 * np.abs(s.values).max(), 1e-12), slope[n]) for n, s in inputs.items()]
-        sizes = [np.abs(m.values).max() / r for r, m in ranges]
-        if max(sizes, default=0.0) == 0.0:
-            return np.zeros((self.time.size, len(self.raw)))
-        step = NUDGE / max(sizes)
-        ends = []
-        for sign in (step, -step):
-            moved = {n: _moved(s, slope[n], sign) for n, s in inputs.items()}
-            ends.append(self._inside(moved, ()).trajectory.values)
-        return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+            moved, _ = self._inputs((), {**self.values, name: value})
+            runs[value] = self._inside(moved).trajectory.values
+            passed[value] = _passed_over(self.time, inputs, moved)
+        found = np.asarray((runs[high] - runs[low]) / (high - low))
+        for side, other in ((low, high), (high, low)):
+            if side == at:
+                continue
+            own, over = runs[side] - raw, runs[other] - raw
+            # Without a jump the changes on the two sides differ by the bend alone; one no larger than elsewhere does no harm.
+            elsewhere = np.abs(over)[~passed[other]].max(axis=0, initial=0.0)
+            jumped = np.abs(over) > np.maximum(JUMP * np.abs(own), elsewhere)
+            rows = (passed[other] & ~passed[side])[:, None] & jumped
+            found[rows] = own[rows] / (side - at)
+        return found
 
     # --- out ---
 
@@ -226,13 +271,36 @@ class _Ends:
         return self._passed(raw, (ALONG,), slope).gradients[:, :, 0]
 
 
-def _brief(slope: InputSignal) -> bool:
-    """Return whether a slope is a few spikes: small enough to be a slope, they are lost in the tolerance of the FMU's run."""
+def _direction(inputs: Mapping[str, InputSignal], slope: Mapping[str, InputSignal]) -> tuple[Direction, float]:
+    """Return the direction of a slope, and the slope's size in it: 0 where nothing moves."""
+    ranges = {n: max(np.ptp(s.values), 1e-6 * np.abs(s.values).max(), 1e-12) for n, s in inputs.items()}
+    sizes = {n: float(np.abs(slope[n].values).max()) / r for n, r in ranges.items()}
+    size = max(sizes.values(), default=0.0)
+    points = np.concatenate([slope[n].values for n in inputs]) / (size or 1.0)
+    return Direction(points, "along " + ", ".join(n for n, s in sizes.items() if s > 0.0)), size
+
+
+def _digest(inputs: Mapping[str, InputSignal]) -> str:
+    parts = [a.tobytes() + b"|" for s in inputs.values() for a in (s.times, s.values, s.breaks)]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+
+
+def _passed_over(time: Array, inputs: Mapping[str, InputSignal], moved: Mapping[str, InputSignal]) -> NDArray[np.bool_]:
+    """Return which rows, (n,), a jump of the inputs passes over as it moves; a row at a jump is after it."""
+    found = np.zeros(time.size, dtype=bool)
+    for before, after in zip(inputs.values(), moved.values(), strict=True):
+        for a, b in zip(before.breaks.tolist(), after.breaks.tolist(), strict=False):
+            found |= (time >= min(a, b)) & (time < max(a, b))
+    return found
+
+
+def _brief(slopes: Iterable[InputSignal]) -> bool:
+    """Return whether one of the slopes is a few spikes: small enough to be a slope, they are lost in a run's tolerance."""
+    return any(_spiked(s) for s in slopes)
+
+
+def _spiked(slope: InputSignal) -> bool:
+    """Return whether a slope's largest value lasts for a small share of the time."""
     size = np.abs(slope.values)
     span = float(slope.times[-1] - slope.times[0])
     return bool(span > 0 and np.trapezoid(size, slope.times) < BRIEF * span * size.max())
-
-
-def _moved(signal: InputSignal, slope: InputSignal, by: float) -> InputSignal:
-    """The signal moved along another on the same instants."""
-    return InputSignal(signal.times, signal.values + by * slope.values, signal.breaks)

@@ -214,6 +214,7 @@ class Host:
         self._busy = 1  # workers of the last request
         self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.jobs`
         self._base: tuple[bytes, Array] | None = None  # the last run, and its outputs
+        self.kept: dict[bytes, Any] = {}  # runs that whoever asks keeps, see `hvdc_ident.fmu.ends`
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
@@ -267,7 +268,8 @@ class Host:
         if heading["do"] != "simulate" or len(names) < 2 or "restart" not in self.learned:
             return []
         d, confirmed = self.description, self.learned.get("derivatives", {})
-        if d.directional and d.states and any(confirmed.get(n, True) for n in names):
+        directions = heading.get("directions", {})
+        if d.directional and d.states and any(confirmed.get(n, n not in directions) for n in names):
             return []
         count = min(self.limits.workers or idle_cores(self._busy), len(names))
         return [names[i::count] for i in range(count)]

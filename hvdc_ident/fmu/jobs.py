@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, replace
 from itertools import islice
 from typing import Any
 
@@ -144,8 +144,15 @@ class _Simulation:
         self.time = arrays["time"]
         self.signals = Signals(arrays["sizes"], arrays["times"], arrays["points"], arrays["breaks"])
         self.inputs = list(self.description.inputs)
+        # Constants of the inputs' directions: parameters 0, of size 1, that move all inputs along a line of points.
+        self.directions: dict[str, str] = heading.get("directions", {})
+        self.along = dict(zip(self.directions, arrays.get("directions", np.empty((0, 0))), strict=True))
+        asked = repr((self.names, self.tolerance)).encode()
         key = b"".join(arrays[n].tobytes() for n in ("time", "times", "points"))
-        self.key = hashlib.sha256(key + repr((self.names, self.tolerance)).encode()).digest()
+        self.key = hashlib.sha256(key + asked).digest()
+        # Noise and steps are those of one experiment, whatever its inputs go through before they enter.
+        kin = str(heading.get("kin", "")).encode()
+        self.kin = hashlib.sha256(arrays["time"].tobytes() + kin + asked).digest() if kin else self.key
         self.partial = bool(heading.get("partial"))  # whether a run that the FMU ends counts, with its rows
         self.ended: tuple[float, int] | None = None  # when it ended this one, s, and the rows up to there
         self.notes: dict[str, str] = {}
@@ -243,15 +250,18 @@ class _Simulation:
     # --- runs ---
 
     def _now(self, name: str) -> float:
-        """Where a parameter stands; for an input the constant that is added to it, 0."""
-        return 0.0 if name in self.inputs else self.values.get(name, self.starts[name])
+        """Where a parameter stands; for an input, or a direction of inputs, what is added of it, 0."""
+        return 0.0 if name in self.inputs or name in self.along else self.values.get(name, self.starts[name])
 
     def _with(self, moved: Mapping[str, float]) -> tuple[dict[str, float], Signals]:
-        """Values and signals of a run with parameters elsewhere, or constants added to inputs."""
+        """Values and signals of a run with parameters elsewhere, or something added to inputs."""
         signals = self.signals
+        for name in moved.keys() & self.along.keys():
+            signals = replace(signals, values=signals.values + moved[name] * self.along[name])
         for name in moved.keys() & set(self.inputs):
             signals = signals.raised(self.inputs.index(name), moved[name])
-        return {**self.values, **{n: v for n, v in moved.items() if n not in self.inputs}}, signals
+        ours = {n: v for n, v in moved.items() if n not in self.inputs and n not in self.along}
+        return {**self.values, **ours}, signals
 
     def _run(self, values: Mapping[str, float], signals: Signals | None = None) -> Array:
         """(n, outputs) of a run without derivatives, checked to be finite; the last one is kept for whoever asks again."""
@@ -449,7 +459,7 @@ class _Simulation:
         low, high = self.bounds[name]
         at = self._now(name)
         octave = round(float(np.log2(abs(at)))) if at else 0  # a step chosen at half the value is chosen anew
-        key = self.key + f"{name} {octave}".encode()
+        key = self.kin + f"{self.directions.get(name, name)} {octave}".encode()
         step = self.jobs.steps.get(key)
         if step is not None:
             return derivative(self._moving(name), at, step, low, high, outputs), step.error
@@ -460,11 +470,11 @@ class _Simulation:
 
     def _noise(self, outputs: Array) -> Array:
         """(outputs,) noise of a run of this experiment."""
-        found = self.jobs.noise.get(self.key)
+        found = self.jobs.noise.get(self.kin)
         if found is None:
             found = noise_of(self._aside, outputs)
             if len(self.jobs.noise) < KEPT_STEPS:
-                self.jobs.noise[self.key] = found
+                self.jobs.noise[self.kin] = found
         return found
 
     def _aside(self, steps: float) -> Array:

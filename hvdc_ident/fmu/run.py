@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +14,25 @@ from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.result import Simulation, Statistics
-from hvdc_ident.trajectory import Trajectory
+from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
 LARGE = 1e300
 """A bound where there is none: JSON has no infinity."""
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """A way in which the inputs of a run move, of such a size that one of them moves by its range.
+
+    points: of all inputs, one after the other, as `Signals.values`. like: a name shared by directions for which the same
+    step of differences does.
+    """
+
+    points: Array
+    like: str
 
 
 def simulate(
@@ -78,18 +91,32 @@ def bare(
     tolerance: Tolerance,
     *,
     partial: bool = False,
+    kin: str = "",
+    directions: Mapping[str, Direction] | None = None,
 ) -> Simulation:
-    """The run of the FMU itself, without effects. partial: whether the rows up to an end that the FMU asks for do."""
+    """The run of the FMU itself, without effects.
+
+    partial: whether the rows up to an end that the FMU asks for do. kin: text that is the same for runs whose noise, and
+    whose steps of differences, are alike though their inputs differ. directions: ways in which all inputs move, by a name
+    that is no parameter's; derivatives along them come after those of the sensitivities.
+    """
+    along = directions or {}
     signals = Signals.of(list(inputs_of(model, experiment, given).values()))
+    known = about(model, sensitivities)
     heading = {
         "do": "simulate",
         "values": changed(model, given),
         "outputs": names,
-        "parameters": sensitivities,
-        **about(model, sensitivities),
+        "parameters": (*sensitivities, *along),
+        "sizes": [*known["sizes"], *(1.0 for _ in along)],
+        "bounds": [*known["bounds"], *([-LARGE, LARGE] for _ in along)],
+        "starts": [*known["starts"], *(0.0 for _ in along)],
         "tolerance": tolerance.rtol,
         "partial": partial,
+        "kin": kin,
+        "directions": {n: d.like for n, d in along.items()},
     }
+    sensitivities = (*sensitivities, *along)
     arrays = {
         "time": experiment.time,
         "sizes": signals.sizes,
@@ -97,6 +124,8 @@ def bare(
         "points": signals.values,
         "breaks": signals.breaks,
     }
+    if along:
+        arrays["directions"] = np.array([d.points for d in along.values()])
     answer, out = model.host.ask(heading, arrays)
     units = tuple(model.outputs[n].unit for n in names)
     accepted, events, evaluations, segments = answer["counts"]
