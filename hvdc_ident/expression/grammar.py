@@ -1,4 +1,4 @@
-"""The words of the expression language, and text cut into tokens and trees; nothing here knows sympy.
+"""Grammar of the expression language: text cut into tokens, and the syntax tree that Python makes of them.
 
 comparison := sum [("<" | "<=" | ">" | ">=" | "==" | "!=") sum]        only as the condition of where
 sum        := product (("+" | "-") product)*
@@ -10,9 +10,10 @@ primary    := number | name | function "(" comparison ("," comparison)* ")" | "(
 
 from __future__ import annotations
 
+import ast
 import difflib
 import re
-from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import NamedTuple, NoReturn
 
 from hvdc_ident.errors import ExpressionError
@@ -25,6 +26,7 @@ MAX_CALLS = 32
 MAX_COMPARISONS = 1024
 CONSTANTS = ("pi", "time")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
+_OPERATORS = ("+", "-", "*", "/", *COMPARISONS)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 # A quantifier that gives nothing back: no text makes the scan slower than linear.
 _TOKEN = re.compile(
@@ -50,57 +52,6 @@ class Token(NamedTuple):
     kind: str
     text: str
     position: int
-
-
-@dataclass(frozen=True)
-class Number:
-    text: str
-    position: int
-
-
-@dataclass(frozen=True)
-class Name:
-    name: str
-    position: int
-
-
-@dataclass(frozen=True)
-class Negative:
-    value: Node
-    position: int
-
-
-@dataclass(frozen=True)
-class Chain:
-    """Operands of + and -, or of * and /, each with the mark before it."""
-
-    items: tuple[tuple[str, Node], ...]
-    position: int
-
-
-@dataclass(frozen=True)
-class Power:
-    base: Node
-    exponent: Node
-    position: int
-
-
-@dataclass(frozen=True)
-class Call:
-    function: str
-    arguments: tuple[Node, ...]
-    position: int
-
-
-@dataclass(frozen=True)
-class Comparison:
-    relation: str
-    left: Node
-    right: Node
-    position: int
-
-
-Node = Number | Name | Negative | Chain | Power | Call | Comparison
 
 
 class Source:
@@ -159,145 +110,117 @@ def _stray(text: str, at: int) -> str:
     return f"the character {shown} is no part of an expression"
 
 
-class TreeBuilder:
-    """Precedence climbing over the tokens; depth is counted, so no text can exhaust the stack."""
+class SyntaxTree:
+    """Structure of an expression as Python's own parser sees it, with the tokens behind its nodes.
+
+    Python parses nothing but the marks, with the name `_` for every number and name of the text, and only where the
+    grammar allows each: no word of the text reaches it. root: a tree of Name, Call, UnaryOp, BinOp and Compare nodes.
+    """
+
+    def __init__(self, source: Source) -> None:
+        found = tokens(source)
+        if len(found) == 1:
+            raise ExpressionError("the expression is empty", where=source.where)
+        _Scan(source).run(found)
+        marks = [t.text if t.kind == "mark" else "_" for t in found[:-1]]
+        starts = accumulate((len(m) + 1 for m in marks), initial=0)
+        self._begins = dict(zip(starts, found, strict=True))
+        self.root: ast.expr = ast.parse(" ".join(marks), mode="eval").body
+
+    def token(self, node: ast.expr) -> Token:
+        """Token at which a node begins."""
+        return self._begins[node.col_offset]
+
+
+class _Level(NamedTuple):
+    """An open parenthesis: whether a function's arguments stand in it, and the scan's counts before it."""
+
+    call: bool
+    depth: int
+    calls: int
+    compared: bool
+
+
+class _Scan:
+    """One pass over the tokens that refuses each one the grammar has no place for, and counts depth before Python parses.
+
+    depth: parentheses, signs, functions and powers around the next token; calls: functions and powers alone. compared:
+    True where a comparison stands before it in the same argument or parenthesis.
+    """
 
     def __init__(self, source: Source) -> None:
         self.source = source
-        self.tokens = tokens(source)
-        self.next = 0
-        self.depth = 0
-        self.calls = 0
+        self.open: list[_Level] = []
+        self.depth = self.calls = 0
+        self.compared = False
 
-    def tree(self) -> Node:
-        """The tree of the whole text."""
-        if self._peek().kind == "end":
-            raise ExpressionError("the expression is empty", where=self.source.where)
-        root = self._comparison()
-        if self._peek().kind != "end":
-            self._unexpected("an operator or the end")
-        return root
+    def run(self, found: list[Token]) -> None:
+        """Raise an ExpressionError at the first token that cannot stand where it does."""
+        before, value_due = Token("start", "", 0), True
+        for token, following in pairwise((*found, found[-1])):
+            if token.text == "(" and before.kind == "name":
+                self._open(token, call=True)
+                value_due = True
+            elif value_due and not (token.text == ")" and before.text == "(" and self.open[-1].call):
+                value_due = self._begin(token, following)
+            else:
+                value_due = self._continue(token)
+            before = token
 
-    def _peek(self) -> Token:
-        return self.tokens[self.next]
+    def _begin(self, token: Token, following: Token) -> bool:
+        """Take a token where a value begins; True where the value is still to come."""
+        if token.kind == "name":
+            self._check_name(token, called=following.text == "(")
+        elif token.text in ("+", "-"):
+            self._deeper(token)
+        elif token.text == "(":
+            self._open(token, call=False)
+        elif token.kind != "number":
+            self._unexpected(token, "a number, a name or '('")
+        return token.kind == "mark"
 
-    def _take(self) -> Token:
-        token = self.tokens[self.next]
-        self.next += 1
-        return token
+    def _continue(self, token: Token) -> bool:
+        """Take a token where a value has ended; True where another one must follow."""
+        if token.text == "**":
+            self._deeper(token, call=True)
+        elif token.text == ")" and self.open:
+            _, self.depth, self.calls, self.compared = self.open.pop()
+        elif token.text in _OPERATORS or (token.text == "," and self.open and self.open[-1].call):
+            if token.text in COMPARISONS and self.compared:
+                self.source.fail("comparisons cannot be chained; nest two where", token.position)
+            self.compared = token.text in COMPARISONS or (self.compared and token.text != ",")
+            self._leave_signs_and_powers()
+        elif token.kind != "end" or self.open:
+            inside = "',' or ')'" if self.open and self.open[-1].call else "')'"
+            self._unexpected(token, inside if self.open else "an operator or the end")
+        return token.text not in (")", "the end")
 
-    def _accept(self, *marks: str) -> Token | None:
-        token = self._peek()
-        return self._take() if token.kind == "mark" and token.text in marks else None
+    def _open(self, token: Token, call: bool) -> None:
+        self.open.append(_Level(call, self.depth, self.calls, self.compared))
+        self._deeper(token, call)
+        self.compared = False
 
-    def _expect(self, mark: str, expected: str) -> None:
-        if self._accept(mark) is None:
-            self._unexpected(expected)
-
-    def _unexpected(self, expected: str) -> NoReturn:
-        token = self._peek()
-        shown = token.text if token.kind == "end" else f"'{token.text[:30]}'"
-        self.source.fail(f"unexpected {shown}, expected {expected}", token.position)
-
-    def _deeper(self, position: int) -> None:
-        self.depth += 1
+    def _deeper(self, token: Token, call: bool = False) -> None:
+        self.depth, self.calls = self.depth + 1, self.calls + call
         if self.depth > MAX_DEPTH:
-            self.source.fail(f"the expression is nested over {MAX_DEPTH} deep; name parts of it as signals", position)
-
-    def _deeper_call(self, position: int) -> None:
-        self._deeper(position)
-        self.calls += 1
+            what = f"the expression is nested over {MAX_DEPTH} deep; name parts of it as signals"
+            self.source.fail(what, token.position)
         if self.calls > MAX_CALLS:
             what = f"functions and powers are nested over {MAX_CALLS} deep; name parts of it as signals"
-            self.source.fail(what, position)
+            self.source.fail(what, token.position)
 
-    def _leave_call(self) -> None:
-        self.depth -= 1
-        self.calls -= 1
+    def _leave_signs_and_powers(self) -> None:
+        level = self.open[-1] if self.open else _Level(False, -1, 0, False)
+        self.depth, self.calls = level.depth + 1, level.calls + level.call
 
-    def _comparison(self) -> Node:
-        left = self._sum()
-        mark = self._accept(*COMPARISONS)
-        if mark is None:
-            return left
-        right = self._sum()
-        second = self._peek()
-        if second.kind == "mark" and second.text in COMPARISONS:
-            self.source.fail("comparisons cannot be chained; nest two where", second.position)
-        return Comparison(mark.text, left, right, mark.position)
-
-    def _sum(self) -> Node:
-        first = self._product()
-        items = [("+", first)]
-        while mark := self._accept("+", "-"):
-            items.append((mark.text, self._product()))
-        return first if len(items) == 1 else Chain(tuple(items), first.position)
-
-    def _product(self) -> Node:
-        first = self._signed()
-        items = [("*", first)]
-        while mark := self._accept("*", "/"):
-            items.append((mark.text, self._signed()))
-        if len(items) == 1:
-            return first
-        signs = sum(isinstance(node, Negative) for _, node in items)
-        bare = [(mark, node.value if isinstance(node, Negative) else node) for mark, node in items]
-        chain = Chain(tuple(bare), first.position)
-        return Negative(chain, first.position) if signs % 2 else chain
-
-    def _signed(self) -> Node:
-        mark = self._accept("+", "-")
-        if mark is None:
-            return self._power()
-        self._deeper(mark.position)
-        value = self._signed()
-        self.depth -= 1
-        return Negative(value, mark.position) if mark.text == "-" else value
-
-    def _power(self) -> Node:
-        base = self._primary()
-        mark = self._accept("**")
-        if mark is None:
-            return base
-        self._deeper_call(mark.position)
-        exponent = self._signed()
-        self._leave_call()
-        return Power(base, exponent, mark.position)
-
-    def _primary(self) -> Node:
-        token = self._peek()
-        if token.kind == "number":
-            return Number(self._take().text, token.position)
-        if token.kind == "name":
-            self._take()
-            return self._call(token) if self._accept("(") else self._name(token)
-        self._expect("(", "a number, a name or '('")
-        self._deeper(token.position)
-        inside = self._comparison()
-        self._expect(")", "')'")
-        self.depth -= 1
-        return inside
-
-    def _name(self, token: Token) -> Node:
-        if token.text in FUNCTIONS:
-            self.source.fail(f"'{token.text}' is a function and cannot stand alone", token.position)
-        return Name(token.text, token.position)
-
-    def _call(self, token: Token) -> Node:
-        if token.text not in FUNCTIONS:
+    def _check_name(self, token: Token, called: bool) -> None:
+        if called and token.text not in FUNCTIONS:
             near = difflib.get_close_matches(token.text, FUNCTIONS, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(FUNCTIONS)}"
             self.source.fail(f"no function '{token.text[:40]}' ({hint})", token.position)
-        self._deeper_call(token.position)
-        arguments: list[Node] = []
-        if self._accept(")") is None:
-            arguments.append(self._comparison())
-            while self._accept(","):
-                arguments.append(self._comparison())
-            self._expect(")", "',' or ')'")
-        self._leave_call()
-        low, high = FUNCTIONS[token.text].arity
-        if not low <= len(arguments) <= high:
-            counts = f"{low}" if low == high else f"{low} to {high}"
-            self.source.fail(f"'{token.text}' takes {counts} arguments, got {len(arguments)}", token.position)
-        return Call(token.text, tuple(arguments), token.position)
+        if not called and token.text in FUNCTIONS:
+            self.source.fail(f"'{token.text}' is a function and cannot stand alone", token.position)
+
+    def _unexpected(self, token: Token, expected: str) -> NoReturn:
+        shown = token.text if token.kind == "end" else f"'{token.text[:30]}'"
+        self.source.fail(f"unexpected {shown}, expected {expected}", token.position)

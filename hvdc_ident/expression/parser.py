@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import operator
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
 
 import sympy as sp
 
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression.functions import FUNCTIONS, function_of, symbol
-from hvdc_ident.expression.grammar import (
-    MAX_COMPARISONS,
-    Call,
-    Chain,
-    Comparison,
-    Name,
-    Negative,
-    Node,
-    Number,
-    Power,
-    Source,
-    TreeBuilder,
-)
+from hvdc_ident.expression.grammar import MAX_COMPARISONS, Source, SyntaxTree
 from hvdc_ident.expression.normal import EXACT, choose, is_double, normal, to_double
 
 _FREE_BITS = 4096
-_RELATIONS: dict[str, tuple[Any, Callable[[float, float], bool]]] = {
-    "<": (sp.Lt, operator.lt),
-    "<=": (sp.Le, operator.le),
-    ">": (sp.Gt, operator.gt),
-    ">=": (sp.Ge, operator.ge),
-    "==": (sp.Eq, operator.eq),
-    "!=": (sp.Ne, operator.ne),
+_SUMS: Mapping[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-"}
+_PRODUCTS: Mapping[type[ast.operator], str] = {ast.Mult: "*", ast.Div: "/"}
+Relation = tuple[Any, Callable[[float, float], bool]]
+_RELATIONS: Mapping[type[ast.cmpop], Relation] = {
+    ast.Lt: (sp.Lt, operator.lt),
+    ast.LtE: (sp.Le, operator.le),
+    ast.Gt: (sp.Gt, operator.gt),
+    ast.GtE: (sp.Ge, operator.ge),
+    ast.Eq: (sp.Eq, operator.eq),
+    ast.NotEq: (sp.Ne, operator.ne),
 }
 _ARITHMETIC: dict[Any, Callable[..., float]] = {
     sp.Add: lambda *a: math.fsum(a),
@@ -56,12 +48,11 @@ def parse(text: str, *, where: str = "") -> sp.Expr:
     if not isinstance(text, str):
         raise ExpressionError("an expression must be text", where=where, got=type(text).__name__)
     source = Source(text, where)
-    tree = TreeBuilder(source).tree()
     try:
-        return _Builder(source).expression(tree)
+        return _Builder(source, SyntaxTree(source)).expression()
     except RecursionError:
         raise ExpressionError(
-            "the expression is nested too deeply", where=where, hint="name parts of it as signals"
+            "the expression is nested too deeply or too long", where=where, hint="name parts of it as signals"
         ) from None
 
 
@@ -70,96 +61,128 @@ class _Unfit(Exception):
 
 
 class _Builder:
-    """A tree to sympy, with every constant checked before sympy may fold it."""
+    """A syntax tree to sympy, with every constant checked before sympy may fold it."""
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
+    def __init__(self, source: Source, tree: SyntaxTree) -> None:
+        self.source, self.tree = source, tree
         self.comparisons = 0
 
-    def expression(self, root: Node) -> sp.Expr:
-        """The expression of the whole tree."""
-        if isinstance(root, Comparison):
-            self.source.fail("a comparison is no value; use it as where(condition, a, b)", root.position)
+    def expression(self) -> sp.Expr:
+        """Expression of the whole tree."""
+        root = self.tree.root
+        if isinstance(root, ast.Compare):
+            self._fail("a comparison is no value; use it as where(condition, a, b)", root)
         return self._guarded(lambda: finish(self.value(root)), root)
 
-    def value(self, node: Node) -> sp.Expr:
-        """The expression of one node."""
+    def value(self, node: ast.expr) -> sp.Expr:
+        """Expression of one node."""
         match node:
-            case Number():
-                return self._guarded(lambda: literal(node.text), node)
-            case Name("pi"):
-                return sp.pi
-            case Name():
-                return symbol(node.name)
-            case Comparison():
-                self.source.fail("a comparison can only be the condition of where", node.position)
-            case Call("where"):
-                return self._where(node)
-        arguments = [self.value(child) for child in _children(node)]
-        if isinstance(node, Call) and node.function in ("min", "max"):
-            self._count_comparisons(node, arguments)
-        return self._guarded(lambda: checked(_combine(node, arguments)), node)
+            case ast.Name():
+                return self._leaf(node)
+            case ast.UnaryOp(op=ast.UAdd()):
+                return self.value(node.operand)
+            case ast.UnaryOp(op=ast.USub()):
+                return self._negative(self.value(node.operand), node)
+            case ast.BinOp(op=ast.Pow()):
+                base, exponent = self.value(node.left), self.value(node.right)
+                return self._guarded(lambda: checked(power(base, exponent)), node)
+            case ast.BinOp(op=ast.Add() | ast.Sub()):
+                return self._sum(node)
+            case ast.BinOp(op=ast.Mult() | ast.Div()):
+                return self._product(node)
+            case ast.Call():
+                return self._call(node)
+            case ast.Compare():
+                self._fail("a comparison can only be the condition of where", node)
+        raise AssertionError(ast.dump(node))
 
-    def _count_comparisons(self, node: Call, arguments: list[sp.Expr]) -> None:
-        """Nothing; raises where sympy would compare too many pairs of values, which it does slowly."""
+    def _leaf(self, node: ast.Name) -> sp.Expr:
+        token = self.tree.token(node)
+        if token.kind == "number":
+            return self._guarded(lambda: literal(token.text), node)
+        return sp.pi if token.text == "pi" else symbol(token.text)
+
+    def _negative(self, value: sp.Expr, node: ast.expr) -> sp.Expr:
+        return self._guarded(lambda: checked(product([sp.Integer(-1), value])), node)
+
+    def _sum(self, node: ast.BinOp) -> sp.Expr:
+        terms = [(mark, self.value(term)) for mark, term in _chain(node, _SUMS)]
+        return self._guarded(
+            lambda: checked(sp.Add(*(a if mark == "+" else product([sp.Integer(-1), a]) for mark, a in terms))), node
+        )
+
+    def _product(self, node: ast.BinOp) -> sp.Expr:
+        """Product of all factors that stand side by side, with one sign before it for the signs of them all."""
+        marks, factors, negative = [], [], False
+        for mark, factor in _chain(node, _PRODUCTS):
+            while isinstance(factor, ast.UnaryOp) and isinstance(factor.op, ast.UAdd):
+                factor = factor.operand
+            if isinstance(factor, ast.UnaryOp):
+                negative, factor = not negative, factor.operand
+            marks.append(mark)
+            factors.append(self.value(factor))
+        result = self._guarded(lambda: checked(_quotient(marks, factors)), node)
+        return self._negative(result, node) if negative else result
+
+    def _call(self, node: ast.Call) -> sp.Expr:
+        name, count = self.tree.token(node).text, len(node.args)
+        low, high = FUNCTIONS[name].arity
+        if not low <= count <= high:
+            counts = f"{low}" if low == high else f"{low} to {high}"
+            self._fail(f"'{name}' takes {counts} arguments, got {count}", node)
+        if name == "where":
+            return self._where(node)
+        arguments = [self.value(child) for child in node.args]
+        if name in ("min", "max"):
+            self._count_comparisons(node, arguments)
+        return self._guarded(lambda: checked(call(name, arguments)), node)
+
+    def _count_comparisons(self, node: ast.Call, arguments: list[sp.Expr]) -> None:
+        """Refuse more pairs of values than sympy, which compares them slowly, has time for."""
         count = sum(len(a.args) if isinstance(a, (sp.Min, sp.Max)) else 1 for a in arguments)
         self.comparisons += count**2
         if self.comparisons > MAX_COMPARISONS:
             what = f"too many values in min and max (their numbers' squares sum to over {MAX_COMPARISONS})"
-            self.source.fail(f"{what}; name parts of it as signals", node.position)
+            self._fail(f"{what}; name parts of it as signals", node)
 
-    def _where(self, node: Call) -> sp.Expr:
-        condition, yes, no = node.arguments
-        if not isinstance(condition, Comparison):
-            self.source.fail(
-                "the condition of where must be a comparison, as in where(x > 0, a, b)", condition.position
-            )
-        left, right = self.value(condition.left), self.value(condition.right)
-        for side, node_of in ((left, condition.left), (right, condition.right)):
-            if side.has(sp.Piecewise):
-                self.source.fail("a condition cannot contain a where; name that part as a signal", node_of.position)
-        test = self._guarded(lambda: compare(condition.relation, left, right), condition)
+    def _where(self, node: ast.Call) -> sp.Expr:
+        condition, yes, no = node.args
+        if not isinstance(condition, ast.Compare):
+            self._fail("the condition of where must be a comparison, as in where(x > 0, a, b)", condition)
+        relation, sides = _RELATIONS[type(condition.ops[0])], (condition.left, condition.comparators[0])
+        left, right = (self.value(side) for side in sides)
+        for side, value in zip(sides, (left, right), strict=True):
+            if value.has(sp.Piecewise):
+                self._fail("a condition cannot contain a where; name that part as a signal", side)
+        test = self._guarded(lambda: compare(relation, left, right), condition)
         first, second = self.value(yes), self.value(no)
         return self._guarded(lambda: checked(choose(test, first, second)), node)
 
-    def _guarded(self, make: Callable[[], Any], node: Node) -> Any:
+    def _guarded(self, make: Callable[[], Any], node: ast.expr) -> Any:
         try:
             return make()
         except _Unfit as e:
-            self.source.fail(str(e), node.position)
+            self._fail(str(e), node)
         except (OverflowError, MemoryError):
-            self.source.fail("the number is too large", node.position)
+            self._fail("the number is too large", node)
         except (TypeError, ValueError, ZeroDivisionError):
-            self.source.fail(_NOT_REAL, node.position)
+            self._fail(_NOT_REAL, node)
+
+    def _fail(self, what: str, node: ast.expr) -> NoReturn:
+        self.source.fail(what, self.tree.token(node).position)
 
 
-def _children(node: Node) -> tuple[Node, ...]:
-    match node:
-        case Negative():
-            return (node.value,)
-        case Chain():
-            return tuple(child for _, child in node.items)
-        case Power():
-            return (node.base, node.exponent)
-        case Call():
-            return node.arguments
-    return ()
-
-
-def _combine(node: Node, arguments: list[sp.Expr]) -> sp.Expr:
-    match node:
-        case Negative():
-            return product([sp.Integer(-1), *arguments])
-        case Power():
-            return power(*arguments)
-        case Chain() if node.items[0][0] == "+":
-            signed = zip(node.items, arguments, strict=True)
-            return sp.Add(*(a if mark == "+" else product([sp.Integer(-1), a]) for (mark, _), a in signed))
-        case Chain():
-            return _quotient([mark for mark, _ in node.items], arguments)
-        case Call():
-            return call(node.function, arguments)
-    raise AssertionError(node)
+def _chain(node: ast.BinOp, marks: Mapping[type[ast.operator], str]) -> list[tuple[str, ast.expr]]:
+    """Operands of the operators in `marks` that stand side by side without parentheses, each with the mark before it."""
+    first, operands = node, [(marks[type(node.op)], node.right)]
+    while (
+        isinstance(first.left, ast.BinOp)
+        and type(first.left.op) in marks
+        and first.left.col_offset == first.col_offset  # an operand in parentheses begins after the whole
+    ):
+        first = first.left
+        operands.append((marks[type(first.op)], first.right))
+    return [(next(iter(marks.values())), first.left), *reversed(operands)]
 
 
 def _quotient(marks: list[str], arguments: list[sp.Expr]) -> sp.Expr:
@@ -215,9 +238,9 @@ def _exponential(argument: sp.Expr) -> sp.Expr:
     return sp.exp(_tame(argument))
 
 
-def compare(relation: str, left: sp.Expr, right: sp.Expr) -> Any:
-    """The condition `left relation right`; True or False where both are constants."""
-    symbolic, numeric = _RELATIONS[relation]
+def compare(relation: Relation, left: sp.Expr, right: sp.Expr) -> Any:
+    """Condition `left relation right`; True or False where both are constants."""
+    symbolic, numeric = relation
     if left.is_number and right.is_number:
         return sp.true if numeric(constant(left), constant(right)) else sp.false
     return symbolic(left, right)
