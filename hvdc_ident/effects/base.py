@@ -1,4 +1,4 @@
-"""What an effect is: how readers of a slot see something else than the slot's own signal.
+"""Base of the effects: each makes readers of a slot see something else than the slot's own signal.
 
 An effect is data (`Effect`). Its use in a model is in `hvdc_ident.effects.placing`; the sizes worth trying when one is
 looked for are in `hvdc_ident.effects.probing`.
@@ -41,7 +41,7 @@ Measure = Literal[
 
 
 class Extent(Protocol):
-    """How far a slot's signal reaches: its largest magnitude, and how far it moves, in its unit."""
+    """Largest magnitude (`peak`) and peak-to-peak range (`range`) of a slot's signal, in its unit."""
 
     @property
     def peak(self) -> float: ...
@@ -81,7 +81,7 @@ class EffectParameter:
 
 
 class Additions:
-    """What an effect adds to the model: states, delays, sampled values, signals, under names that are free.
+    """Variables that an effect adds to the model: states, delays, sampled values, signals, under names that are free.
 
     kind: of the slot, one of SLOT_KINDS. circular: whether the slot lies on an algebraic loop.
     """
@@ -198,7 +198,7 @@ class Effect:
 
     @property
     def scanned(self) -> bool:
-        """Whether looking for it takes a closer look at many sizes."""
+        """True where a parameter of the effect must be searched over many values."""
         return any(q.scan is not None for q in self.parameters.values())
 
     @property
@@ -208,7 +208,7 @@ class Effect:
         return "e.g. " + ", ".join(f"{n} = {v:g} {units.get(n, '')}".rstrip() for n, v in self.example.items())
 
     def is_neutral(self, values: Mapping[str, float | str]) -> bool:
-        """Whether the effect is not there: a parameter switches it off, or none of the optional ones acts."""
+        """True where the effect is absent: a parameter switches it off, or none of the optional ones acts."""
         switches = {n: q for n, q in self.parameters.items() if q.neutral is not None and not q.optional}
         if switches:
             return any(_at_neutral(q, values[n], values) for n, q in switches.items())

@@ -10,7 +10,7 @@ from hvdc_ident.frozen import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """What of u lies beyond the band."""
+    """Return the part of u that lies beyond the band."""
     return u - clip(u, -p["width"], p["width"])
 
 

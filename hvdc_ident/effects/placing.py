@@ -88,16 +88,16 @@ class EffectUse:
         return self.effect.replace("-", "_")
 
     def parameter_name(self, name: str) -> str:
-        """What a parameter of the effect is called in the model."""
+        """Name of a parameter of the effect in the model."""
         prefix = self.prefix or self.prefix_at(self.at[0])
         return f"{prefix}_{name}"
 
     def made(self, name: str) -> bool:
-        """Whether a state or signal of the model is part of this effect, not a slot that it sits at."""
+        """True for a state or signal of the model that is part of this effect, False for a slot that it sits at."""
         return any(name.startswith(f"{self.prefix_at(place)}_") for place in self.at)
 
     def prefix_at(self, place: str) -> str:
-        """What the names begin with of all that the effect adds at a place."""
+        """Prefix of the names of all that the effect adds at a place."""
         return f"{self.label}_{place.replace('.', '_')}"
 
 
@@ -191,7 +191,7 @@ def _at_one(
 
 
 def _leads_back(model: Model, name: str) -> bool:
-    """Whether a signal or unknown is computed from itself, through other signals and unknowns alone."""
+    """True where a signal or unknown is computed from itself, through other signals and unknowns alone."""
     equations = {n: s.value for n, s in model.signals.items()} | {n: a.equation for n, a in model.algebraic.items()}
     seen: set[str] = set()
     stack = [name]

@@ -38,7 +38,7 @@ from hvdc_ident.trajectory import Array
 
 @dataclass(frozen=True)
 class SlotSignal:
-    """What the sizes of an effect are measured by: a slot's signal over all experiments.
+    """Range and time scales of a slot's signal over all experiments, from which the sizes of an effect are chosen.
 
     low, high: its extremes; rest: the largest magnitude it has at a start; all in its unit. fast, slow: the shortest
     and the longest time worth a thought, s. tones: frequencies, Hz, that stand out in what is unexplained.
@@ -87,12 +87,12 @@ class SlotSignal:
 
     @property
     def range(self) -> float:
-        """How far it moves; a thousandth of its peak where it does not."""
+        """Peak-to-peak range in the signal's unit; a thousandth of its peak where the signal is constant."""
         return max(self.high - self.low, 1e-3 * self.peak)
 
     @property
     def excursion(self) -> float:
-        """How far its magnitude rises above what it is at rest; a thousandth of its peak where it does not."""
+        """Rise of the magnitude above its value at rest, in the signal's unit; at least a thousandth of the peak."""
         return max(self.peak - self.rest, 1e-3 * self.peak)
 
     def time(self, share: float) -> float:
@@ -237,7 +237,7 @@ def _probe(effect: Effect, values: Mapping[str, float], signal: SlotSignal, sour
 
 
 def clearance(effect: Effect, values: Mapping[str, float]) -> dict[str, float]:
-    """How far each parameter that switches the effect off is from doing so: 0 at neutral.
+    """Distance from neutral of each parameter that switches the effect off: 0 at neutral.
 
     The difference from the neutral value; 1/value where that is infinite; T1 - T2 where it is another parameter. An
     optional parameter that is left out (0) counts as not there.

@@ -321,7 +321,7 @@ def _number_of(head: Any) -> Callable[..., float] | None:
 
 
 def checked(expression: sp.Expr) -> sp.Expr:
-    """The same expression, refused where it is a constant that is no finite real number."""
+    """Return the expression; refuse a constant that is no finite real number."""
     if expression.is_number:
         constant(expression)
     return expression

@@ -97,7 +97,7 @@ def _sum(e: Any) -> Text:
 
 
 def _signed(e: Any) -> tuple[bool, str]:
-    """Whether a minus stands before the term, and the term without it."""
+    """Return (True where a minus stands before the term, the term without it)."""
     text, binds = _product(e) if e.is_Mul else _text(e)
     if text.startswith("-"):
         return True, text[1:]

@@ -53,7 +53,7 @@ _YEAR_2100 = 4.1e9  # s since 1970
 
 
 class Format(Protocol):
-    """What a module of this folder supplies.
+    """Protocol of a module of this folder.
 
     NAME is its key in the catalogue, SUMMARY one line for it, SUFFIXES the usual endings, lower case, with the dot.
     """
@@ -63,7 +63,7 @@ class Format(Protocol):
     SUFFIXES: tuple[str, ...]
 
     def recognises(self, path: Path) -> bool:
-        """Whether the file is of this format; true for no file of another one."""
+        """True for a file of this format, and for no file of another one."""
 
     def read(self, path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         """The waveforms, all or those named in that order; WaveformError where the file cannot be used."""
@@ -72,7 +72,7 @@ class Format(Protocol):
         """Name and unit of every signal, without reading the waveforms."""
 
     def sample(self, path: Path) -> None:
-        """Nothing; a small valid file is at the path afterwards."""
+        """Write a small valid file to the path."""
 
     # A module that can also write its format has `write(trajectory, path) -> None`, for `convert`; one whose recordings
     # stand in several files has `files(path) -> list[Path]`, all of them that are there.
@@ -203,7 +203,7 @@ def _cut(found: Trajectory, window: tuple[float, float], where: str) -> Trajecto
 
 
 def write_csv(trajectory: Trajectory, path: str | os.PathLike[str], *, units: bool = False) -> None:
-    """Nothing; the trajectory is at the path afterwards, whole or not at all, every number to the last bit.
+    """Write the trajectory to the path, whole or not at all, every number to the last bit.
 
     First column `time` in s, then the signals, an empty cell where a value was not recorded. units: write `name [unit]`
     where the unit is known. A name a spreadsheet would take for a formula gets an apostrophe before it, which the reader
@@ -339,7 +339,7 @@ def _recognised(module: Format, path: Path) -> bool:
 
 
 def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
-    """What every format promises, whatever its module checked already."""
+    """Refuse a trajectory without the properties that every format promises, which its module need not check."""
     where = str(path)
     if len(found) < rows:
         raise WaveformError("too few rows", where=where, expected=f"at least {rows}", got=f"{len(found)}")

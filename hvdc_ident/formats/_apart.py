@@ -25,7 +25,7 @@ RATE = 5e6  # bytes a second, at least
 
 
 def read_apart(module: str, path: Path) -> Trajectory:
-    """What `waveforms_here(path)` of that module of this folder gives, run elsewhere.
+    """Return the result of `waveforms_here(path)` of a module of this folder, run in a process of its own.
 
     Raises WaveformError: its own, or where the process ends or hangs.
     """

@@ -18,7 +18,7 @@ _DAY = 86400.0  # s
 
 
 def is_clock(text: str) -> bool:
-    """Whether the text is a time of day, with or without a date before it."""
+    """True for a text that is a time of day, with or without a date before it."""
     return _CLOCK.fullmatch(text) is not None
 
 

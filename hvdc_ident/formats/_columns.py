@@ -1,4 +1,4 @@
-"""What several readers share: names of their own, records of several rates, packages that are an extra."""
+"""Helpers of several readers: unique names, records of several rates, optional packages."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def joined(parts: Sequence[Trajectory], path: Path) -> Trajectory:
 
 
 def check_size(rows: int, columns: int, path: Path) -> None:
-    """Nothing; WaveformError where so many numbers do not fit in the memory a table may take."""
+    """Raise WaveformError where so many numbers do not fit in the memory a table may take."""
     size = rows * columns * 8
     if size > MAX_BYTES:
         raise WaveformError(

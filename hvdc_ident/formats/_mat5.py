@@ -61,7 +61,7 @@ def variables(content: bytes) -> dict[str, Any]:
 
 
 class _Reader:
-    """What has been read so far, held against the limits."""
+    """Reader of the elements of a file, which counts what it has read against the limits."""
 
     def __init__(self, order: str) -> None:
         self.order, self.parts, self.bytes = order, 0, 0

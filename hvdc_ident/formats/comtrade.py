@@ -51,7 +51,7 @@ class _Record:
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a .cff with a section header, or a .cfg whose second line counts channels."""
+    """True for a .cff with a section header, or a .cfg whose second line counts channels."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         return False
@@ -100,7 +100,7 @@ def files(path: Path) -> list[Path]:
 
 
 def sample(path: Path) -> None:
-    """Nothing; a small ASCII record with an analog channel of two kinds and a digital one is there afterwards."""
+    """Write a small ASCII record with an analog channel of two kinds and a digital one."""
     header = (
         "STATION,REC,1999\r\n3,2A,1D\r\n1,Vdc,,,kV,0.5,1,0,-32767,32767,1,1,P\r\n2,P,,,MW,0.1,0,0,-32767,32767,1,1,P\r\n"
         "1,TRIP,,,0\r\n50\r\n1\r\n1000,4\r\n01/01/2020,00:00:00.000000\r\n01/01/2020,00:00:00.002000\r\nASCII\r\n1\r\n"
@@ -282,7 +282,7 @@ def _decoded(content: bytes) -> str:
 
 @contextlib.contextmanager
 def _refusals(path: Path, part: str) -> Iterator[None]:
-    """What the package stumbles over, as an error that names the file."""
+    """Turn errors of the package into a WaveformError that names the file."""
     try:
         yield
     except _REFUSALS as error:

@@ -52,7 +52,7 @@ _MANY_ROWS_SHARE = 0.2  # of the instants that may have more than two rows (even
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the top of a file says about the rest. labels: the header cells as they stand, the time's included.
+    """Layout of a file as its top declares it. labels: the header cells as they stand, the time's included.
 
     units: the time's included, as the header says them. time: the column of times; scale: s in its unit. date: the
     column of dates beside it, -1 where there is none. absolute: whether its times are dates or times of day.
@@ -81,7 +81,7 @@ class _Layout:
 
 
 def recognises(path: Path) -> bool:
-    """Whether the file's ending is one of text columns and it starts like text."""
+    """True for a file whose ending is one of text columns and that starts like text."""
     if path.suffix.lower() not in SUFFIXES:
         return False
     with open(path, "rb") as file:
@@ -123,7 +123,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 
 
 def sample(path: Path) -> None:
-    """Nothing; a small file with a unit and a jump is at the path afterwards."""
+    """Write a small file with a unit and a jump to the path."""
     path.write_text("# two signals\ntime,u [pu],y\n0.0,1.0,0.4\n0.1,1.0,0.4\n0.1,1.5,0.4\n0.25,1.5,-2e-3\n", "utf-8")
 
 

@@ -71,7 +71,7 @@ def starts_as_version_4(top: bytes) -> bool:
 
 
 def recognises(path: Path) -> bool:
-    """Whether the file starts with the `Aclass` matrix every result file starts with."""
+    """True for a file that starts with the `Aclass` matrix every result file starts with."""
     with open(path, "rb") as file:
         top = file.read(_HEADER + 7)
     return len(top) == _HEADER + 7 and _order(top) is not None and top[_HEADER:] == b"Aclass\0"
@@ -115,7 +115,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 
 
 def sample(path: Path) -> None:
-    """Nothing; a small result (parameter, variable, negative alias, event) is at the path afterwards."""
+    """Write a small result (parameter, variable, negative alias, event) to the path."""
     rows = [(0.0, 1.0), (0.1, 1.0), (0.1, 1.5), (0.1, 2.0), (0.25, 1.75)]
     names, texts = ("time", "c.R", "c.v", "c.n"), ("Time [s]", "Resistance [Ohm]", "Voltage [V|kV]", "Its negative [V]")
     info = [(0, 1, 0, -1), (1, 2, 0, 0), (2, 2, 0, 0), (2, -2, 0, 0)]

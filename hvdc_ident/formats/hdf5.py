@@ -29,7 +29,7 @@ _MAX_SETS = 100_000
 
 
 def recognises(path: Path) -> bool:
-    """Whether the file starts as HDF5 or netCDF 3 does."""
+    """True for a file that starts as HDF5 or netCDF 3 does."""
     with open(path, "rb") as file:
         top = file.read(8)
     return top == _HDF5 or top[:4] in _NETCDF3
@@ -48,7 +48,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 
 
 def sample(path: Path) -> None:
-    """Nothing; a small HDF5 file with two signals and a unit is there afterwards."""
+    """Write a small HDF5 file with two signals and a unit."""
     with package("h5py", path).File(path, "w") as file:
         file["time"] = np.array([0.0, 0.1, 0.1, 0.3])
         file["grid/P"] = np.array([1.0, 1.0, 1.5, 1.4])

@@ -58,7 +58,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 
 
 def sample(path: Path) -> None:
-    """Nothing; a small version 5 file with a time vector, a vector and a matrix is there afterwards."""
+    """Write a small version 5 file with a time vector, a vector and a matrix."""
     from scipy.io import savemat
 
     time = np.array([0.0, 0.1, 0.1, 0.3])

@@ -20,7 +20,7 @@ _MAGIC = b"PAR1"
 
 
 def recognises(path: Path) -> bool:
-    """Whether the file starts as Parquet does."""
+    """True for a file that starts as Parquet does."""
     with open(path, "rb") as file:
         return file.read(4) == _MAGIC
 
@@ -47,7 +47,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 
 
 def write(trajectory: Trajectory, path: Path) -> None:
-    """Nothing; the trajectory is at the path afterwards, in double precision, units in the columns' metadata."""
+    """Write the trajectory to the path in double precision, with units in the columns' metadata."""
     arrow, parquet = package("pyarrow", path), package("pyarrow.parquet", path)
     fields = [arrow.field("time", arrow.float64(), metadata={"unit": "s"})]
     for name, unit in zip(trajectory.names, trajectory.units, strict=True):
@@ -57,7 +57,7 @@ def write(trajectory: Trajectory, path: Path) -> None:
 
 
 def sample(path: Path) -> None:
-    """Nothing; a small table with a unit and a jump is there afterwards."""
+    """Write a small table with a unit and a jump."""
     values = np.array([[1.0, 0.5], [1.0, 0.5], [1.5, 0.5], [1.4, 0.25]])
     write(Trajectory(np.array([0.0, 0.1, 0.1, 0.3]), values, ("u", "y"), ("pu", "")), path)
 

@@ -99,7 +99,7 @@ def _inf(path: Path) -> Path:
 
 
 def sample(path: Path) -> None:
-    """Nothing; twelve channels in an .inf and two .out files are there afterwards."""
+    """Write twelve channels in an .inf and two .out files."""
     lines = [
         f'PGB({n}) Output Desc="S{n}" Group="Main" Max=2.0 Min=-2.0 Units="{"kV" if n % 2 else "MW"}"'
         for n in range(1, 13)

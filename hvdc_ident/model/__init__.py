@@ -1,4 +1,4 @@
-"""What a model is, and its text form."""
+"""Models and their text form."""
 
 from hvdc_ident.model.card import parse_card, read_card, save_card, write_card
 from hvdc_ident.model.definition import (

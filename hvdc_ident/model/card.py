@@ -98,7 +98,7 @@ def _section(section: str, table: object) -> dict[str, Any]:
 
 
 def _check_values(item: dict[str, Any], place: str) -> None:
-    """Nothing; raises for values of TOML that no field takes. The kinds of the rest are checked by the model."""
+    """Refuse values of TOML that no field takes; the model checks the kinds of the rest."""
     for key, value in item.items():
         if isinstance(value, dict):
             if key not in ("parameters", "replaces"):

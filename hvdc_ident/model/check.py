@@ -1,4 +1,4 @@
-"""Whether a model holds together: its names, the symbols in its expressions, and no circle of signals."""
+"""Consistency checks of a model: its names, the symbols in its expressions, and no circle of signals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VARIABLES = ("parameters", "inputs", "states", "signals", "algebraic", "delays",
 
 
 def check(model: Model) -> None:
-    """Nothing, for a coerced model that holds together.
+    """Refuse a coerced model that is not consistent.
 
     Raises ModelError for bad or doubled names, circles of signals and impossible constants, UnknownNameError for a
     symbol that is no variable of the model.

@@ -82,7 +82,7 @@ def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
 
 
 def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> None:
-    """Nothing; raises where a key is no field of the class, or a field without a default has no key."""
+    """Refuse keys that are no fields of the class, and the lack of a field without a default."""
     known = _fields(kind)
     for key in given:
         if key not in known:

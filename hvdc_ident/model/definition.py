@@ -1,4 +1,4 @@
-"""What a model is: states, index-1 unknowns, named signals, parameters, inputs and outputs, in sympy expressions."""
+"""Definition of a model: states, index-1 unknowns, named signals, parameters, inputs and outputs, in sympy expressions."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Algebraic:
 
 @dataclass(frozen=True)
 class Output:
-    """What can be recorded."""
+    """Quantity that can be recorded: an expression with its unit."""
 
     value: sp.Expr
     unit: str = ""
@@ -222,7 +222,7 @@ class Model(Shown):
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
-        """What the machine code depends on: names and equations, without the values of parameters and inputs."""
+        """Tuple of all that the machine code depends on: names and equations, without the values of parameters and inputs."""
         return (
             tuple(self.parameters),
             tuple(self.inputs),

@@ -16,7 +16,7 @@ class External(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the model."""
 
     @property
     def parameters(self) -> FrozenMap[Parameter]:
@@ -28,7 +28,7 @@ class External(Protocol):
 
     @property
     def outputs(self) -> FrozenMap[Output]:
-        """What can be recorded, with units; the expressions say nothing."""
+        """Outputs by name, with units; their expressions have no meaning."""
 
     @property
     def states(self) -> FrozenMap[Any]:

@@ -40,7 +40,7 @@ def shipped_models() -> tuple[str, ...]:
 
 
 def is_shipped(name: str) -> bool:
-    """Whether a model of that name is shipped, be it one of a family."""
+    """True where a model of that name is shipped, be it one of a family."""
     return name in _shipped_by_name() or _of_a_family(name) is not None
 
 

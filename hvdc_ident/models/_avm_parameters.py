@@ -12,7 +12,7 @@ X_TRANSFORMER, R_TRANSFORMER, X_ARM = 0.18, 0.001, 0.075
 
 @dataclass(frozen=True)
 class Rating:
-    """What differs between two ratings: MVA, power at the start in pu, gains in pu and pu/s, C in s, Zg, Rdc in pu."""
+    """Parameters that differ between two ratings: MVA, power at the start in pu, gains in pu and pu/s, C in s, Zg, Rdc in pu."""
 
     base: float
     power: float
@@ -78,7 +78,7 @@ def plant(rated: Rating) -> dict[str, Parameter]:
 
 
 def inside(filtered: bool) -> dict[str, Parameter]:
-    """What the phasor link lacks: current control, PLL, feed-forward and filters."""
+    """Parameters that the phasor link lacks: current control, PLL, feed-forward and filters."""
     filter_ = {"FM": _parameter(140.0, "Hz", "-3 dB frequency of the measurement filters")} if filtered else {}
     return {
         "KPI": _parameter(0.4870141, "pu", "proportional gain of the current control"),

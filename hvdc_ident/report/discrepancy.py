@@ -38,7 +38,7 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def hidden_curve(at: str, curve: Mapping[str, Any]) -> Figure:
-    """What is added at a slot, over time or over a signal, with its 95 % band where that is known."""
+    """Figure of the signal added at a slot, over time or over a signal, with its 95 % band where that is known."""
     fig = figure(7.4, 2.6, {"left": 0.12, "right": 0.98, "bottom": 0.2, "top": 0.97})
     axes = fig.subplots()
     x, y = np.array(curve["at"]), np.array(curve["value"])
@@ -75,7 +75,7 @@ def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
-    """Nothing; draws one channel's gain and phase."""
+    """Draw one channel's gain and phase."""
     looks = (("data", MEASURED, "record"), ("nominal", BEFORE, "refitted"), ("augmented", AFTER, "with effect"))
     f = np.array(c["omega"]) / (2 * np.pi)
     for key, colour, label in looks:

@@ -66,8 +66,8 @@ def write_letter(folder: Path) -> Path:
 
 
 def _missed(results: Results, found: dict[str, Any]) -> str:
-    """How far the model, with the gains it came with, is off at most: as a share of what the signal does, or where no course
-    of it is at hand in times of its noise."""
+    """Sentence on the largest error of the model with its nominal gains: as a share of the signal's swing or, where no record
+    of it is at hand, as a multiple of its noise."""
     gap = found.get("gap") or {}
     noise = gap.get("noise_floor") or {}
     missed = [
@@ -95,7 +95,7 @@ def _missed(results: Results, found: dict[str, Any]) -> str:
 
 
 def _swing(results: Results, output: str, experiment: str) -> float | None:
-    """What a recorded signal does in an experiment, from its smallest to its largest value."""
+    """Peak-to-peak value of a recorded signal in an experiment, in its unit; None where it is not recorded."""
     for stage in ("simulation", "fit"):
         table = results.table(f"{stage}.{experiment}.csv")
         if table is not None and f"{output}.measured" in table:
@@ -105,7 +105,7 @@ def _swing(results: Results, output: str, experiment: str) -> float | None:
 
 
 def _consistent(found: dict[str, Any]) -> str:
-    """What the difference is consistent with: the effect that was named, and those the data cannot tell from it."""
+    """Sentences on what the difference is consistent with: the named effect, and those the data cannot tell from it."""
     verdict, effects = found["verdict"], found.get("effects") or []
     if verdict == "no-evidence":
         return f"Beyond the gains nothing is missing that these recordings could show. {found.get('text', '')}".strip()
@@ -134,7 +134,7 @@ def _consistent(found: dict[str, Any]) -> str:
 
 
 def _in_common(found: dict[str, Any]) -> str:
-    """That the one set there is delays a slow signal by so much, whichever of it is the right one."""
+    """Sentence on the delay of a slow signal that all effects of the only ambiguous set have in common; empty without one."""
     groups = found.get("ambiguity") or []
     late = [r.get("late") for group in groups for r in group if r.get("refitted", True)]
     if len(groups) != 1 or len(late) < 2 or any(v is None or v <= 0.0 for v in late):
@@ -152,7 +152,7 @@ def _interval(effect: dict[str, Any]) -> str:
 
 
 def _gains(found: dict[str, Any]) -> str:
-    """Whether the gains are to blame: how far a fit moves them without the effect, and how far with it."""
+    """Sentences on the gains: how far a fit moves them without the effect, and how far with it."""
     given, without, after = (found.get(f"parameters_{k}") or {} for k in ("before", "refitted", "after"))
     moved = {
         n: (without[n] / g - 1.0, after[n] / g - 1.0) for n, g in given.items() if g and n in without and n in after
@@ -183,7 +183,7 @@ def _gains(found: dict[str, Any]) -> str:
 
 
 def _added(found: dict[str, Any]) -> str:
-    """What the augmented model has: an effect, or a formula, filter or curve found from the data; empty where nothing was added."""
+    """Kind of the addition in the augmented model: "effect", "formula", "filter" or "curve"; empty where nothing was added."""
     if found.get("effects"):
         return "effect"
     kind = (found.get("fallback") or {}).get("kind", "") if found.get("augmented_model") else ""

@@ -1,4 +1,4 @@
-"""What a part of the page is."""
+"""Section of the page."""
 
 from __future__ import annotations
 

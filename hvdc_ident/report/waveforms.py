@@ -51,7 +51,7 @@ class Sheet:
         return self.top, self.strip
 
     def explain(self) -> None:
-        """Nothing; the legend says what is drawn, a new one where that is not what was drawn before."""
+        """Draw the legend of the curves; replace one that lists others."""
         handles, labels = self.top.get_legend_handles_labels()
         for legend in list(self.figure.legends):
             if [t.get_text() for t in legend.texts] == labels:
@@ -104,7 +104,7 @@ def waveforms(
 def curves(
     output: str, unit: str, before: Trajectory | None, after: Trajectory | None
 ) -> tuple[dict[str, Array], list[Curve], tuple[str, str, str]]:
-    """The same for a figure that zooms: its columns, its curves, and the titles of its axes."""
+    """Return the waveforms for a figure that zooms: its columns, its curves, and the titles of its axes."""
     tables = {label: t for label, t in (("before", before), ("after", after)) if t is not None}
     shown = after if after is not None else before
     assert shown is not None

@@ -107,7 +107,7 @@ def _step(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _accept(r, factor):  # type: ignore[no-untyped-def]
-    """What follows a good step, whose length the next one takes `factor` times. Returns a status."""
+    """Accept a step and set the next one's length to `factor` times its own; return a status."""
     if r.nd or r.ns or (r.i_out < r.n_out and vector(r.t_out, r.n_out)[r.i_out] <= r.step_end):
         make_dense(r)
     event = find_switch(r) if r.ns else NONE
@@ -127,7 +127,7 @@ def _accept(r, factor):  # type: ignore[no-untyped-def]
 
 
 def _entries(stamp):  # type: ignore[no-untyped-def]
-    """What Python calls, for the present state of the kernels' files."""
+    """Return the functions that Python calls, for the present state of the kernels' files."""
 
     @njit(cache=True, error_model="numpy")
     def integrate(state, work, span, tolerance, max_steps, y, w, p, constants, breaks, pointer, times, values, t_out, out, scale, hess_row, hess_column):  # type: ignore[no-untyped-def]
@@ -177,7 +177,7 @@ def _entries(stamp):  # type: ignore[no-untyped-def]
 
     @njit(cache=True, error_model="numpy")
     def room(state):  # type: ignore[no-untyped-def]
-        """How many doubles of workspace a run of these sizes takes."""
+        """Number of doubles of workspace that a run of these sizes takes."""
         r = record(address_of(state))
         r.stamp = stamp
         r.free = 0

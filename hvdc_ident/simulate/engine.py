@@ -191,7 +191,7 @@ class Engine:
         return state, self._integrators.room(state.copy())
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
-        """Whether the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
+        """True where the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
         s = self.structure.sizes
         if method != "auto":
             if method == "explicit" and s.nz:
@@ -230,7 +230,7 @@ def _status(answer: int) -> int:
 
 @lru_cache(maxsize=64)
 def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Any, ...]:
-    """What an integration reads of its inputs: start values, breaks, then the pieces of all of them and their points."""
+    """Return the tables that an integration reads of its inputs: start values, breaks, then the pieces of all of them and their points."""
     # "At the first row" is what stood before anything happened: the value from the left.
     u = [
         float(i.values[0] if i.times.size == 1 or i.times[0] >= begin else i(np.nextafter(begin, -np.inf)))

@@ -59,7 +59,7 @@ def rest(address, dims, p, y, w, wd, m, jac, worst, rule):  # type: ignore[no-un
 
 
 def room(state):  # type: ignore[no-untyped-def]
-    """How many doubles of workspace a run of a state takes."""
+    """Number of doubles of workspace that a run of a state takes."""
     return _room(_integers(state))
 
 

@@ -1,4 +1,4 @@
-"""What comes into the equations from outside at an instant: time, inputs, delayed signals, held samples."""
+"""Exogenous values of the equations at an instant: time, inputs, delayed signals, held samples."""
 
 from __future__ import annotations
 

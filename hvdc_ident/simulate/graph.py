@@ -160,7 +160,7 @@ class Graph:
         return self._node(name, *arguments)
 
     def _cut_at_zero(self, a: int) -> bool:
-        """Whether a node is max(0, x): with modes held, x may pass 0 within a step before the switch is found."""
+        """True for a node that is max(0, x): with modes held, x may pass 0 within a step before the switch is found."""
         key = self.nodes[a]
         return key[0] == "select" and self.zero in key[2:]
 

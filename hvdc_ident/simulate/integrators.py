@@ -20,7 +20,7 @@ MAX_STEPS = 4  # the one argument of `integrate` that is no array
 
 @dataclass(frozen=True)
 class Integrators:
-    """What `entries` defines, to be called from Python; arguments as stated there."""
+    """Functions of `entries`, to be called from Python; arguments as stated there."""
 
     rest: Callable[..., int]
     room: Callable[..., int]
@@ -57,7 +57,7 @@ def _symbol(name: str) -> str:
 
 
 def _prepare_runtime() -> None:
-    """Nothing; the functions of numba's runtime that compiled code calls (memory, errors) can be found by their names."""
+    """Make the functions of numba's runtime that compiled code calls (memory, errors) known by their names."""
     from numba.core.registry import cpu_target
     from numba.core.runtime import rtsys
 

@@ -1,4 +1,4 @@
-"""What is compiled for a model's equations, kept for every model that has the same."""
+"""Cache of what is compiled for a model's equations, for every model that has the same."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class _Key:
-    """What decides the machine code: the equations and the other arguments, not the values of parameters and inputs."""
+    """Key of the machine code: the equations and the other arguments, not the values of parameters and inputs."""
 
     model: Model
     others: tuple[Any, ...]

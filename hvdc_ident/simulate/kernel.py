@@ -1,4 +1,4 @@
-"""How the integrators are compiled: once for an installation, and again where a file they are made from has changed."""
+"""Compilation of the integrators: once for an installation, and again where a file they are made from has changed."""
 
 from __future__ import annotations
 

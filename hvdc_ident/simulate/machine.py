@@ -40,7 +40,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Function:
-    """What one generated function stores: nodes at places in `out`, and rows of `width` doubles."""
+    """Contents of one generated function: nodes at places in `out`, and rows of `width` doubles."""
 
     name: str
     nodes: Sequence[tuple[int, int]] = ()  # (place, node)

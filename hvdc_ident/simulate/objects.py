@@ -24,7 +24,7 @@ _PREFIX, _DIGEST = "code-", hashlib.sha256().digest_size
 
 
 def folders() -> Iterator[Path]:
-    """Where object code may lie, best place first: as numba's own files do, beside the sources, else with the user's caches."""
+    """Folders for object code, best first: as numba's own files do, beside the sources, else with the user's caches."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         yield Path(given)
@@ -61,7 +61,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, code: bytes) -> bool:
-    """Whether the file is there now: whole, or the folder is as it was."""
+    """Write the file, whole or not at all; True where it is there now."""
     part = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,7 +81,7 @@ def _seal(name: str, code: bytes) -> bytes:
 
 
 def _clear(folder: Path) -> None:
-    """Nothing; the folder's object code takes no more than ROOM afterwards. Parts that a killed process left are among it."""
+    """Delete the oldest object code until the folder's takes no more than ROOM, parts that a killed process left included."""
     with os.scandir(folder) as entries:
         files = [(e.stat().st_mtime, e.stat().st_size, e.path) for e in entries if e.name.startswith(_PREFIX)]
     total = sum(size for _, size, _ in files)
@@ -96,7 +96,7 @@ def _clear(folder: Path) -> None:
 
 @cache
 def _surroundings() -> tuple[str, ...]:
-    """What every object code depends on beside its own text: the compiler, the processor, and how this file uses them."""
+    """Versions that every object code depends on beside its own text: the compiler, the processor, and how this file uses them."""
     return (
         llvmlite.__version__,
         ".".join(map(str, llvm.llvm_version_info)),

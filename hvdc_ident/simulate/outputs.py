@@ -1,4 +1,4 @@
-"""What a step leaves behind: rows of outputs at the instants asked for, and the history of delayed signals."""
+"""Results of a step: rows of outputs at the instants asked for, and the history of delayed signals."""
 
 from __future__ import annotations
 

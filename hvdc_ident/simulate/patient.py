@@ -109,7 +109,7 @@ def stepped(address, inner, nu, nx, y, w, wd, p, m, size, v, h, x):  # type: ign
 
 
 def _entries(stamp):  # type: ignore[no-untyped-def]
-    """What Python calls, for the present state of the kernels' files."""
+    """Return the functions that Python calls, for the present state of the kernels' files."""
 
     @njit(cache=True, error_model="numpy")
     def trace(address, inner, nu, y, w, p, m, ends_p, ends_w, v, sign):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""How an experiment changes the model that is run: slots driven by recorded columns, outputs seen through instruments,
+"""Changes that an experiment makes to the model that is run: slots driven by recorded columns, outputs seen through instruments,
 inputs with an unknown offset, states with a start of their own."""
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def residual(address, y, w, wd, p, m, n, inner, first, total, r):  # type: ignor
 
 
 def _entry(stamp):  # type: ignore[no-untyped-def]
-    """What Python calls, for the present state of the kernels' files."""
+    """Return the function that Python calls, for the present state of the kernels' files."""
 
     @njit(cache=True, error_model="numpy")
     def rest(address, dims, p, y, w, wd, m, jac, worst, rule):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""What a simulation returns."""
+"""Result of a simulation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Statistics:
-    """How a run went: its status, the method, and counts of steps, switches, evaluations and segments between breaks.
+    """Statistics of a run: its status, the method, and counts of steps, switches, evaluations and segments between breaks.
 
     forced: very short steps taken past an instant of infinite slope, where the tolerance cannot be met.
     """

@@ -34,7 +34,7 @@ def next_stop(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def begin_segment(r):  # type: ignore[no-untyped-def]
-    """What happens at r.t: inputs jump, samples are taken and published, outputs are written. False: no solution there."""
+    """Begin a segment at r.t: inputs jump, samples are taken and published, outputs are written. False: no solution there."""
     final = not r.t < r.end
     r.tb = r.t + 1.0 if final else next_stop(r)
     enter_segment(r)
@@ -143,7 +143,7 @@ def _echo_sources(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def prepare_segment(r):  # type: ignore[no-untyped-def]
-    """What stays the same until the segment's end, the switches' tolerances, and the first step's length."""
+    """Set the constants of the segment, the switches' tolerances and the first step's length."""
     r.segments += 1
     still = enter_segment(r)
     slopes = vector(r.wd, 1 + r.nu)

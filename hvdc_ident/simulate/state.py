@@ -1,4 +1,4 @@
-"""What a run is made of, as one record that compiled code reads and writes.
+"""State of a run, as one record that compiled code reads and writes.
 
 Every kernel of the integrators takes this record instead of some forty arguments: sizes, addresses of the generated
 functions (`do_...`), addresses of the vectors in the workspace, tolerances, and where the run stands. The compiler's
@@ -75,7 +75,7 @@ RUN = np.dtype(
 
 
 def place(field: str) -> int:
-    """Where a field stands in the vector of integers."""
+    """Position of a field in the vector of integers."""
     names = RUN.names
     assert names is not None
     return names.index(field)

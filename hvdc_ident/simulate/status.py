@@ -1,4 +1,4 @@
-"""How a run may end."""
+"""Statuses with which a run ends."""
 
 NAMES = ("converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff")
 CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF = range(6)

@@ -607,7 +607,7 @@ _Values = tuple[Array, Array, float]
 
 @dataclass(frozen=True)
 class Path:
-    """Where a way from values to values ended.
+    """End of a path from values to values.
 
     v: the last steady state on it. share: of the way, up to there. ends: "arrived"; "fold", where the branch turns back; "jump", where it
     breaks off; "no start", where none is known at its beginning. at: the values there, where it did not arrive.
@@ -621,7 +621,7 @@ class Path:
 
 @dataclass(frozen=True)
 class _Region:
-    """Where a rest is looked for: the sizes of states, unknowns and held values as far as the model's guesses tell them.
+    """Region in which a rest is looked for: the sizes of states, unknowns and held values as far as the model's guesses tell them.
 
     size: what is usual; a residual is judged against it, so that a value that grows without bound, as a dc voltage whose
     power balance P / Vdc goes to 0, cannot make its own residual small. limit: what is out of question (infinite: not known).

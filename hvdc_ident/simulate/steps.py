@@ -124,8 +124,8 @@ def make_dense(r):  # type: ignore[no-untyped-def]
 
 
 def _rodas_point(stage):  # type: ignore[no-untyped-def]
-    """What a stage needs before its right-hand side: where it is taken (from stage 5 on, relative to the stage before)
-    and what is added to it."""
+    """Return the kernel that prepares a stage's right-hand side: the point where it is taken (from stage 5 on, relative to
+    the stage before) and the term added to it."""
 
     @elementwise
     def point(base, mass, ft, *rest):  # type: ignore[no-untyped-def]
@@ -202,7 +202,7 @@ def _rodas_matrix(r):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath={"contract"})
 def _rodas_solve(r, k):  # type: ignore[no-untyped-def]
-    """What the generated solve does, by dense linear algebra: from the right-hand side at the address k to the stage."""
+    """Do the work of the generated solve by dense linear algebra: from the right-hand side at the address k to the stage."""
     n, width = r.n, r.width
     _sum(r.stride, (k, r.add), (k,), ())
     matrix, pivots, head = table(r.matrix, n, n), indices(r.pivots, n), vector(k, n)

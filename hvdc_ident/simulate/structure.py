@@ -222,7 +222,7 @@ class Structure:
 
     @property
     def moves_by_itself(self) -> bool:
-        """Whether an equation uses `time`, so that its derivative in time is not 0 between changes of the inputs."""
+        """True where an equation uses `time`, so that its derivative in time is not 0 between changes of the inputs."""
         return any(0 in self.partial(v, "w") for v in self.rhs)
 
     # --- functions ---
@@ -331,7 +331,7 @@ class Structure:
         )
 
     def compile_late(self) -> Code:
-        """What only the Rosenbrock method needs: second derivatives and elimination, most of the code of a large model."""
+        """Compile what only the Rosenbrock method needs: second derivatives and elimination, most of the code of a large model."""
         e, width = self.elimination, self.sizes.width
         written: dict[str, Callable[[str], str]] = {}
         if e is not None:

@@ -159,7 +159,7 @@ def _move(r, share):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _is_other_side(r):  # type: ignore[no-untyped-def]
-    """Whether a mode differs from those at the step's origin."""
+    """True where a mode differs from those at the step's origin."""
     m, side = vector(r.m, r.ns), vector(r.side, r.ns)
     changed = 0
     for k in range(r.ns):

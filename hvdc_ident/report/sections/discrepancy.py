@@ -1,4 +1,4 @@
-"""What the model lacks: the verdict, the gap before and after, how the gains move, and how sure it is."""
+"""Section on the discrepancy of the model: the verdict, the gap before and after, how the gains move, and how sure it is."""
 
 from __future__ import annotations
 

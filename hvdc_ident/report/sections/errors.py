@@ -88,7 +88,7 @@ def _error(window: dict[str, Any], kind: str) -> str:
 
 
 def _held_out(fit: dict[str, Any]) -> str:
-    """How the estimates hold in experiments that were kept out of the fit."""
+    """Table of the errors at the estimates in experiments that were kept out of the fit."""
     rows = []
     for name, line in (fit.get("validation") or {}).items():
         if line.get("status") != "done":

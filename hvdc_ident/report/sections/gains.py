@@ -33,7 +33,7 @@ STATUS = {
 
 
 def _outcome(fit: dict[str, Any]) -> str:
-    """What became of the fit, said first."""
+    """Paragraph on the status of the fit."""
     status = str(fit.get("status", ""))
     judged = fit.get("adequacy") or {}
     said = (
@@ -47,7 +47,7 @@ def _outcome(fit: dict[str, Any]) -> str:
 
 
 def _more(fit: dict[str, Any]) -> str:
-    """What was estimated beside the candidates, what follows from them, and how they hang together."""
+    """Tables of derived quantities, nuisance parameters, correlations and fits one by one."""
     return _derived(fit) + _nuisances(fit) + _correlation(fit) + _one_by_one(fit)
 
 
@@ -141,7 +141,7 @@ def _end(value: Any, none: str) -> str:
 
 
 def _weights(fit: dict[str, Any]) -> str:
-    """Where the standard deviation of each output comes from, for it decides the intervals."""
+    """Note on the origin of each output's standard deviation, which decides the intervals."""
     sources = fit.get("noise_source") or {}
     if not sources:
         return ""

@@ -1,4 +1,4 @@
-"""What the data tell about each parameter: verdicts, profiles, information by experiment, what to measure next."""
+"""Section on the identifiability of each parameter: verdicts, profiles, information by experiment, what to measure next."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _lead(found: dict[str, Any]) -> str:
 
 
 def _structure(structural: dict[str, Any]) -> str:
-    """What perfect data could tell."""
+    """Sentence on structural identifiability, from perfect data."""
     lost = structural.get("unidentifiable") or []
     if lost:
         return f"Not even perfect data would tell {text(listed(map(str, lost)))}"

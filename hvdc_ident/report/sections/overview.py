@@ -25,7 +25,7 @@ def _asked(results: Results, fit: dict[str, Any]) -> str:
 
 
 def _estimated(results: Results, fit: dict[str, Any]) -> str:
-    """What was estimated and which of it moved most; without a fit, what could be."""
+    """Sentence on the parameters that were estimated and the one that moved most; without a fit, on those that could be."""
     told = results.get("identifiability")
     candidates = list(fit.get("candidates") or told.get("parameters") or {})
     fitted = [str(n) for n in fit.get("fitted") or ([] if fit else told.get("identifiable") or [])]
@@ -86,7 +86,7 @@ def _missing(results: Results) -> str:
 
 
 def _shrunk(gap: dict[str, Any]) -> str:
-    """What adding it did to the residual, on held-out data where there are any."""
+    """Clause on the residual before and after the addition, on held-out data where there are any."""
     pooled = gap.get("pooled") or {}
     for part, where in (("holdout", "held-out"), ("fit", "fitted")):
         was, now = ((pooled.get(m) or {}).get(part) for m in ("refitted", "augmented"))

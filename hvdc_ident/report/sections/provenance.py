@@ -1,4 +1,4 @@
-"""Where the page comes from: software, seed, files and their hashes; and every number of it, to be saved."""
+"""Section on the origin of the page: software, seed, files and their hashes; and every number of it, to be saved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether what is left over looks like noise: goodness of fit, whiteness, correlation with the inputs."""
+"""Section on the residuals, compared with noise: goodness of fit, whiteness, correlation with the inputs."""
 
 from __future__ import annotations
 
