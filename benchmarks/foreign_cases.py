@@ -265,7 +265,10 @@ def ours(path: Path, interface: str) -> FmuModel:
 
 
 def run_ours(model: FmuModel, plan: Plan, names: Sequence[str], values: Mapping[str, float] | None = None) -> Array:
-    return np.asarray(model.simulate(plan.experiment(), values, outputs=tuple(names)).trajectory.values)
+    """(rows, names) of our run; NaN after an end that the FMU asked for."""
+    found = model.simulate(plan.experiment(), values, outputs=tuple(names), partial=True).trajectory.values
+    rest = np.full((plan.rows.size - found.shape[0], found.shape[1]), np.nan)
+    return np.vstack([found, rest])
 
 
 # --- parts ---
@@ -297,6 +300,7 @@ def simulation(path: Path, interface: str, told: Told) -> None:
     begin = time.perf_counter()
     found = run_ours(model, plan, peer.names)
     told({"seconds": time.perf_counter() - begin})
+    found[~np.isfinite(truth)] = np.nan  # FMPy leaves the row out at which an FMU ends the run
     off = np.where(steady, gaps(found[rows], truth[rows], scale), 0.0)
     k = int(np.argmax(off)) if off.size else 0
     apart = np.abs(found[rows] - truth[rows])[:, k] if off.size else np.zeros(1)

@@ -83,6 +83,14 @@ class Update:
     next_time: float | None
 
 
+class Ended(Exception):
+    """The FMU asked for the end of the run in a step. reached: the instant that it stands at, s."""
+
+    def __init__(self, reached: float) -> None:
+        super().__init__("the FMU asked for the end of the run")
+        self.reached = reached
+
+
 class Vector:
     """A vector of doubles with its address."""
 
@@ -403,7 +411,7 @@ class Binding:
         """Return the instant from which to go on, and the one that outputs belong to.
 
         They differ for an FMU of FMI 3.0 whose own steps do not end at t + h: it goes on from there all the same, and
-        early return alone moves the communication point. Raises RuntimeError where the FMU asks for the end of the run.
+        early return alone moves the communication point. Raises Ended where the FMU asks for the end of the run.
         """
         self.progress[NOW] = t
         if self.version == 2:
@@ -417,7 +425,7 @@ class Binding:
             return t + h, t + h
         _, end, early, reached = self.fmu.doStep(t, h)
         if end:
-            raise RuntimeError("the FMU asked for the end of the run")
+            raise Ended(float(reached))
         return float(reached) if early else t + h, float(reached)
 
     def _discarded(self, t: float, discard: FMICallException) -> float:
@@ -428,12 +436,14 @@ class Binding:
             end = self.fmu.getBooleanStatus(fmi2Terminated)
         except FMICallException:  # the FMU does not say
             end = False
-        if end:
-            raise RuntimeError("the FMU asked for the end of the run")
         try:
             reached = float(self.fmu.getRealStatus(fmi2LastSuccessfulTime))
         except FMICallException:
+            if end:
+                raise Ended(t) from None
             raise discard from None
+        if end:
+            raise Ended(reached)
         if not reached > t:
             raise discard
         return reached

@@ -10,6 +10,7 @@ harmless is tried once for each FMU, against a run that reads right after steps 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from ctypes import c_int
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.fmu.binding import DISCARD, ERROR, Failure, Vector
+from hvdc_ident.fmu.binding import DISCARD, ERROR, Ended, Failure, Vector
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
 from hvdc_ident.fmu.signals import Signals
@@ -240,7 +241,14 @@ def _go(
             try:
                 stepper.step(instants[k - 1], t, after[k - 1], before[k])
             except RunEnded as e:
-                e.rows = _rows(time[time <= stops[k - 1]], stops[:k], left[:k], right[:k])
+                count = k
+                if float(e.t or 0.0) >= t - _rounding(time):
+                    with contextlib.suppress(Failure):  # an FMU may show nothing any more: its row is not there then
+                        left[k] = right[k] = seen.get()
+                        count += 1
+                e.rows = _rows(
+                    time[time <= stops[count - 1] + _rounding(time)], stops[:count], left[:count], right[:count]
+                )
                 raise
         plain = calls.plain or not shows or stepper.stands_at(before[k])
         left[k] = seen.get() if plain else stepper.show(before[k])
@@ -368,8 +376,8 @@ class _Stepper:
         for _ in range(EARLY):
             try:
                 reached, computed = self.plant.binding.step(t, b - t)
-            except RuntimeError as e:
-                raise RunEnded(t) from e
+            except Ended as e:
+                raise RunEnded(max(e.reached, t)) from None
             if reached >= b - rounding:
                 if computed < b - rounding and b - computed > 1e-9 * max(abs(b), b - a):
                     self.behind = max(self.behind, b - computed)

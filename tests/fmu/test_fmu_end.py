@@ -44,6 +44,8 @@ def test_the_rows_up_to_the_end_are_kept(fmu, version, interface):
         rows = run.trajectory.time.size
         assert run.status == "ended" and np.array_equal(run.trajectory.time, TIME[:rows])
         assert TIME[rows - 1] <= END + 0.5 and rows >= 22 and "asked for the end of the run at 2." in run.notes["end"]
+        if interface == "co-simulation":  # the step to 2.3 s is done, and says so
+            assert rows == 24 and "at 2.3 s" in run.notes["end"]
         assert run["y"] == pytest.approx(response(TIME[:rows]), abs=1e-4)
     assert simulate(model, STEP.with_(time=TIME[:15]), partial=True).status == "converged"
 
