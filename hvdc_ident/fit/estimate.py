@@ -26,6 +26,7 @@ from hvdc_ident.fit.refined import Refined
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.residual_tests import residual_tests
 from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, StartOutcome, Status
+from hvdc_ident.fit.rough import LUCK, Trend, residual_at, threshold_of, trend_of
 from hvdc_ident.fit.starts import DISTINCT, Optimum, best_first, distinct, latin_hypercube
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
@@ -93,15 +94,24 @@ def _result(
         rivals = [r for r in rivals if r.cost >= best.cost]
     if whiten == "residual":
         problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
+    again = problem is not first or best not in usable
+    best, trend = on_trend(problem, best)
+    if trend is not None:  # what ended on another tooth of this optimum is no other optimum
+        rivals = [
+            r for r in rivals if not trend.holds(r.theta, threshold_of(problem, residual_at(problem, best.theta)))
+        ]
     blocks = problem.blocks(best.theta)
     source = {o: source_of(problem.fitted_experiments, o) for o in problem.outputs}
-    inner, all_unknowns = _uncertainties(problem, best.theta, blocks, source)
+    inner, all_unknowns = (
+        u.on_trend(trend, problem.names) for u in _uncertainties(problem, best.theta, blocks, source)
+    )
     samples = sum(b.residual.size for b in blocks)
     worth = min(1.0, sum(inner.effective.values()) / samples)
     optima = [best] if inner.singular else distinct(problem, [best, *rivals], worth)
+    if trend is not None:
+        optima = [best, *(o for o in optima if o is not best)]
     outcomes = _outcomes(problem, begins, runs, weigh=problem is not first)
-    again = problem is not first or best not in usable
-    status, message = _status(problem, best, optima, outcomes, worth, again=again)
+    status, message = _status(problem, best, optima, outcomes, worth, trend, again=again)
     noise = {o: _noise_text(problem, o) for o in problem.outputs}
     judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
     inner, all_unknowns = inner.widened(judged.widening), all_unknowns.widened(judged.widening)
@@ -124,6 +134,7 @@ def _result(
         rmse_start=problem.rmse_start,
         rmse_given=problem.rmse_given,
         adequacy=judged,
+        roughness={} if trend is None else {"delta_chi2": 2.0 * trend.roughness, "text": trend.text},
         noise_source=FrozenMap(noise),
         sigma=problem.sigma,
         rho=inner.rho,
@@ -136,6 +147,15 @@ def _result(
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
         covariance=Covariance(inner.names, inner.corrected, inner.dof),
     )
+
+
+def on_trend(problem: Problem, best: Optimum) -> tuple[Optimum, Trend | None]:
+    """The optimum, that of the trend where the cost is rough, and that trend. Raises SimulationError."""
+    trend = trend_of(problem, best.theta)
+    if trend is None:
+        return best, None
+    r, _ = problem.residual(trend.theta)
+    return Optimum(trend.theta, 0.5 * float(r @ r)), trend
 
 
 def _method(optimiser: Optimiser | str | None, starts: int | None, seed: int) -> tuple[Optimiser, int]:
@@ -245,24 +265,30 @@ def _status(
     optima: Sequence[Optimum],
     outcomes: Sequence[StartOutcome],
     worth: float,
+    trend: Trend | None,
     *,
     again: bool,
 ) -> tuple[Status, str]:
     """The status of the whole fit and why, worst first.
 
-    again: whether the optimum was found once more in other weights than the runs had.
+    again: whether the optimum was found once more in other weights than the runs had. trend: where the cost is rough.
     """
-    lower = [o for o in outcomes if o.cost is not None and (best.cost - o.cost) * worth > DISTINCT]
+    jump = 0.0 if trend is None else LUCK * trend.roughness
+    lower = [o for o in outcomes if o.cost is not None and (best.cost - jump - o.cost) * worth > DISTINCT]
+    if trend is not None:
+        lower = [o for o in lower if not trend.holds(_end(problem, o), DISTINCT / worth)]
     if lower:
         return "not-converged", f"a run had reached a lower cost: {lower[0].message}"
-    there = _arrived(problem, best, outcomes, worth)
-    if not again and all(o.status == "flat" for o in there):
+    if trend is not None and not trend.settled:
+        return "not-converged", f"the trend of the cost has no optimum near the best run's end: {trend.text}"
+    there = _arrived(problem, best, outcomes, worth, jump)
+    if not again and trend is None and all(o.status == "flat" for o in there):
         return "not-converged", f"the start with the lowest cost did not move: {there[0].message}"
-    if again and promised(problem, best.theta) > SETTLED:
+    if again and trend is None and promised(problem, best.theta) > SETTLED:
         return "not-converged", (
             "the cost still falls where the best run used up its evaluations: bounds, a nearer start or more of [fit] starts help"
         )
-    if not again and not _stands(problem, best, there):
+    if not again and trend is None and not _stands(problem, best, there):
         return "not-converged", f"the best run did not reach an optimum: {there[0].message}"
     near = [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
     if near:
@@ -294,10 +320,13 @@ def _beside_the_other_optimum(
     return told
 
 
-def _arrived(problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], worth: float) -> list[StartOutcome]:
+def _arrived(
+    problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], worth: float, jump: float
+) -> list[StartOutcome]:
     """The runs that reached the optimum, the best first: its cost, to within what moves no estimate by half its spread, or
-    its place, to a thousandth of the ranges, for a cost may scatter by the simulation's own error."""
-    slack = max(1e-6 * best.cost, SAME / worth)
+    its place, to a thousandth of the ranges, for a cost may scatter by the simulation's own error. jump: what it does so by,
+    where that is known."""
+    slack = max(1e-6 * best.cost, SAME / worth) + jump
     reached = [
         (o.cost, o)
         for o in outcomes
@@ -306,10 +335,15 @@ def _arrived(problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], 
     return [o for _, o in sorted(reached, key=lambda pair: pair[0])]
 
 
+def _end(problem: Problem, outcome: StartOutcome) -> Array:
+    """(p,) where a run ended."""
+    return np.array([outcome.end[n] for n in problem.names])
+
+
 def _there(problem: Problem, best: Optimum, outcome: StartOutcome) -> bool:
     """Return whether a run ended where the best one did."""
     space = problem.coordinates
-    end = space.scaled(np.array([outcome.end[n] for n in problem.names]))
+    end = space.scaled(_end(problem, outcome))
     return bool((np.abs(end - space.scaled(best.theta)) <= 1e-3 * space.ranges).all())
 
 

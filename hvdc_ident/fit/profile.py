@@ -6,6 +6,7 @@ round: a step is a piece of work of its own, wherever it is done, and an executo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -26,10 +27,23 @@ from hvdc_ident.fit.profile_walk import (
     Walk,
     Walker,
 )
+from hvdc_ident.fit.rough import Trend
+from hvdc_ident.fit.unknown import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
 
-__all__ = ["ONE_SIDED", "TWO_SIDED", "Physical", "Profile", "Profiles", "Side", "SideStatus", "Walk", "profiles"]
+__all__ = [
+    "ONE_SIDED",
+    "TWO_SIDED",
+    "Physical",
+    "Profile",
+    "Profiles",
+    "Side",
+    "SideStatus",
+    "Walk",
+    "profiles",
+    "trend_profiles",
+]
 
 Asked = tuple[str, float]
 """A side: the unknown and the direction, -1.0 or 1.0."""
@@ -124,6 +138,50 @@ def profiles(
             continue
         named = {n: _profile([(walkers[n, d], sides[n, d]) for d in (-1.0, 1.0)]) for n in wanted}
         return Profiles(best.theta, best.at.cost, FrozenMap(named), tuple(restarts))
+
+
+def trend_profiles(
+    optimum: Trend,
+    unknowns: Sequence[Free],
+    names: Sequence[str],
+    covariance: Array,
+    gradient: Array,
+    threshold: Mapping[str, float],
+    physical: Physical,
+) -> FrozenMap[Profile]:
+    """The profile of each named unknown as the curvature of a rough cost's trend has it, for no walk finds its crossing.
+
+    covariance: (p, p) of the estimates, before what correlated samples add, which is in the thresholds; of one on a bound
+    the inverse of its curvature. gradient: (p,) of the cost, which pushes one that lies on a bound.
+    """
+    found = {}
+    for name in names:
+        i = [u.name for u in unknowns].index(name)
+        u, at = unknowns[i], float(optimum.theta[i])
+        bound = u.on_bound(at)
+        rise = threshold[name] * (ONE_SIDED / TWO_SIDED if bound else 1.0)
+        push = abs(float(gradient[i])) if bound else 0.0
+        half = covariance[i, i] * (math.sqrt(push**2 + 2.0 * rise / covariance[i, i]) - push)
+        ends = [_trend_side(u, at, side * half, physical.get(name, (False, False))) for side in (-1.0, 1.0)]
+        low, high = max(at - half, u.min), min(at + half, u.max)
+        values = np.unique(np.append(np.linspace(low, high, 9), at))
+        off = values - at
+        thetas = np.tile(optimum.theta, (values.size, 1)) + np.outer(off, covariance[:, i] / covariance[i, i])
+        rises = push * np.abs(off) + 0.5 * off**2 / covariance[i, i]
+        found[name] = Profile(name, at, ends[0], ends[1], values, rises, thetas, rise, bound)
+    return FrozenMap(found)
+
+
+def _trend_side(u: Free, at: float, off: float, physical: tuple[bool, bool]) -> Side:
+    """One end of the profile of a trend: off from the optimum, or the bound before it."""
+    end = u.max if off > 0 else u.min
+    if at == end:
+        return Side("open-at-bound", None, "the optimum lies on this bound")
+    if abs(off) < abs(end - at):
+        return Side("closed", at + off)
+    if physical[int(off > 0)]:
+        return Side("closed", end, f"ended by the physical bound {end:.4g}")
+    return Side("open-at-bound", None, f"the trend of the cost has not risen enough at the bound {end:.4g}")
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ class Walker:
             found = yield Descent(self.space.unscaled(x), self.fixed, enough)
         self.evaluations += found.evaluations
         fall = self.best.at.cost - found.at.cost
-        if fall > 0.02 * self.rise and not self.last:
+        if fall > max(0.02, self.walk.tolerance) * self.rise and not self.last:
             raise BetterFoundError(found.theta, fall)
         return found
 
@@ -208,7 +208,7 @@ class Walker:
         end = yield Descent(point.theta, np.zeros_like(self.fixed), 0.1 * self.walk.tolerance * self.rise)
         self.evaluations += end.evaluations
         fall = self.best.at.cost - end.at.cost
-        if fall > 0.02 * self.rise:
+        if fall > max(0.02, self.walk.tolerance) * self.rise:
             raise BetterFoundError(end.theta, fall)
 
     def _refine(self, x: float, at: Reached, ahead: float, there: Reached) -> Steps[tuple[float, Reached]]:

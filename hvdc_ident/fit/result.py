@@ -83,6 +83,7 @@ class FitResult(Shown):
     adequacy: whether the residuals are of the size of the noise, with the verdict in words and what to do.
     rmse, rmse_given, rmse_start: by output and experiment, at the optimum, at the given values and at the start, in the
     output's unit.
+    roughness: empty, or where the cost jumps from one parameter value to the next: {delta_chi2, by how much at random; text}.
     noise_source: by output, in words. sigma: standard deviation by experiment and output, in the output's unit.
     rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
     correlation: between the estimates. residual_tests: by output and experiment. starts: outcomes of the multistart.
@@ -106,6 +107,7 @@ class FitResult(Shown):
     rmse: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     rmse_start: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     rmse_given: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    roughness: Mapping[str, Any] = field(default_factory=dict)
     noise_source: FrozenMap[str] = field(default_factory=FrozenMap)
     sigma: FrozenMap[FrozenMap[float]] = field(default_factory=FrozenMap)
     rho: FrozenMap[float] = field(default_factory=FrozenMap)
@@ -129,6 +131,7 @@ class FitResult(Shown):
     def _screen(self) -> Iterator[str | Table]:
         yield f"Fit: {self.status}. {self.message[:1].upper()}{self.message[1:]}."
         yield self._quality()
+        yield f"{self.roughness['text']}." if self.roughness else ""
         start = self.starts[0].start if self.starts else {}
         rows = [(n, e.value, e.unit, _ends(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
         yield (

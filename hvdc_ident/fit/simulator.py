@@ -76,6 +76,11 @@ def sensitivity_error(simulator: Simulator) -> float:
     return max([*own, SENSITIVITY_ERROR])
 
 
+def approximate(simulator: Simulator) -> bool:
+    """Return whether the simulator says that its sensitivities are differences: runs of it may jump between values."""
+    return any(isinstance(s, Approximate) for s in (simulator, getattr(simulator, "model", None)))
+
+
 def inputs_of(simulator: Simulator, experiments: Sequence[Experiment]) -> dict[str, Input]:
     """The simulator's inputs; of one that does not name them, those of the experiments, as they began."""
     if isinstance(simulator, WithInputs):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -13,6 +14,9 @@ from hvdc_ident.fit.problem import stacked
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.trajectory import Array
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.rough import Trend
 
 SINGULAR = 1e-7
 """Singular values of the normalised columns below this share of the largest are the sensitivities' own error."""
@@ -62,6 +66,13 @@ class Uncertainty:
         alone = min(self.dof_independent, float(max(1, self.rows - len(self.names))))
         corrected = self.corrected * factor
         return replace(self, corrected=corrected, dof=min(self.dof, dof), dof_independent=alone, excess=factor)
+
+    def on_trend(self, trend: Trend | None, names: Sequence[str]) -> Uncertainty:
+        """The same with what the roughness of the cost adds. trend: None where there is none; names: of its unknowns."""
+        if trend is None:
+            return self
+        places = [list(names).index(n) for n in self.names]
+        return replace(self, raw=trend.widened(self.raw, places), corrected=trend.widened(self.corrected, places))
 
     def correlation(self) -> dict[str, dict[str, float]]:
         """Correlation of the estimates between those that have a standard deviation."""

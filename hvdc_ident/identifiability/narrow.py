@@ -11,7 +11,9 @@ import numpy as np
 
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit.objective import LeastSquares
-from hvdc_ident.fit.profile import Profile, Profiles, profiles
+from hvdc_ident.fit.profile import Profile, Profiles, Walk, profiles, trend_profiles
+from hvdc_ident.fit.rough import LUCK, Trend, roughness, trend_of
+from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability import verdicts
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
 from hvdc_ident.identifiability.evidence import (
@@ -114,6 +116,10 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
     """The optimum of the set all of whose profiles are closed, with a verdict on every member."""
     better = 0
     while optimum is not None:
+        rough = roughness(optimum.problem, optimum.theta)
+        trend = trend_of(optimum.problem, optimum.theta, rough)
+        if trend is not None:
+            optimum = Optimum(optimum.problem, trend.theta, trend)
         limits = thresholds(optimum)
         so_far.thresholds |= limits
         physical = physical_bounds(optimum.problem)
@@ -121,25 +127,31 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
             profiles,
             LeastSquares.of(optimum.problem),
             physical=physical,
-            walk=so_far.walk,
+            walk=_no_finer(so_far.walk, rough / min(limits.values())),
             executor=executor,
             progress=so_far.progress,
         )
-        around = walked(optimum.theta, optimum.names, threshold=limits)
-        so_far.notes += [f"A better optimum was found: {r}." for r in around.restarts]
-        optimum = Optimum(optimum.problem, around.theta)
+        if trend is not None:
+            by_name = _of_trend(optimum, trend, limits, physical, so_far.seed)
+            if _note_of(trend) not in so_far.notes:
+                so_far.notes.append(_note_of(trend))
+        else:
+            around = walked(optimum.theta, optimum.names, threshold=limits)
+            so_far.notes += [f"A better optimum was found: {r}." for r in around.restarts]
+            optimum = Optimum(optimum.problem, around.theta)
 
-        def again(
-            other: Mapping[str, float], walked: partial[Profiles] = walked, at: Array = around.theta
-        ) -> Mapping[str, Profile]:
-            return walked(at, list(other), threshold=other).by_name
+            def again(
+                other: Mapping[str, float], walked: partial[Profiles] = walked, at: Array = around.theta
+            ) -> Mapping[str, Profile]:
+                return walked(at, list(other), threshold=other).by_name
 
-        by_name = joint_limits(optimum, around.by_name, limits, again, seed=so_far.seed)
+            by_name = joint_limits(optimum, around.by_name, limits, again, seed=so_far.seed)
         opened = [n for n, p in by_name.items() if not bounded(p) or _undetermined(so_far, optimum, p)]
         if not opened:
             so_far.tell("other optima")
             others = other_optima(optimum, limits, so_far.ends)
-            if others and others[0].rise < -WORTH * min(limits.values()) and better < RESTARTS:
+            worth = WORTH * min(limits.values()) + (0.0 if trend is None else LUCK * trend.roughness)
+            if others and others[0].rise < -worth and better < RESTARTS:
                 so_far.notes.append(
                     f"A better optimum was found, from elsewhere: the cost fell by {-others[0].rise:.3g}."
                 )
@@ -159,6 +171,30 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
             so_far.combinations.append(replace(combo, held=(victim,)))
         optimum = so_far.without(optimum, {victim: so_far.found[victim].reason})
     return None
+
+
+def _no_finer(walk: Walk, rough: float) -> Walk:
+    """The walk, its crossings no finer than the roughness of the cost, as a share of the threshold."""
+    return walk if rough <= walk.tolerance else replace(walk, tolerance=rough)
+
+
+def _of_trend(
+    optimum: Optimum, trend: Trend, limits: Mapping[str, float], physical: Mapping[str, tuple[bool, bool]], seed: int
+) -> FrozenMap[Profile]:
+    """The profiles of the trend of a rough cost, with joint limits of several on bounds."""
+    problem = optimum.problem
+    r, jacobian = problem.residual(optimum.theta)
+
+    def again(other: Mapping[str, float]) -> FrozenMap[Profile]:
+        return trend_profiles(
+            trend, problem.unknowns, list(other), optimum.uncertainty.raw, jacobian.T @ r, other, physical
+        )
+
+    return joint_limits(optimum, again({n: limits[n] for n in optimum.names}), limits, again, seed=seed)
+
+
+def _note_of(trend: Trend) -> str:
+    return f"{trend.text}."
 
 
 def _undetermined(so_far: Findings, optimum: Optimum, profile: Profile) -> bool:

@@ -43,10 +43,15 @@ def other_optima(
     """
     objective, space = LeastSquares.of(best.problem), best.problem.coordinates
     limit = max(limits.values())
+
+    def teeth(theta: Array) -> bool:
+        """Return whether a point is the best one but for the roughness of the cost."""
+        return best.trend is not None and best.trend.holds(theta, limit)
+
     known = [space.scaled(best.theta)]
     begins: list[Array] = []
     for theta in (*_ended(best, ends, limit), *_exchanged(best)):
-        if _new(space.scaled(theta), known):
+        if _new(space.scaled(theta), known) and not teeth(theta):
             known.append(space.scaled(theta))
             begins.append(theta)
     found: list[Reached] = []
@@ -58,7 +63,7 @@ def other_optima(
             )
         except SimulationError:
             continue
-        if end.at.cost - best.cost < limit and _new(space.scaled(end.theta), reached):
+        if end.at.cost - best.cost < limit and _new(space.scaled(end.theta), reached) and not teeth(end.theta):
             reached.append(space.scaled(end.theta))
             found.append(end)
     found.sort(key=lambda r: r.at.cost)

@@ -17,6 +17,7 @@ from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.rough import Trend
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import misfit_weights
@@ -31,6 +32,7 @@ class Optimum:
 
     problem: Problem
     theta: Array
+    trend: Trend | None = None  # where the cost is rough, and this the optimum of its trend
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +83,8 @@ class Optimum:
         """What the curvature says, corrected for correlated samples."""
         source = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
         spans = np.array([u.span for u in self.problem.unknowns])
-        return uncertainty(self.blocks, self.problem.names, spans, source, noise_dof=self.problem.noise_dof)
+        known = uncertainty(self.blocks, self.problem.names, spans, source, noise_dof=self.problem.noise_dof)
+        return known.on_trend(self.trend, self.problem.names)
 
     @property
     def deterministic(self) -> tuple[str, ...]:

@@ -15,6 +15,8 @@ import numpy as np
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.optimiser import OptimiserResult, Outcome
 from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.rough import RUNS, roughness
+from hvdc_ident.fit.simulator import approximate
 from hvdc_ident.fit.unknown import Coordinates
 from hvdc_ident.trajectory import Array
 
@@ -149,6 +151,9 @@ class _Walk:
         if left <= 1e-4 * self.cost + 1e-12 * self.r.size:
             return "converged", "no smaller step lowers the cost"
         error = self._scatter(p, low, high)
+        if left > LUCK * error and approximate(self.problem.simulator):  # smooth on a tooth, and rough beyond it
+            self.evaluations += RUNS
+            error = max(error, roughness(self.problem, self.theta))
         if left <= LUCK * error:
             return "converged", f"no step lowers the cost by more than its own scatter there ({error:.2g})"
         return "stalled", "the sensitivities promise a lower cost that no step reaches (a jump, or their error)"

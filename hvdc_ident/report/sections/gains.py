@@ -43,6 +43,8 @@ def _outcome(fit: dict[str, Any]) -> str:
         head = "The model does not fit these records" if judged["verdict"] == "does-not-fit" else "On the noise"
         what = f" Next: {text(judged['next'])}." if judged.get("next") else ""
         said += f"<p><strong>{head}</strong>: {text(judged['text'])}.{what}</p>"
+    if fit.get("roughness"):
+        said += f"<p>{text(fit['roughness']['text'])}.</p>"
     return said
 
 

@@ -99,6 +99,7 @@ def told(data: Mapping[str, Any]) -> list[str]:
     judged = data.get("adequacy") or {}
     lines += [f"{FIT_WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
     lines += [f"Next: {judged['next']}"] if judged.get("next") else []
+    lines += [f"{data['roughness']['text']}."] if data.get("roughness") else []
     from hvdc_ident.study.responses import response_lines
 
     beside = _beside(data)

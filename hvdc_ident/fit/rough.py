@@ -1,0 +1,272 @@
+"""Optima of a cost that is rough: the trend over the width of the interval, not the lowest of many teeth.
+
+Events that pass rows, and adaptive steps of a solver that takes others at each parameter value, make the residuals jump from
+one value to the next. The cost is then a saw on a parabola: its lowest tooth lies anywhere within sqrt(2 roughness) standard
+deviations, and a profile that looks for a crossing stops at the next tooth. The roughness is told by fourth differences
+(J. J. More and S. M. Wild, SIAM J. Sci. Comput. 33 (2011) 1292), over steps as wide as the interval. Where it is not small
+against the threshold, the optimum is where the trend of the residuals, regressed over that width, has no gradient left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.problem import Problem, stacked
+from hvdc_ident.fit.simulator import approximate
+from hvdc_ident.fit.uncertainty import SINGULAR
+from hvdc_ident.trajectory import Array
+
+TWO_SIDED = 1.92
+"""Rise of the cost at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
+FINE = 0.05
+"""Share of its half-width by which an end may be off: 1.96 times 0.95 to 1.05 standard deviations cover 94 to 96 of 100."""
+SLIGHT = 2.0 * FINE
+"""Roughness, as a share of the threshold, that moves an end by less than that: the rise goes with the distance squared."""
+UNEVEN = -np.cos(np.pi * np.arange(9) / 8)
+"""Places from -1 to 1 along a coordinate: a constant, a slope and a bend leave 6 of 9 to tell the scatter by."""
+REACH = 2.0
+"""First reach of the places, in standard deviations: the interval."""
+LUCK = 3.0
+"""So many times the roughness the cost of the lowest of some twenty teeth, and of the next, may lie apart."""
+RUNS = 9
+"""Evaluations that tell the roughness."""
+ROUNDS = 8
+"""Times that the places are moved or spread before what is known then is taken."""
+SPREAD = 8.0
+"""At most so many times as far the places reach in the next round: the scatter in one is only roughly known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """The optimum of the trend of a rough cost.
+
+    theta: (p,), each unknown in its unit. gain: (p, p), what the covariance of the single run's derivatives is to be
+    multiplied by from both sides, for they are off. scatter: (p, p) covariance of theta by the roughness alone.
+    curvature: (p, p) of the cost. roughness: what the cost, half of chi-square, changes by at random between values within
+    the interval. settled: whether the optimum lies among the places that it was told from.
+    """
+
+    theta: Array
+    gain: Array
+    scatter: Array
+    curvature: Array
+    roughness: float
+    settled: bool = True
+
+    def holds(self, theta: Array, threshold: float) -> bool:
+        """Return whether a search may have ended at theta, (p,), for a tooth within the interval of this optimum."""
+        off = theta - self.theta
+        return bool(0.5 * off @ self.curvature @ off <= threshold + LUCK * self.roughness)
+
+    def widened(self, covariance: Array, places: Sequence[int] | None = None) -> Array:
+        """The covariance of the estimates, (k, k), with the derivatives' error and the roughness in it.
+
+        places: of those k among all p unknowns; None: all.
+        """
+        among = np.ix_(places, places) if places is not None else ...
+        gain = self.gain[among]
+        return np.asarray(gain @ covariance @ gain.T + self.scatter[among])
+
+    @property
+    def text(self) -> str:
+        """A sentence for the reader."""
+        return (
+            f"Runs of this simulator jump from one parameter value to the next, so that chi-square changes by about "
+            f"{2.0 * self.roughness:.2g} at random within the intervals (their ends lie where it has risen by 3.84): "
+            "estimates and intervals are those of its trend over the intervals, not of its lowest point"
+        )
+
+
+def residual_at(problem: Problem, theta: Array) -> Array:
+    """(N,) residuals at theta, (p,), without their derivatives. Raises SimulationError."""
+    r, _ = problem.loss.applied(*stacked(problem.blocks(theta, derivatives=False)))
+    return np.concatenate([r, problem.prior(theta)[0]]) if problem.priors else r
+
+
+def roughness(problem: Problem, theta: Array) -> float:
+    """Return what the cost changes by at random between values of theta, (p,), within its interval.
+
+    0 where sensitivities are exact, for such runs are smooth, and where a run fails beside theta: nothing is then known.
+    Residuals r that jump by n change the cost by sum r n + sum n^2/2, the first of mean 0 for noise in r. n is what
+    eight runs more leave of polynomials of degree 4, as fourth differences do, but at uneven steps: teeth that are even
+    would look smooth at even ones.
+    """
+    if not approximate(problem.simulator):
+        return 0.0
+    space = problem.coordinates
+    low, high = space.bounds
+    x = space.scaled(theta)
+    r, jacobian = problem.residual(theta)
+    length = np.linalg.norm(jacobian * space.slope(theta), axis=0)
+    room = np.maximum(high - x, x - low)
+    # All together they go through the interval of each unknown to one side.
+    step = np.minimum(np.where(length > 0, REACH / np.where(length > 0, length, 1.0), 0.0), room)
+    step = np.where(high - x >= x - low, step, -step)
+    try:
+        runs = np.array([r, *(residual_at(problem, space.unscaled(x + s * step)) for s in 0.5 + 0.5 * UNEVEN[1:])])
+    except SimulationError:
+        return 0.0
+    smooth = np.linalg.qr(np.polynomial.chebyshev.chebvander(UNEVEN, 4))[0]
+    left = runs - smooth @ (smooth.T @ runs)
+    squares = np.sum(left**2, axis=0) / (UNEVEN.size - smooth.shape[1])
+    return float(np.sqrt(np.sum(r**2 * squares)) + 0.5 * np.sum(squares))
+
+
+def threshold_of(problem: Problem, r: Array) -> float:
+    """The rise of the cost at the ends of an interval, which a misfit larger than the noise makes as much larger."""
+    return TWO_SIDED * max(1.0, float(r @ r) / max(r.size - len(problem.names), 1))
+
+
+def trend_of(problem: Problem, theta: Array, rough: float | None = None) -> Trend | None:
+    """The optimum of the trend near theta, (p,); None where the cost is smooth enough to be walked on, or a run fails.
+
+    rough: the `roughness` there, where it is known.
+
+    At places about the optimum, along each unknown, the Gauss-Newton step is taken with one and the same matrix of
+    derivatives J. Where it leads, q, is regressed on the place: its intercept is the optimum, and its slope B is what J
+    lacks of the trend's own derivatives, for with these q would be the same from everywhere. J has errors that do not
+    depend on the residuals, so it serves as an instrument: the covariance is G (J'J)^-1 G' with G = (1 - B)^-1.
+    The places are spread until B is known to `FINE`, and moved until the optimum lies among them.
+    """
+    rough = roughness(problem, theta) if rough is None else rough
+    if rough == 0.0 or rough <= SLIGHT * threshold_of(problem, residual_at(problem, theta)):
+        return None
+    space = problem.coordinates
+    low, high = space.bounds
+    x = space.scaled(theta)
+    inside = np.flatnonzero((x > low) & (x < high))
+    reach = np.full(inside.size, REACH)
+    found: Trend | None = None
+    for n in range(ROUNDS):
+        try:
+            at = space.unscaled(x)
+            whitened = _Whitened.of(problem, x, inside, problem.residual(at)[1] * space.slope(at))
+            if whitened is None:
+                return found
+            lines = _regressed(whitened, reach)
+        except SimulationError:
+            return found
+        rough = max(rough, lines.rough) if n == 0 else rough
+        error = float(lines.error.max())
+        gain = np.linalg.pinv(np.eye(inside.size) - lines.slope)
+        ahead = gain @ lines.intercept
+        x = np.clip(whitened.place(np.clip(ahead, -reach, reach)), low, high)
+        settled = bool((np.abs(ahead) <= reach).all())
+        found = whitened.trend(x, gain * np.sqrt(1.0 + error**2), gain @ lines.scatter @ gain.T, rough, settled)
+        if error > FINE:
+            reach = reach * min(max(error / FINE, 2.0), SPREAD)
+        elif settled:
+            return found
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """Coordinates about x in which the estimates have the covariance 1 by the derivatives there.
+
+    inside: the k unknowns that move. axes: (k, k) a step in scaled coordinates for each. left: (N, k) orthonormal.
+    """
+
+    problem: Problem
+    x: Array
+    inside: NDArray[np.intp]
+    axes: Array
+    left: Array
+
+    @classmethod
+    def of(cls, problem: Problem, x: Array, inside: NDArray[np.intp], columns: Array) -> _Whitened | None:
+        """The coordinates by (N, p) derivatives; None where they leave a direction undetermined."""
+        length = np.linalg.norm(columns[:, inside], axis=0)
+        if not inside.size or not (length > 0).all():
+            return None
+        u, s, vt = np.linalg.svd(columns[:, inside] / length, full_matrices=False)
+        if s[-1] <= SINGULAR * s[0]:
+            return None
+        return cls(problem, x, inside, vt.T / s / length[:, None], u)
+
+    def place(self, z: Array) -> Array:
+        """(p,) scaled coordinates of z, (k,)."""
+        moved = self.x.copy()
+        moved[self.inside] += self.axes @ z
+        return moved
+
+    def led(self, z: Array) -> Array:
+        """Return where a Gauss-Newton step from z leads with the derivatives of the centre, and the cost: (k + 1,)."""
+        r = residual_at(self.problem, self.problem.coordinates.unscaled(self.place(z)))
+        return np.append(z - self.left.T @ r, 0.5 * float(r @ r))
+
+    def room(self, j: int) -> tuple[float, float]:
+        """How far the bounds let go along the j-th coordinate, down and up."""
+        low, high = (b[self.inside] - self.x[self.inside] for b in self.problem.coordinates.bounds)
+        axis = self.axes[:, j]
+        with np.errstate(divide="ignore"):
+            ends = np.sort([low / axis, high / axis], axis=0)
+        return float(-ends[0].max()), float(ends[1].min())
+
+    def trend(self, x: Array, gain: Array, scatter: Array, rough: float, settled: bool) -> Trend:
+        """The trend whose optimum is at x, (p,), with gain and scatter, (k, k), in units of the unknowns."""
+        space = self.problem.coordinates
+        theta = space.unscaled(x)
+        axes = self.axes * space.slope(theta)[self.inside][:, None]
+        back = np.linalg.inv(axes)
+        whole, spread, curved = np.eye(x.size), np.zeros((x.size, x.size)), np.zeros((x.size, x.size))
+        among = np.ix_(self.inside, self.inside)
+        whole[among] = axes @ gain @ back
+        spread[among] = axes @ scatter @ axes.T
+        curved[among] = back.T @ back
+        return Trend(theta, whole, spread, curved, rough, settled)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Regression of where steps lead on where they begin: intercept (k,), slope (k, k) with its standard error, and the
+    intercept's covariance, so large that 1.96 standard deviations cover what Student's t of the places left says. rough:
+    what a parabola leaves of the cost."""
+
+    intercept: Array
+    slope: Array
+    error: Array
+    scatter: Array
+    rough: float
+
+
+def _regressed(at: _Whitened, reach: Array) -> _Lines:
+    """The regression from places along each coordinate as far as its reach, (k,)."""
+    k = reach.size
+    rows, led = [np.zeros(2 * k)], [at.led(np.zeros(k))]
+    for j in range(k):
+        for t in _nodes(*at.room(j), float(reach[j])):
+            z, row = np.zeros(k), np.zeros(2 * k)
+            z[j] = t
+            row[2 * j : 2 * j + 2] = t / reach[j], (t / reach[j]) ** 2
+            rows.append(row)
+            led.append(at.led(z))
+    design, q = np.column_stack([np.ones(len(rows)), np.array(rows)]), np.array(led)
+    coefficients, *_ = np.linalg.lstsq(design, q, rcond=None)
+    left = q - design @ coefficients
+    dof = len(rows) - 2 * k - 1
+    known = np.linalg.pinv(design.T @ design)
+    *_, rough = np.sqrt(np.sum(left**2, axis=0) / dof)
+    coefficients, left = coefficients[:, :k], left[:, :k]
+    noise = left.T @ left / dof
+    return _Lines(
+        coefficients[0],
+        coefficients[1::2].T / reach,
+        np.sqrt(np.outer(np.diag(noise), np.diag(known)[1::2])) / reach,
+        noise * known[0, 0] * float(stdtrit(dof, 0.975) / stdtrit(np.inf, 0.975)) ** 2,
+        float(rough),
+    )
+
+
+def _nodes(below: float, above: float, reach: float) -> list[float]:
+    """Places, but for 0, from -reach to reach; where the bounds are nearer than that, more of them on the side with room."""
+    near, far = min(below, above, reach), min(max(below, above), max(reach, 2.0 * reach - min(below, above)))
+    places = 0.5 * (far - near + (far + near) * UNEVEN) * (1.0 if above >= below else -1.0)
+    middle = int(np.argmin(np.abs(places)))  # 0, but for the rounding, where both sides have room
+    return [float(t) for n, t in enumerate(places) if n != middle]
