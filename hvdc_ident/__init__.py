@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.sensitivity.global_screening import morris, sobol
-    from hvdc_ident.sensitivity.linear import linear_sensitivities
+    from hvdc_ident.sensitivity.local_sensitivities import linear_sensitivities
     from hvdc_ident.sensitivity.sweep_result import SweepResult
     from hvdc_ident.signals import InputSignal, multisine, ramp, step
     from hvdc_ident.simulate.result import Simulation
@@ -157,7 +157,7 @@ _imported = offered(
         "models": "load_model",
         "parameters": "Input Parameter",
         "sensitivity.global_screening": "morris sobol",
-        "sensitivity.linear": "linear_sensitivities",
+        "sensitivity.local_sensitivities": "linear_sensitivities",
         "sensitivity.sweep_result": "SweepResult",
         "signals": "InputSignal multisine ramp step",
         "simulate.result": "Simulation",

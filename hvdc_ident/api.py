@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel, OperatingPoint
     from hvdc_ident.linearize.frequency import Response
     from hvdc_ident.linearize.jacobian import Side
-    from hvdc_ident.sensitivity.factors import Ranges
-    from hvdc_ident.sensitivity.local import LocalSensitivities
+    from hvdc_ident.sensitivity.derivatives import Ranges
+    from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
     from hvdc_ident.sensitivity.sweep_result import SweepResult
     from hvdc_ident.simulate import Simulation, Tolerance
     from hvdc_ident.study.assemble import DataLike, ModelLike, ParametersLike
@@ -241,7 +241,7 @@ def sensitivities(
 
     from hvdc_ident.errors import InputError
     from hvdc_ident.model.definition import Model
-    from hvdc_ident.sensitivity.local import sensitivities as derivatives
+    from hvdc_ident.sensitivity.local_sensitivities import sensitivities as derivatives
     from hvdc_ident.study.assemble import experiments_of, names_of, subject_of, values_of
     from hvdc_ident.study.study import Study
 
@@ -288,7 +288,7 @@ def sweep(
     """Return the RMSE of each output in each experiment, and poles where wanted, at many values of some parameters.
 
     parameters: {name: values}, several make their product; or `grid`, `log_grid`, `latin_hypercube` of
-    `hvdc_ident.sensitivity.axes`. A study has its own in [[sweep]]. data: a study, experiments or a table.
+    `hvdc_ident.sensitivity.sampling`. A study has its own in [[sweep]]. data: a study, experiments or a table.
     against: "data" (default where outputs were recorded), "base" (the run at the model's own values) or another model.
     want: "rmse", "poles" or "bode" (default: "rmse", without data "poles").
     executor, progress: as in `fit`. A point that fails is a row with a reason and no number.
@@ -299,7 +299,7 @@ def sweep(
     (3, 6)
     """
     from hvdc_ident.errors import StudyError
-    from hvdc_ident.sensitivity.sweep import sweep as swept
+    from hvdc_ident.sensitivity.sweep_run import sweep as swept
     from hvdc_ident.study.assemble import model_of, names_of, study_of, values_of
     from hvdc_ident.study.sweeps import against_of, axes_of, wanted
 

@@ -20,9 +20,9 @@ from hvdc_ident.linearize import find_operating_point
 from hvdc_ident.linearize.loop import loop
 from hvdc_ident.linearize.margins import margins
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity.forward import trajectory_sensitivities
-from hvdc_ident.sensitivity.sweep import sweep
+from hvdc_ident.sensitivity.derivatives import trajectory_sensitivities
 from hvdc_ident.sensitivity.sweep_result import SweepResult
+from hvdc_ident.sensitivity.sweep_run import sweep
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.study import Study, load_study
 from hvdc_ident.study.sweeps import axes_of

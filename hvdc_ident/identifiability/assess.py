@@ -28,7 +28,7 @@ from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.structure import structure as structure_of
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.fisher import collinear_subsets
-from hvdc_ident.sensitivity.local import LocalSensitivities, sensitivities
+from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities, sensitivities
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 ENOUGH = 5

@@ -23,7 +23,7 @@ from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.notebook import Shown, Table, data_frame
 from hvdc_ident.sensitivity.fisher import Collinear
-from hvdc_ident.sensitivity.local import LocalSensitivities
+from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
 
 CONDITIONS = (
     "Every verdict holds for these outputs, experiments, noise and bounds, at the optimum of the pilot fit; with other "

@@ -15,7 +15,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.local_rank import METHOD, local_rank
 from hvdc_ident.model.definition import Model
-from hvdc_ident.sensitivity.rank.combination import Combination as Found
+from hvdc_ident.sensitivity.rank.invariants import StructuralCombination
 from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
 from hvdc_ident.simulate.structure import Structure as Equations
 
@@ -117,7 +117,7 @@ def _hidden(model: Model, alone: Sequence[str], names: Sequence[str], outputs: S
     return {n for n in alone if any(c.members == (n,) for c in wide.combinations)}
 
 
-def _confirmed(found: Sequence[Found], numbers: Structure) -> tuple[tuple[Combination, ...], set[str]]:
+def _confirmed(found: Sequence[StructuralCombination], numbers: Structure) -> tuple[tuple[Combination, ...], set[str]]:
     """The combinations that the numbers lose too, and the parameters that the numbers tell apart.
 
     Of a combination that the numbers lose in part only, that part stands, in the numbers' words.
@@ -155,7 +155,7 @@ def _behind_switches(model: Model, outputs: Sequence[str]) -> set[str]:
     return {listed[k] for _, group, k in behind if group == "p"}
 
 
-def _combination(c: Found) -> Combination:
+def _combination(c: StructuralCombination) -> Combination:
     direction: FrozenMap[float] = (
         FrozenMap(zip(c.members, c.directions[0], strict=True)) if c.directions else FrozenMap()
     )

@@ -1,8 +1,6 @@
-"""What experiments tell about parameters, to first order: information matrices and what can be read from them.
+"""Fisher information of experiments about parameters, and what follows from it to first order.
 
-Columns are whitened sensitivities (output over its standard deviation, per unit of the scaled parameter), rows the
-samples. Scaled coordinates: d ln(theta) where a parameter is positive, d theta/(max - min) where 0 is admissible.
-Collinearity index: Brun, Reichert, Kuensch 2001, doi 10.1029/2000WR900350.
+Collinear subsets, null directions, inflation and the order in which parameters are determined.
 """
 
 from __future__ import annotations
@@ -16,8 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.sensitivity.pivot import leading
 from hvdc_ident.trajectory import Array
+
+EQUAL = 1e-9
+"""Share of the largest magnitude by which two entries of a direction differ and are still equal."""
+
+
+def leading(direction: Array) -> int:
+    """Return the index of the first entry that is as large in magnitude as any, to EQUAL. direction: (n,).
+
+    That entry is scaled to 1: an index that rounding cannot change from one machine to another.
+    """
+    size = np.abs(direction)
+    return int(np.argmax(size >= (1.0 - EQUAL) * size.max()))
+
 
 THRESHOLD = 1.92
 """Half the 95 % quantile of chi-square with one degree of freedom."""

@@ -1,4 +1,4 @@
-"""Which parameters matter over their whole ranges: Morris' elementary effects and Sobol's indices, through SALib.
+"""Global screening of parameters over their ranges: Morris' elementary effects and Sobol's indices, through SALib.
 
 SALib is an extra: pip install 'hvdc_ident[screening]'. Morris 1991, doi 10.1080/00401706.1991.10484804; Saltelli et al.
 2010, doi 10.1016/j.cpc.2009.09.018.
@@ -20,9 +20,9 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
-from hvdc_ident.sensitivity.axes import Samples
-from hvdc_ident.sensitivity.sweep import sweep
-from hvdc_ident.sensitivity.text import table_text
+from hvdc_ident.sensitivity.derivatives import table_text
+from hvdc_ident.sensitivity.sampling import Samples
+from hvdc_ident.sensitivity.sweep_run import sweep
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Screening:
-    """What a screening found for the RMSE of each (output, experiment) of `series`.
+class ScreeningResult:
+    """Measures of a screening for the RMSE of each (output, experiment) of `series`.
 
     measures: (series, parameters) by name. Morris: mu_star, mu, sigma, mu_star_conf, in the output's unit over the
     whole range. Sobol: S1, ST, S1_conf, ST_conf: shares of the variance. failed: points that failed; dropped: Morris
@@ -105,8 +105,8 @@ def morris(
     seed: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Screening:
-    """Elementary effects of the RMSE over the ranges: trajectories (k + 1) runs for k parameters; same seed, same result.
+) -> ScreeningResult:
+    """Return elementary effects of the RMSE over the ranges: trajectories (k + 1) runs for k parameters; same seed, same result.
 
     ranges: (min, max) by parameter, in its unit. A trajectory with a failed run is left out and counted. Other arguments
     as in `sweep`. Raises InputError where SALib is not installed, ComputationError where no trajectory is whole.
@@ -135,7 +135,7 @@ def morris(
         for n in names:
             found[n].append(np.asarray(line[n], dtype=float))
     bad, dropped = int((~np.isfinite(rmse).all(axis=1)).sum()), int((~whole).sum())
-    return Screening("morris", tuple(ranges), series, _measures(found), x.shape[0], bad, dropped)
+    return ScreeningResult("morris", tuple(ranges), series, _measures(found), x.shape[0], bad, dropped)
 
 
 def sobol(
@@ -150,8 +150,8 @@ def sobol(
     seed: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> Screening:
-    """First-order and total shares of the RMSE's variance over the ranges: samples (k + 2) runs; same seed, same result.
+) -> ScreeningResult:
+    """Return first-order and total shares of the RMSE's variance over the ranges: samples (k + 2) runs; same seed, same result.
 
     samples: a power of 2. Other arguments as in `morris`. Raises InputError where SALib is not installed,
     ComputationError where a run fails: the indices need every one.
@@ -182,11 +182,11 @@ def sobol(
             line = analyse.analyze(problem, rmse[:, column], calc_second_order=False, seed=seed)
         for n in names:
             found[n].append(np.asarray(line[n], dtype=float))
-    return Screening("sobol", tuple(ranges), series, _measures(found), x.shape[0])
+    return ScreeningResult("sobol", tuple(ranges), series, _measures(found), x.shape[0])
 
 
 def _installed() -> None:
-    """Raises InputError where SALib is missing."""
+    """Raise InputError where SALib is missing."""
     try:
         import SALib  # noqa: F401
     except ImportError:
@@ -217,7 +217,7 @@ def _errors(
     executor: Executor | None,
     progress: Progress | None,
 ) -> tuple[Array, tuple[tuple[str, str], ...], str]:
-    """(runs, series) RMSE, nan where a run failed; what the columns are; the first reason."""
+    """Return the RMSE, (runs, series), nan where a run failed; the series of the columns; the first reason of a failure."""
     found = sweep(
         model,
         experiments,

@@ -1,4 +1,4 @@
-"""What a sweep found: rows in the order of its points, as JSON, CSV, xarray and figures."""
+"""Result of a sweep: rows in the order of its points, as JSON, CSV, xarray and figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.files import csv_cell
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.notebook import Shown, Table, data_frame
-from hvdc_ident.sensitivity.axes import Points, Samples
+from hvdc_ident.sensitivity.sampling import Points, Samples
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ class SweepResult(Shown):
         }
 
     def summary(self) -> dict[str, Any]:
-        """What sweep.json says beside the points: parameters with axis and base, units, what was compared, failures."""
+        """Return the part of sweep.json beside the points: parameters with axis and base, units, what was compared, failures."""
         kinds = {n: a for a in self.axes for n in a.names}
         return {
             "parameters": {

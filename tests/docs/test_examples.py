@@ -17,7 +17,7 @@ WITH_EXAMPLES = (
     "hvdc_ident.linearize.loop",
     "hvdc_ident.linearize.operating_point",
     "hvdc_ident.models",
-    "hvdc_ident.sensitivity.sweep",
+    "hvdc_ident.sensitivity.sweep_run",
     "hvdc_ident.study.export",
 )
 

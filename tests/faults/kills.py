@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import cases
 import forks
 
-from hvdc_ident.sensitivity import sweep
+from hvdc_ident.sensitivity import sweep_run
 
 STAGES = ("sweep", "identify", "diagnose")
 
@@ -45,7 +45,7 @@ class Tally:
 def killed(stage: str, folder: Path, kills: int, seed: int, workers: int) -> Tally:
     """The tally of so many kills of a stage, in a folder of its own. Raises AssertionError where a run fails by itself."""
     if workers > 1:
-        sweep.PROBE = sweep.WORTH = -1.0
+        sweep_run.PROBE = sweep_run.WORTH = -1.0
     path = cases.write_study(folder, points=3000, hidden=0.02 if stage == "diagnose" else 0.0)
     options = ("--workers", workers)
     forks.run(stage, path, "--out", folder / "whole", *options)  # everything is compiled here

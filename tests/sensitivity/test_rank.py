@@ -17,8 +17,7 @@ import sympy as sp
 from hvdc_ident.expression import parse
 from hvdc_ident.model.definition import Algebraic, Model, Output, State
 from hvdc_ident.sensitivity.rank.equations import Equations, Source
-from hvdc_ident.sensitivity.rank.high_precision import HighPrecision, context
-from hvdc_ident.sensitivity.rank.prime_field import PRIMES, NoSuchNumber, PrimeField, numerator, roots
+from hvdc_ident.sensitivity.rank.rings import PRIMES, HighPrecision, NoSuchNumber, PrimeField, context, numerator, roots
 from hvdc_ident.sensitivity.rank.taylor import Taylor
 
 FIELD = PrimeField()

@@ -12,8 +12,8 @@ from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.model.definition import Algebraic, Delay, Model, Output, Signal, State
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity.rank import answer
-from hvdc_ident.sensitivity.rank.prime_field import NotRational
+from hvdc_ident.sensitivity import structural
+from hvdc_ident.sensitivity.rank.rings import NotRational
 from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
 from hvdc_ident.simulate import simulate
 
@@ -212,7 +212,7 @@ def test_real_points_see_what_the_field_sees(link: Model, monkeypatch: pytest.Mo
     for model, outputs, parameters, moved in models:
         exact = ask(model, outputs, parameters, inputs={moved: "ramp"}, start=start, time_limit=30)
         with monkeypatch.context() as patch:
-            patch.setattr(answer, "FieldPoints", _refuse)
+            patch.setattr(structural, "FieldPoints", _refuse)
             real = ask(model, outputs, parameters, inputs={moved: "ramp"}, start=start, time_limit=60)
         assert (exact.method, real.method) == ("prime field", "numeric, local")
         assert real.identifiable == exact.identifiable

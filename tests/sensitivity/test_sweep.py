@@ -14,8 +14,8 @@ from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
 from hvdc_ident.model.card import parse_card
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity.axes import grid, latin_hypercube, listed
-from hvdc_ident.sensitivity.sweep import sweep
+from hvdc_ident.sensitivity.sampling import grid, latin_hypercube, listed
+from hvdc_ident.sensitivity.sweep_run import sweep
 from hvdc_ident.study.executors import Ended
 from hvdc_ident.trajectory import trajectory
 from tests.effort import calls
@@ -106,8 +106,8 @@ class Backwards:
 
 
 def test_rows_stand_where_their_points_stand(monkeypatch):
-    monkeypatch.setattr("hvdc_ident.sensitivity.sweep.PROBE", -1.0)
-    monkeypatch.setattr("hvdc_ident.sensitivity.sweep.WORTH", -1.0)
+    monkeypatch.setattr("hvdc_ident.sensitivity.sweep_run.PROBE", -1.0)
+    monkeypatch.setattr("hvdc_ident.sensitivity.sweep_run.WORTH", -1.0)
     axis = latin_hypercube({"k": (1, 9), "g": (1, 2)}, 30, seed=1)
     plain = sweep(MODEL, [RECORDED], axis)
     found = sweep(MODEL, [RECORDED], axis, executor=Backwards())

@@ -1,1 +1,1 @@
-"""How structural identifiability is decided: series over exact numbers, random points, ranks, and words for what is seen."""
+"""Ranks for structural identifiability: rings, Taylor series over them, random points, and invariants of the parameters."""

@@ -13,7 +13,7 @@ import numpy as np
 from hvdc_ident.errors import InputError, SteadyStateError, unknown_name
 from hvdc_ident.expression.functions import FUNCTIONS
 from hvdc_ident.model.definition import Model
-from hvdc_ident.sensitivity.rank.prime_field import Array, NotRational
+from hvdc_ident.sensitivity.rank.rings import Array, NotRational
 from hvdc_ident.simulate.engine import engine
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.structure import Structure
@@ -139,7 +139,7 @@ class Source:
         return tuple(found)
 
     def _conditions(self) -> dict[int, bool]:
-        """{condition: whether it holds} at the operating point."""
+        """Return {condition: True where it holds} at the operating point."""
         g = self.graph
         if not g.switches:
             return {}
@@ -245,6 +245,6 @@ class _Branches:
         return g.call("sqrt" if op == "sqrt0" else op, *x)
 
     def _turns(self, y: int, x: int) -> float:
-        """What atan2(y, x) exceeds atan(y/x) by at the operating point."""
+        """Return atan2(y, x) - atan(y/x) at the operating point."""
         top, bottom = self.source.evaluate([y, x], self.origin.leaves())
         return 0.0 if bottom > 0 else math.copysign(math.pi, top)

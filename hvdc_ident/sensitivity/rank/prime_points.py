@@ -1,17 +1,260 @@
-"""Random points over a prime field: values found step by step, and the rows there."""
+"""Random points over a prime field at which given equations hold, found step by step without general elimination.
+
+Every named signal and every root is a variable with an equation of its own, so that the system is large and sparse.
+An equation with one variable left is solved for it; a variable left in one equation only is solved from it, last; where
+neither is to be had, one variable is chosen at random, and if an equation then contradicts, it becomes a root of that
+equation: a polynomial in one unknown.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from random import Random
 from typing import Any
 
 from hvdc_ident.sensitivity.rank.equations import Equations
-from hvdc_ident.sensitivity.rank.field_point import Draw, Solve, Sparse, Step, Tear, plan
 from hvdc_ident.sensitivity.rank.points import Base, Question, Rows, affected, rows
-from hvdc_ident.sensitivity.rank.prime_field import NoSuchNumber, NotRational, PrimeField, numerator, roots
-from hvdc_ident.sensitivity.rank.ring import OutOfTime
+from hvdc_ident.sensitivity.rank.rings import NoSuchNumber, NotRational, OutOfTime, PrimeField, numerator, roots
+from hvdc_ident.simulate.graph import Graph
+
+FIXED = -1
+
+
+@dataclass(frozen=True)
+class Solve:
+    """The variable is the root of the equation, of degree 1 or 2 in it."""
+
+    equation: int
+    variable: int
+    degree: int
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The variable is random."""
+
+    variable: int
+
+
+@dataclass(frozen=True)
+class Tear:
+    """The variable is such that the steps, taken from it, leave 0 in the equation."""
+
+    variable: int
+    steps: tuple[Solve, ...]
+    equation: int
+
+
+@dataclass(frozen=True)
+class Check:
+    """The equation has nothing left to solve for and must hold by itself."""
+
+    equation: int
+
+
+Step = Solve | Draw | Tear | Check
+
+
+class Sparse:
+    """Polynomial equations in leaves, signals and roots, from nodes of a model's graph.
+
+    known: leaves that have a value; null: leaves that are 0. Every other leaf and every signal or root is a variable.
+    """
+
+    def __init__(self, equations: Equations, zeros: Sequence[int], known: Sequence[int], null: Collection[int]) -> None:
+        self.source, self.graph, self.null = equations.graph, Graph(), null
+        self.signals = {n for n in equations.signals if self.source.nodes[n][0] not in ("leaf", "const")}
+        self.constants: dict[int, float] = {}
+        self.leaf_of: dict[int, int] = {}
+        self._fractions: dict[int, tuple[int, int]] = {}
+        self._products: dict[int, int] = {}
+        self.equations: list[int] = []
+        self.fixed = {self._variable(n) for n in known if self.source.nodes[n][0] == "leaf"}
+        same = [self._same(z) for z in zeros]  # all before any expression is read
+        for z, alike in zip(zeros, same, strict=True):
+            if alike:
+                self._fraction(self.source.nodes[z][1])
+            else:
+                self.equations.append(self._fraction(z)[0])
+        self.equations = [self._with_products(e) for e in self.equations]
+        self.fixed |= set(self.constants)
+        self._slopes: dict[int, dict[int, int]] = {e: self.graph.gradient(e) for e in self.equations}
+
+    def _same(self, zero: int) -> bool:
+        """True where an equation only says that an unknown is a signal: both are one variable from here on."""
+        op, *a = self.source.nodes[zero]
+        if (
+            op != "sub"
+            or a[0] not in self.signals
+            or a[1] in self.leaf_of
+            or self.source.nodes[a[1]][:2] != ("leaf", "y")
+        ):
+            return False
+        self.leaf_of[a[1]] = self._variable(a[0])
+        return True
+
+    def _variable(self, node: int) -> int:
+        if node not in self.leaf_of:
+            self.leaf_of[node] = self.graph.leaf("v", node)
+        return self.leaf_of[node]
+
+    def _fraction(self, node: int) -> tuple[int, int]:
+        """Numerator and denominator of a node of the source in the variables."""
+        for n in self.source.reachable([node]):
+            if n not in self._fractions:
+                self._fractions[n] = self._define(n)
+        return self._fractions[node]
+
+    def _define(self, n: int) -> tuple[int, int]:
+        g = self.graph
+        op, *a = self.source.nodes[n]
+        if n in self.null:
+            return g.zero, g.one
+        if op in ("leaf", "const"):
+            v = self._variable(n)
+            if op == "const":
+                if a[0] in (0.0, 1.0):
+                    return g.constant(a[0]), g.one
+                self.constants[v] = a[0]
+            return v, g.one
+        top, bottom = self._operate(n, op, [self._fractions[k] for k in a])
+        if n not in self.signals:
+            return top, bottom
+        v = self._variable(n)
+        if bottom == g.one:
+            self._products.setdefault(top, v)
+        self.equations.append(g.sub(g.mul(v, bottom), top))
+        return v, g.one
+
+    def _operate(self, n: int, op: str, x: list[tuple[int, int]]) -> tuple[int, int]:
+        g = self.graph
+        if op in ("add", "sub"):
+            join = g.add if op == "add" else g.sub
+            (a, b), (c, d) = x
+            return (join(a, c), b) if b == d else (join(g.mul(a, d), g.mul(c, b)), g.mul(b, d))
+        if op == "neg":
+            return g.neg(x[0][0]), x[0][1]
+        if op == "mul":
+            return g.mul(x[0][0], x[1][0]), g.mul(x[0][1], x[1][1])
+        if op == "div":
+            return g.mul(x[0][0], x[1][1]), g.mul(x[0][1], x[1][0])
+        if op == "sqrt":
+            v = self._variable(n)
+            self.equations.append(g.sub(g.mul(g.mul(v, v), x[0][1]), x[0][0]))
+            return v, g.one
+        raise NotRational(f"'{op}' in the equations of the start")
+
+    def _with_products(self, equation: int) -> int:
+        """The equation with products that are a signal's definition written as that signal."""
+        g, new = self.graph, {}
+        for n in g.reachable([equation]):
+            op, *a = g.nodes[n]
+            if n in self._products and g.nodes[n][0] == "mul" and not self._defines(equation, n):
+                new[n] = self._products[n]
+            else:
+                new[n] = n if op in ("leaf", "const") else getattr(g, op)(*(new[k] for k in a))
+        return new[equation]
+
+    def _defines(self, equation: int, product: int) -> bool:
+        return self.graph.nodes[equation] == ("sub", self._products[product], product)
+
+    def variables(self, equation: int) -> set[int]:
+        """The variables an equation depends on."""
+        return set(self._slopes[equation]) - self.fixed
+
+    def degree(self, equation: int, variable: int) -> int:
+        """1 or 2: the equation's degree in a variable; 3 stands for more."""
+        slope = self._slopes[equation][variable]
+        if variable not in self.graph.reachable([slope]):
+            return 1
+        second = self.graph.gradient(slope)[variable]
+        return 2 if variable not in self.graph.reachable([second]) else 3
+
+
+def plan(s: Sparse, drawable: set[int], first: set[int], random: Random | None = None) -> list[Step]:
+    """Steps that give every variable a value; NotRational where this simple way does not lead through.
+
+    drawable: variables that may be random. first: those that are drawn before anything is solved.
+    random: makes another plan where there are several, for one may lead to a branch that another avoids.
+    """
+    steps: list[Step] = [Draw(v) for v in sorted(first)]
+    last: list[Step] = []
+    known, left = set(first), list(s.equations)
+    while left:
+        done = _forward(s, left, known, steps)
+        if not left or done or _peel(s, left, known, last):
+            continue
+        _tear(s, left, known, steps, drawable, random)
+    unknown = (
+        {v for e in s.equations for v in s.variables(e)} - known - {x.variable for x in last if isinstance(x, Solve)}
+    )
+    return [*steps, *(Draw(v) for v in sorted(unknown)), *reversed(last)]
+
+
+def _forward(s: Sparse, left: list[int], known: set[int], steps: list[Step], highest: int = 2) -> bool:
+    """Solve the first equation that has one variable left."""
+    for e in left:
+        rest = s.variables(e) - known
+        if len(rest) == 1:
+            v = rest.pop()
+            if s.degree(e, v) <= highest:
+                steps.append(Solve(e, v, s.degree(e, v)))
+                known.add(v)
+                left.remove(e)
+                return True
+    return False
+
+
+def _peel(s: Sparse, left: list[int], known: set[int], last: list[Step]) -> bool:
+    """Put aside the equation of a variable that no other equation has."""
+    where: dict[int, list[int]] = {}
+    for e in left:
+        for v in s.variables(e) - known:
+            where.setdefault(v, []).append(e)
+    alone = [(s.degree(es[0], v), v, es[0]) for v, es in where.items() if len(es) == 1]
+    for degree, v, e in sorted(alone):
+        if degree <= 2:
+            last.append(Solve(e, v, degree))
+            left.remove(e)
+            return True
+    return False
+
+
+def _tear(
+    s: Sparse, left: list[int], known: set[int], steps: list[Step], drawable: set[int], random: Random | None
+) -> None:
+    counts: dict[int, int] = {}
+    for e in left:
+        for v in s.variables(e) - known:
+            counts[v] = counts.get(v, 0) + 1
+    if not counts:
+        steps.extend(Check(e) for e in left)
+        left.clear()
+        return
+    surplus = len(counts) > len(left)
+    order = sorted(counts, key=lambda v: (-counts[v], v))
+    if random is not None:
+        random.shuffle(order)
+    for v in order:
+        inner: list[Step] = []
+        tried, remaining = known | {v}, list(left)
+        while _forward(s, remaining, tried, inner, highest=1):
+            closing = next((e for e in remaining if not s.variables(e) - tried), None)
+            if closing is not None:
+                remaining.remove(closing)
+                steps.append(Tear(v, tuple(x for x in inner if isinstance(x, Solve)), closing))
+                known |= tried
+                left[:] = remaining
+                return
+    if surplus:
+        chosen = next((v for v in order if v in drawable), order[0])
+        steps.append(Draw(chosen))
+        known.add(chosen)
+        return
+    raise NotRational("the start's equations are too entangled")
+
 
 TRIES = 300
 
@@ -35,7 +278,7 @@ class Values:
         self.of = dict(given) | {v: ring.number(Equations.fraction(c)) for v, c in s.constants.items()}
 
     def take(self, steps: Sequence[Step]) -> None:
-        """Takes the steps; NoSuchNumber where a root or a quotient does not exist."""
+        """Take the steps. Raises NoSuchNumber where a root or a quotient does not exist."""
         for step in steps:
             if isinstance(step, Draw):
                 self.of[step.variable] = self.ring.random(self.random)
@@ -153,7 +396,7 @@ class FieldPoints:
         return Base(p, y, w, self._roots(self.sparse, of), frozenset(n for n, v in known.items() if of.get(v)))
 
     def _same_branch(self, y: list[Any]) -> None:
-        """Refuses a start at which something is 0 that is not 0 at the operating point: it solves other equations."""
+        """Raise for a start at which a node is 0 that is not 0 at the operating point: it solves other equations."""
         q = self.q
         if not (q.rested and (q.rest.residuals or q.source.graph.switches)):
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +15,47 @@ from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.sensitivity.factors import Ranges, factors
-from hvdc_ident.sensitivity.text import table_text
 from hvdc_ident.simulate.engine import simulate
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+def factors(
+    model: Model, names: Sequence[str], values: Mapping[str, float], ranges: Ranges
+) -> tuple[FrozenMap[float], FrozenMap[float]]:
+    """Return the parameters' values and the factors that normalise derivatives by them, both in the parameters' units.
+
+    A factor is the width of a given range, else the magnitude of the value; where the value is 0, the width of the
+    model's own bounds or the parameter's size. Raises UnknownNameError, and StudyError for a range without a width.
+    """
+    at, found = {}, {}
+    for name in names:
+        if name not in model.parameters:
+            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+        own = model.parameters[name]
+        at[name] = float(values.get(name, own.value))
+        low, high = ranges.get(name, (own.min, own.max))
+        width = high - low
+        if name in ranges and not (math.isfinite(width) and width > 0):
+            raise StudyError(
+                f"the range of '{name}' is wrong", expected="finite min < max", got=f"min {low:g}, max {high:g}"
+            )
+        if name in ranges or (at[name] == 0 and math.isfinite(width) and width > 0):
+            found[name] = float(width)
+        else:
+            found[name] = abs(at[name]) or own.size
+    return FrozenMap(at), FrozenMap(found)
+
+
+def table_text(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Return a header and lines as text with aligned columns."""
+    rows = [tuple(header), *map(tuple, lines)]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(header))]
+    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +65,7 @@ class Sensitivities:
     values: of the parameters. factors: what a derivative is multiplied by to be normalised, in the parameter's unit:
     its value, or its range where one is given or the value is 0. outputs: by experiment; times: (n,) s; gradients:
     (n, outputs, parameters), output unit per parameter unit; compared: (n,) the rows inside the window.
-    notes: what makes a sensitivity say little, by experiment.
+    notes: by experiment, a reason why its sensitivities say little.
     """
 
     model: str
@@ -46,7 +81,7 @@ class Sensitivities:
     notes: FrozenMap[str]
 
     def of(self, experiment: str, output: str, parameter: str, *, normalised: bool = False) -> Array:
-        """(n,) one derivative over time, in units, or times the parameter's factor."""
+        """Return one derivative over time, (n,), in units or times the parameter's factor."""
         place, column = self._place(experiment, output, parameter)
         found = self.gradients[experiment][:, place, column]
         return found * self.factors[parameter] if normalised else found
@@ -166,7 +201,7 @@ def trajectory_sensitivities(
     outputs: Sequence[str] | None = None,
     ranges: Ranges | None = None,
 ) -> Sensitivities:
-    """The exact derivatives of each experiment's outputs over time, the start's dependence on the parameters included.
+    """Return the exact derivatives of each experiment's outputs over time, the start's dependence on the parameters included.
 
     parameters: default, all of the model. values: parameters that differ from the model's. outputs: names of outputs or
     signals (default: the recorded ones, else all outputs). ranges: (min, max) of a parameter, in its unit, as its factor.
@@ -263,7 +298,7 @@ def steady_sensitivities(
     outputs: Sequence[str] | None = None,
     ranges: Ranges | None = None,
 ) -> SteadySensitivities:
-    """The exact derivatives of the steady state of the given values of parameters and inputs.
+    """Return the exact derivatives of the steady state at given values of parameters and inputs.
 
     outputs: names of outputs or signals; default, all outputs. Raises SteadyStateError where there is none.
     """

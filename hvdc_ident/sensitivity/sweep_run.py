@@ -1,4 +1,4 @@
-"""The verb `sweep`: a model run at many points of its parameters, compared with data, another model or itself."""
+"""Sweeps: a model run at many points of its parameters, compared with data, another model or itself."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from hvdc_ident.executor import Executor, Progress, ends
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.external import AnyModel
-from hvdc_ident.sensitivity.axes import AxesLike, Points, points_of
-from hvdc_ident.sensitivity.point import PointTask
-from hvdc_ident.sensitivity.question import Want, check, task_of
+from hvdc_ident.sensitivity.sampling import AxesLike, Points, points_of
+from hvdc_ident.sensitivity.sweep_point import PointTask, Want, check, task_of
 from hvdc_ident.sensitivity.sweep_result import SweepResult
 from hvdc_ident.trajectory import Array
 
@@ -26,7 +25,7 @@ TOLD = 0.1  # s between two reports of progress
 
 
 class Kept(Protocol):
-    """Where finished points are kept: bytes by key."""
+    """Store of finished points: bytes by key."""
 
     def get(self, keys: Sequence[bytes], /) -> Mapping[bytes, bytes]: ...
     def put(self, key: bytes, value: bytes, /) -> None: ...
@@ -72,7 +71,7 @@ def sweep(
     kept: Callable[[str], Kept] | None = None,
     progress: Progress | None = None,
 ) -> SweepResult:
-    """A row for each point: the RMSE of each output in each experiment, and poles or frequency response where wanted.
+    """Return a row for each point: the RMSE of each output in each experiment, and poles or frequency response if wanted.
 
     axes: `grid`, `log_grid`, `listed`, `latin_hypercube`, several of them (their product, the last moves fastest), or
     {name: values}; parameters, or inputs that no experiment moves, in their units. against: the recordings, the run at
@@ -85,7 +84,7 @@ def sweep(
     Raises InputError for names, values, bounds or data that do not fit, ComputationError where the reference fails.
 
     >>> from hvdc_ident import load_model
-    >>> from hvdc_ident.sensitivity.sweep import sweep
+    >>> from hvdc_ident.sensitivity import sweep
     >>> found = sweep(load_model("vsc-hvdc-link"), [], {"KIVDC": [250.0, 750.0, 1500.0]}, want=["poles"])
     >>> len(found), found.poles.shape
     (3, (3, 6))

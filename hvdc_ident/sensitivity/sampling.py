@@ -1,4 +1,4 @@
-"""Where a sweep goes: grids, logarithmic grids, lists, Latin hypercubes, and their products, never held as tuples."""
+"""Points of a sweep: grids, logarithmic grids, lists, Latin hypercubes, and their products, never held as tuples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exact sensitivities of eigenvalues and of the frequency response, in units and normalised."""
+"""Exact local sensitivities: of eigenvalues and the frequency response, and of all that a model gives together."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.errors import unknown_name
+from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
-from hvdc_ident.sensitivity.factors import Ranges, factors
-from hvdc_ident.sensitivity.text import table_text
+from hvdc_ident.sensitivity.derivatives import (
+    Ranges,
+    Sensitivities,
+    SteadySensitivities,
+    factors,
+    steady_sensitivities,
+    table_text,
+    trajectory_sensitivities,
+)
 from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
@@ -71,7 +79,7 @@ class LinearSensitivities:
         return xarray.DataArray(found, coords=axes, dims=tuple(axes), name="response sensitivity")
 
     def channel(self, input: str, output: str, parameter: str, *, normalised: bool = False) -> Complex:
-        """(n,) the derivative of one channel's response by one parameter."""
+        """Return the derivative of one channel's response by one parameter, (n,)."""
         for kind, name, known in (
             ("input", input, self.inputs),
             ("output", output, self.outputs),
@@ -142,7 +150,7 @@ def linear_sensitivities(
     omega: Array | Sequence[float] | None = None,
     ranges: Ranges | None = None,
 ) -> LinearSensitivities:
-    """The exact derivatives of the eigenvalues and of the frequency response at the steady state of the given values.
+    """Return the exact derivatives of the eigenvalues and of the frequency response at the steady state of given values.
 
     inputs, outputs: of the response; default, all. omega: rad/s; default, around the poles. ranges: as factors, as in
     `trajectory_sensitivities`. Raises SteadyStateError where there is no operating point, LinearizationError where the
@@ -171,3 +179,67 @@ def linear_sensitivities(
         np.asarray(response.values, dtype=complex),
         np.stack([slopes[n] for n in names], axis=-1) if names else np.zeros(shape, dtype=complex),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class LocalSensitivities:
+    """Derivatives by the same parameters, in units and normalised by the same factors.
+
+    trajectories: by experiment and output over time; None without an experiment. steady: of the steady state of the
+    values. linear: of eigenvalues and frequency response there; None where there is no linear model, and `why` says it.
+    """
+
+    trajectories: Sensitivities | None
+    steady: SteadySensitivities
+    linear: LinearSensitivities | None
+    why: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Norms of the trajectories' derivatives, the steady ones, those of the eigenvalues, peaks of the responses'."""
+        return {
+            "trajectories": self.trajectories.to_dict() if self.trajectories else None,
+            "steady": self.steady.to_dict(),
+            "linear": self.linear.to_dict() if self.linear else None,
+            "why": self.why,
+        }
+
+    def plot(self, ax: Any = None) -> Any:
+        """Axes with the first output's derivatives over time; of the steady state where there is no experiment."""
+        return self.trajectories.plot(ax=ax) if self.trajectories is not None else self.steady.plot(ax)
+
+    def __str__(self) -> str:
+        parts = [p for p in (self.trajectories, self.steady, self.linear) if p is not None]
+        return "\n\n".join([*map(str, parts), *([self.why] if self.why else [])])
+
+    def _repr_html_(self) -> str:
+        return "<pre>" + escape(str(self)) + "</pre>"
+
+
+def sensitivities(
+    model: Model,
+    experiments: Sequence[Experiment] = (),
+    parameters: Sequence[str] | None = None,
+    *,
+    values: Mapping[str, float] | None = None,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    omega: Array | Sequence[float] | None = None,
+    ranges: Ranges | None = None,
+) -> LocalSensitivities:
+    """Return the exact derivatives of all that a model gives by parameters (default: all of the model's) at `values`.
+
+    outputs: names of outputs (default: those that experiments recorded, else all); inputs: of the frequency response at
+    omega, rad/s (default: all, around the poles). ranges: (min, max) of a parameter as its factor, in its unit; else
+    its value, or its range where that is 0. The global view is `morris` and `sobol`.
+    Raises UnknownNameError, SteadyStateError or SimulationError.
+    """
+    common: dict[str, Any] = {"values": values, "outputs": outputs, "ranges": ranges}
+    along = trajectory_sensitivities(model, experiments, parameters, **common) if experiments else None
+    steady = steady_sensitivities(model, parameters, **common)
+    recorded = dict.fromkeys(o for e in experiments for o in e.outputs)
+    seen = outputs or list(recorded) or None
+    try:
+        linear = linear_sensitivities(model, parameters, inputs=inputs, omega=omega, **{**common, "outputs": seen})
+    except LinearizationError as error:
+        return LocalSensitivities(along, steady, None, f"no linear model: {error}")
+    return LocalSensitivities(along, steady, linear)

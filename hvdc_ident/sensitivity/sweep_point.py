@@ -1,0 +1,300 @@
+"""One point of a sweep: parameter values in, RMSE, poles and frequency response out, packed in bytes without pickles."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import sympy as sp
+from numpy.typing import NDArray
+
+from hvdc_ident.errors import (
+    ComputationError,
+    HvdcIdentError,
+    SimulationError,
+    SteadyStateError,
+    StudyError,
+    unknown_name,
+)
+from hvdc_ident.experiment import Experiment
+from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.model.definition import Model
+from hvdc_ident.model.external import AnyModel
+from hvdc_ident.sensitivity.sampling import Points
+from hvdc_ident.simulate.engine import Method, simulate
+from hvdc_ident.trajectory import Array
+
+DONE, FAILED = b"\x00", b"\x01"
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Reference of an output of an experiment: values at the experiment's rows, (m,), in the output's unit."""
+
+    experiment: str
+    output: str
+    rows: NDArray[np.intp]
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PointTask:
+    """The work of a point, the same in every process: called with (k,) values it returns packed bytes.
+
+    values: parameters and inputs held at other than the model's values. references: what is compared, in order.
+    poles: how many poles are wanted (0: none). omega, inputs, outputs: of the frequency response (empty: none).
+    method: the integrator of every run, fixed beforehand so that no point depends on those before it.
+    """
+
+    model: AnyModel
+    experiments: tuple[Experiment, ...]
+    names: tuple[str, ...]
+    values: FrozenMap[float]
+    references: tuple[Reference, ...]
+    poles: int = 0
+    omega: Array = field(default_factory=lambda: np.empty(0))
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    method: Method = "rosenbrock"
+
+    @cached_property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in a packed point: RMSE, poles (two each), response (two each)."""
+        return len(self.references), 2 * self.poles, 2 * self.omega.size * len(self.outputs) * len(self.inputs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
+
+    def __call__(self, point: Array) -> bytes:
+        """Return the result of a point as packed bytes; the reason, packed, where a run fails."""
+        given = FrozenMap({**self.values, **dict(zip(self.names, map(float, point), strict=True))})
+        try:
+            numbers = np.concatenate([self._errors(given), self._linear(given)])
+        except HvdcIdentError as e:
+            return FAILED + str(e).encode()
+        if not np.isfinite(numbers).all():
+            return FAILED + b"a result is not finite"
+        return DONE + numbers.astype("<f8").tobytes()
+
+    def _errors(self, given: FrozenMap[float]) -> Array:
+        """Return the RMSE of each reference, (references,), in the outputs' units."""
+        found = np.empty(len(self.references))
+        for experiment in self.experiments:
+            chosen = [(i, r) for i, r in enumerate(self.references) if r.experiment == experiment.name]
+            if not chosen:
+                continue
+            run = simulated(self.model, experiment, given, tuple(r.output for _, r in chosen), self.method)
+            for column, (i, r) in enumerate(chosen):
+                difference = run[r.rows, column] - r.values
+                found[i] = np.sqrt(np.mean(difference * difference))
+        return found
+
+    def _linear(self, given: FrozenMap[float]) -> Array:
+        """Poles, then the response, real and imaginary parts in turn."""
+        if not self.poles and not self.omega.size:
+            return np.empty(0)
+        from hvdc_ident.linearize import find_operating_point, linearize
+
+        at = find_operating_point(self.model, given)
+        linear = linearize(self.model, at, inputs=self.inputs or None, outputs=self.outputs or None)
+        parts = []
+        if self.poles:
+            poles = np.asarray(linear.poles(), dtype=complex)
+            if poles.size != self.poles:
+                raise SimulationError(
+                    "the number of poles changed", expected=str(self.poles), got=str(poles.size)
+                )  # e.g. a loop that becomes ill-posed
+            parts.append(poles[np.lexsort((poles.imag, poles.real))])
+        if self.omega.size:
+            parts.append(np.asarray(linear.response(self.omega), dtype=complex).ravel())
+        return np.concatenate(parts).view(float)
+
+    def unpacked(self, packed: bytes) -> tuple[Array, Array, Array] | str:
+        """RMSE (references,), poles and response as complex numbers; or the reason of a failure."""
+        if packed[:1] != DONE:
+            return packed[1:].decode()
+        numbers = np.frombuffer(packed, dtype="<f8", offset=1)
+        a, b, c = self.sizes
+        response = numbers[a + b :].view(complex).reshape(self.omega.size, len(self.outputs), len(self.inputs))
+        assert numbers.size == a + b + c
+        return numbers[:a], numbers[a : a + b].view(complex), response
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """A hash of all that decides a point's result but the point itself and the code."""
+        parts: list[Any] = [model_text(self.model), self.names, dict(self.values), self.method, self.poles]
+        parts += [self.inputs, self.outputs, self.omega.tobytes()]
+        for r in self.references:
+            parts += [r.experiment, r.output, r.rows.tobytes(), r.values.tobytes()]
+        for e in self.experiments:
+            parts += [e.name, e.time.tobytes(), dict(e.values), e.drive, {k: dict(v) for k, v in e.instrument.items()}]
+            for name, u in e.inputs.items():
+                parts += [name, u.times.tobytes(), u.values.tobytes(), u.breaks.tobytes()]
+        return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()
+
+
+def simulated(model: AnyModel, experiment: Experiment, given: Any, outputs: tuple[str, ...], method: Method) -> Array:
+    """Return the outputs, (n, outputs), of one run whose integrator does not depend on the runs before it."""
+    try:
+        return simulate(model, experiment, given, outputs=outputs, method=method).trajectory.values
+    except SimulationError as e:
+        if method != "explicit" or "stiff" not in e.what:
+            raise
+    return simulate(model, experiment, given, outputs=outputs, method="rosenbrock").trajectory.values
+
+
+def model_text(model: AnyModel) -> str:
+    """The model as text that differs where its equations or its values do, to the last digit."""
+    if not isinstance(model, Model):
+        return model.text
+    lines = [model.name, repr(model.values), repr({n: i.value for n, i in model.inputs.items()})]
+    for kind in ("states", "signals", "algebraic", "outputs", "delays", "sampled"):
+        for name, item in getattr(model, kind).items():
+            fields = [f"{f}={_exact(getattr(item, f))}" for f in item.__dataclass_fields__]
+            lines.append(f"{kind} {name} {' '.join(fields)}")
+    return "\n".join(lines)
+
+
+def _exact(value: Any) -> str:
+    return str(sp.srepr(value)) if isinstance(value, sp.Basic) else repr(value)
+
+
+Want = Literal["rmse", "poles", "bode"]
+
+
+def check(
+    model: AnyModel, experiments: Sequence[Experiment], points: Points, base: Mapping[str, float], want: Sequence[str]
+) -> None:
+    """Raise InputError for names, values, bounds or experiments that do not fit the sweep."""
+    known = [*model.parameters, *model.inputs]
+    for name in (*points.names, *base):
+        if name not in model.parameters and name not in model.inputs:
+            raise unknown_name("parameter or input", name, known, where="sweep")
+    for name in want:
+        if name not in ("rmse", "poles", "bode"):
+            raise unknown_name("result of a sweep", name, ("rmse", "poles", "bode"))
+    names = [e.name for e in experiments]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise StudyError("two experiments of one name", where="sweep", got=twice[0], expected="distinct names")
+    if "rmse" in want and not experiments:
+        raise StudyError("a sweep has nothing to compare", where="sweep", expected="at least one experiment")
+    for axis in points.axes:
+        for column, name in enumerate(axis.names):
+            _check_values(model, experiments, name, axis.values[:, column])
+
+
+def _check_values(model: AnyModel, experiments: Sequence[Experiment], name: str, values: Array) -> None:
+    for e in experiments:
+        if name in e.inputs:
+            raise StudyError(f"'{name}' is moved by experiment '{e.name}' and cannot be swept", where="sweep")
+    own = model.parameters.get(name)
+    if own is not None and not (own.min <= values.min() and values.max() <= own.max):
+        raise StudyError(
+            f"a value of '{name}' lies outside the model's own bounds",
+            where=f"sweep of {name}",
+            expected=f"values in [{own.min:g}, {own.max:g}]",
+            got=f"{values.min():g} to {values.max():g}",
+        )
+
+
+def task_of(
+    model: AnyModel,
+    experiments: tuple[Experiment, ...],
+    names: tuple[str, ...],
+    base: FrozenMap[float],
+    against: Literal["data", "base"] | AnyModel,
+    outputs: Sequence[str] | None,
+    want: Sequence[str],
+    linear: tuple[Sequence[str], Sequence[str]] | None,
+    omega: Array | None,
+) -> PointTask:
+    """Return the work of every point, its references run once here. Raises ComputationError where a reference fails."""
+    references: list[Reference] = []
+    method: Method = "rosenbrock"
+    if "rmse" in want:
+        method = _method(model, experiments, base)
+        for e in experiments:
+            references += _references(model, e, base, against, outputs, method)
+        if not references:
+            raise StudyError(
+                "no experiment has a recorded output to compare",
+                where="sweep",
+                hint='against="base", or another model, needs no recording',
+            )
+    poles = 0
+    channels: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    frequencies = np.empty(0)
+    if "poles" in want or "bode" in want:
+        from hvdc_ident.linearize import find_operating_point, linearize
+
+        try:
+            point = find_operating_point(model, base)
+        except SteadyStateError as e:
+            hint = 'want = ["rmse"], which needs no operating point, or base values in [model.values] that have one'
+            raise SteadyStateError(
+                e.what, where=f"sweep, {e.where}", expected=e.expected, got=e.got, hint=hint
+            ) from None
+        at = linearize(
+            model,
+            point,
+            inputs=linear[0] if linear else None,
+            outputs=linear[1] if linear else None,
+        )
+        poles = int(np.size(at.poles())) if "poles" in want else 0
+        channels = tuple(at.input_names), tuple(at.output_names)
+        if "bode" in want:
+            frequencies = np.asarray(omega if omega is not None else at.bode().omega, dtype=float)
+    return PointTask(model, experiments, names, base, tuple(references), poles, frequencies, *channels, method=method)
+
+
+def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMap[float]) -> Method:
+    """The integrator of every point: the one that serves at the base values."""
+    first = experiments[0]
+    try:
+        found = simulate(model, first, base, outputs=first.outputs or None).statistics.method
+    except ComputationError:
+        return "rosenbrock"
+    except SteadyStateError:
+        return "rosenbrock"
+    return "explicit" if found == "explicit" else "rosenbrock"
+
+
+def _references(
+    model: AnyModel,
+    e: Experiment,
+    base: FrozenMap[float],
+    against: Literal["data", "base"] | AnyModel,
+    outputs: Sequence[str] | None,
+    method: Method,
+) -> list[Reference]:
+    """Return the references of one experiment: its recording, the run at the base values, or another model's run."""
+    if against == "data":
+        recorded = [o for o in (e.outputs if outputs is None else outputs) if o in e.outputs]
+        found = []
+        for o in recorded:
+            assert e.measured is not None
+            rows = np.flatnonzero(e.compared & np.isfinite(e.measured[o]))
+            if not rows.size:
+                hint = "a wider window"
+                raise StudyError(f"no row of '{o}' can be compared", where=f"experiment '{e.name}'", hint=hint)
+            found.append(Reference(e.name, o, rows, np.array(e.measured[o][rows])))
+        return found
+    chosen = tuple(outputs if outputs is not None else (e.outputs or model.outputs))
+    rows = np.flatnonzero(e.compared)
+    if not isinstance(against, str) and hasattr(against, "outputs"):
+        missing = [o for o in chosen if o not in against.outputs and o not in against.names]
+        if missing and outputs is None:
+            chosen = tuple(o for o in chosen if o not in missing)
+        run = simulate(against, e.with_(measured=None), {}, outputs=chosen).trajectory.values
+    elif against == "base":
+        run = simulated(model, e, base, chosen, method)
+    else:
+        raise StudyError(
+            "what a sweep is compared with is unknown", expected='"data", "base" or a Model', got=repr(against)[:60]
+        )
+    return [Reference(e.name, o, rows, np.array(run[rows, k])) for k, o in enumerate(chosen)]
