@@ -17,7 +17,7 @@ import numpy as np
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.locus import root_locus
 from hvdc_ident.linearize.matrices import eliminate
-from hvdc_ident.linearize.system import System, system
+from hvdc_ident.linearize.system import CompiledSystem, system
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.structure import torn
 
@@ -32,7 +32,7 @@ def best(run: Callable[[], object], repetitions: int) -> float:
     return min(times)
 
 
-def reduced(s: System, jac: np.ndarray) -> np.ndarray:
+def reduced(s: CompiledSystem, jac: np.ndarray) -> np.ndarray:
     """[A B; C D] of a Jacobian over [x, z, u], the unknowns eliminated."""
     z = s.layout
     rows = [*range(z.nx), *range(z.n, z.main), *range(z.nx, z.n)]
@@ -40,7 +40,7 @@ def reduced(s: System, jac: np.ndarray) -> np.ndarray:
     return eliminate(jac[np.ix_(rows, columns)], z.nx + z.no, z.nx + z.nu).result
 
 
-def as_control(s: System, point) -> control.NonlinearIOSystem:
+def as_control(s: CompiledSystem, point) -> control.NonlinearIOSystem:
     """The link for python-control: states and outputs, the algebraic unknowns solved inside by Newton's method."""
     z, p, w = s.layout, point.p, point.w.copy()
     unknown = np.array([*point.unknowns.values()])

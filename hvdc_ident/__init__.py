@@ -36,32 +36,39 @@ if TYPE_CHECKING:
     from hvdc_ident.fit.result import FitResult
     from hvdc_ident.formats import read_waveforms
     from hvdc_ident.identifiability import IdentifiabilityReport
-    from hvdc_ident.linearize.compare import compare, gap, ncf_margin, nu_gap
-    from hvdc_ident.linearize.impedance import (
+    from hvdc_ident.linearize import (
+        LinearModel,
         MeasuredResponse,
+        OperatingPoint,
         Port,
+        balanced,
+        compare,
+        continuation,
+        gap,
+        h2_norm,
+        hinf_norm,
+        linf_norm,
+        loop,
+        loop_margins,
+        margins,
+        ncf_margin,
+        nu_gap,
+        one_sided,
+        plant_and_controller,
+        point_at,
         port_admittance,
         port_impedance,
+        read_response,
         response_at_tones,
         response_from_record,
+        root_locus,
         simulated_response,
+        symbolic_transfer,
     )
-    from hvdc_ident.linearize.jacobian import one_sided
-    from hvdc_ident.linearize.linear_model import LinearModel
-    from hvdc_ident.linearize.locus import root_locus
-    from hvdc_ident.linearize.loop import loop, plant_and_controller
-    from hvdc_ident.linearize.margins import loop_margins, margins
-    from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
-    from hvdc_ident.linearize.operating_point import OperatingPoint, continuation, point_at
-    from hvdc_ident.linearize.reduce import balanced
-    from hvdc_ident.linearize.response_file import read_response
-    from hvdc_ident.linearize.symbolic import symbolic_transfer
     from hvdc_ident.model.definition import Model
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
-    from hvdc_ident.sensitivity.global_screening import morris, sobol
-    from hvdc_ident.sensitivity.local_sensitivities import linear_sensitivities
-    from hvdc_ident.sensitivity.sweep_result import SweepResult
+    from hvdc_ident.sensitivity import SweepResult, linear_sensitivities, morris, sobol
     from hvdc_ident.signals import InputSignal, multisine, ramp, step
     from hvdc_ident.simulate.result import Simulation
     from hvdc_ident.study.study import Study, load_study
@@ -140,25 +147,13 @@ _imported = offered(
         "fit.result": "FitResult",
         "formats": "read_waveforms",
         "identifiability": "IdentifiabilityReport",
-        "linearize.compare": "compare gap ncf_margin nu_gap",
-        "linearize.impedance": "MeasuredResponse Port port_admittance port_impedance response_at_tones response_from_record "
-        "simulated_response",
-        "linearize.jacobian": "one_sided",
-        "linearize.linear_model": "LinearModel",
-        "linearize.locus": "root_locus",
-        "linearize.loop": "loop plant_and_controller",
-        "linearize.margins": "loop_margins margins",
-        "linearize.norms": "h2_norm hinf_norm linf_norm",
-        "linearize.operating_point": "OperatingPoint continuation point_at",
-        "linearize.reduce": "balanced",
-        "linearize.response_file": "read_response",
-        "linearize.symbolic": "symbolic_transfer",
+        "linearize": "LinearModel MeasuredResponse OperatingPoint Port balanced compare continuation gap h2_norm hinf_norm "
+        "linf_norm loop loop_margins margins ncf_margin nu_gap one_sided plant_and_controller point_at port_admittance "
+        "port_impedance read_response response_at_tones response_from_record root_locus simulated_response symbolic_transfer",
         "model.definition": "Model",
         "models": "load_model",
         "parameters": "Input Parameter",
-        "sensitivity.global_screening": "morris sobol",
-        "sensitivity.local_sensitivities": "linear_sensitivities",
-        "sensitivity.sweep_result": "SweepResult",
+        "sensitivity": "SweepResult linear_sensitivities morris sobol",
         "signals": "InputSignal multisine ramp step",
         "simulate.result": "Simulation",
         "study.study": "Study load_study",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.linearize import LinearModel, OperatingPoint
-    from hvdc_ident.linearize.frequency import Response
+    from hvdc_ident.linearize.frequency import FrequencyResponse
     from hvdc_ident.linearize.jacobian import Side
     from hvdc_ident.sensitivity.derivatives import Ranges
     from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
@@ -187,7 +187,7 @@ def bode(
     outputs: Names = None,
     parameters: Values = None,
     point: OperatingPoint | None = None,
-) -> Response:
+) -> FrequencyResponse:
     """Return the frequency response between inputs and outputs, delays exact; it draws itself with `plot()`.
 
     model: as in `linearize`, or a LinearModel. omega: in rad/s (default: around the poles).

@@ -1,4 +1,8 @@
-"""Delays as rational functions: Pade approximants of exp(-sT) in state space, and their exact response."""
+"""Delays and sampled blocks of a linear model: Pade approximants, exact responses, and the matrix it is reduced from.
+
+`DelayFree` is a linear model before its delays are approximated, from which the exact frequency response is computed;
+`Blocks` is the matrix over states, inputs and unknowns in which Pade states stand for the delays.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.matrices import Array, eliminate
-from hvdc_ident.linearize.system import Layout, System
+from hvdc_ident.linearize.system import CompiledSystem, Layout
 from hvdc_ident.model.definition import Model
 
 MAX_ORDER = 12
@@ -94,7 +98,7 @@ class Channel:
         return self.time if self.kind == "delay" else 0.5 * self.time + self.compute
 
 
-def channels(model: Model, s: System, p: Array) -> tuple[Channel, ...]:
+def channels(model: Model, s: CompiledSystem, p: Array) -> tuple[Channel, ...]:
     """Every delay and sampled block with its times at parameters p."""
     times = s.timing(p)
     nd, nq = len(model.delays), len(model.sampled)
@@ -206,9 +210,12 @@ class DelayFree:
 
 
 class Blocks:
-    """Where states, Pade states, inputs, unknowns and delayed values stand in the matrix that is reduced."""
+    """Matrix that is reduced to a linear model, and the places of its rows and columns.
 
-    def __init__(self, s: System, found: tuple[Channel, ...], order: int) -> None:
+    Rows and columns: states, Pade states, inputs or outputs, unknowns, delayed values.
+    """
+
+    def __init__(self, s: CompiledSystem, found: tuple[Channel, ...], order: int) -> None:
         self.size, self.channels, self.order = s.layout, found, order
         self.pade = pade(order) if found else (np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0)
         self.n_pade = order * len(found)
@@ -216,7 +223,7 @@ class Blocks:
         self.rows, self.columns = self.n + self.size.no, self.n + self.size.nu
 
     def spread(self, jac: Array) -> Array:
-        """The Jacobian's rows f, outputs, g and columns [x, Pade, u, z, e] in place; Pade and delay rows are 0."""
+        """Return the Jacobian's rows f, outputs, g and columns [x, Pade, u, z, e] in place; Pade and delay rows are 0."""
         z, k = self.size, self.n_pade
         total = np.zeros((*jac.shape[:-2], z.nx + k + z.no + z.nz + z.ne, z.nx + k + z.nu + z.nz + z.ne))
         rows = [*range(z.nx), *range(z.n + z.ne, z.main), *range(z.nx, z.n)]
@@ -227,7 +234,7 @@ class Blocks:
         return total
 
     def sources(self, jac: Array) -> Array:
-        """The rows of what is delayed, over the columns [x, Pade, u, z, e]."""
+        """Return the rows of the delayed signals over the columns [x, Pade, u, z, e]."""
         z = self.size
         total = np.zeros((*jac.shape[:-2], z.ne, z.nx + self.n_pade + z.nu + z.nz + z.ne))
         columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
@@ -257,7 +264,7 @@ class Blocks:
             total[..., total.shape[-2] - z.ne + i, :] += through * sources[..., i, :]
 
     def matrix_along(self, djac: Array, jac: Array, dtime: Array) -> Array:
-        """(directions, ...) the derivative of `matrix`; djac: of the Jacobian; dtime: (channels, directions)."""
+        """Return the derivative of `matrix`, (directions, ...); djac: of the Jacobian; dtime: (channels, directions)."""
         total = self.spread(djac)
         if self.channels:
             a, b, _, through = self.pade

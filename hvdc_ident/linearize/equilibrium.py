@@ -1,4 +1,4 @@
-"""Scaled damped Newton with bounds, and a homotopy, for operating points with something fixed, free or bounded.
+"""Equations of an operating point with values fixed, free or bounded, and Newton's method and a homotopy that solve them.
 
 A plain steady state is found where simulation finds it, in `hvdc_ident.simulate.steady_state`.
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
 from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.linearize.system import System, system
+from hvdc_ident.linearize.system import CompiledSystem, system
 from hvdc_ident.model.definition import Model
 
 Equations = Callable[[Array], tuple[Array, Array]]
@@ -25,7 +25,7 @@ SHORTEST = 2.0**-10
 
 @dataclass(frozen=True)
 class Root:
-    """Where the iteration ended. shares: (equations,) scaled residuals; method: "newton" or "homotopy"."""
+    """End of an iteration. v: unknowns; shares: (equations,) scaled residuals; method: "newton" or "homotopy"."""
 
     v: Array
     residual: Array
@@ -35,12 +35,12 @@ class Root:
 
     @property
     def found(self) -> bool:
-        """Whether every scaled residual is below ACCURACY."""
+        """True where every scaled residual is below ACCURACY."""
         return bool((self.shares < ACCURACY).all())
 
 
 def weights(jacobian: Array, v: Array) -> Array:
-    """(equations,) the size of each equation's terms, 1 for an equation without any."""
+    """Return the size of each equation's terms, (equations,), 1 for an equation without any."""
     if v.size == 0:
         return np.ones(jacobian.shape[0])
     size = np.abs(jacobian) @ np.maximum(np.abs(v), 1e-3)
@@ -48,7 +48,7 @@ def weights(jacobian: Array, v: Array) -> Array:
 
 
 def newton(equations: Equations, v: Array, low: Array, high: Array, limit: int = 60) -> Root:
-    """The root near v within [low, high], or the best point reached: read `found`.
+    """Return the root near v within [low, high], or the best point reached: read `found`.
 
     Steps are exact Newton steps where the Jacobian is square and regular, else of least norm; each is halved until the
     scaled residual falls. A variable on a bound that the step would leave is held there.
@@ -117,7 +117,7 @@ def _step(jac: Array, r: Array, weight: Array, v: Array, low: Array, high: Array
 
 
 def homotopy(equations: Equations, v: Array, low: Array, high: Array) -> Root:
-    """The root that the way from v leads to on which what the equations are off by at v goes to 0: read `found`.
+    """Return the root reached from v while the residual at v is reduced to 0 step by step: read `found`.
 
     For what Newton's method does not reach at once from a known operating point: each part of the way is solved from the
     one before, and halved where it is not.
@@ -146,13 +146,13 @@ At = Literal["steady", "start"]
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class EquilibriumSearch:
     """The unknowns v = [x, z, delays and sampled, freed inputs, freed parameters, bounded signals] and their equations.
 
     equation_rows: which rows of the system are asked to be 0, after that come the fixed signals, then the bounded ones.
     """
 
-    system: System
+    system: CompiledSystem
     at: At
     time: float
     u: Array
@@ -179,8 +179,8 @@ class Search:
         at: At,
         moving: Collection[str],
         time: float,
-    ) -> Search:
-        """The search for a model. Raises UnknownNameError, ModelError for a value or bounds that cannot be."""
+    ) -> EquilibriumSearch:
+        """Return the equations for a model. Raises UnknownNameError, and ModelError for a value or bounds that cannot be."""
         signals = [n for n in (*fixed, *bounds) if not _is_variable(model, n)]
         s = system(model, tuple(dict.fromkeys((*model.outputs, *signals))))
         _check(model, s, fixed, free, bounds, moving)
@@ -217,14 +217,14 @@ class Search:
 
     @property
     def is_plain(self) -> bool:
-        """Return whether all that is asked for is the steady state at given inputs and parameters."""
+        """True where only the steady state at given inputs and parameters is asked for."""
         whole = len(self.equation_rows) == self.system.layout.n + self.system.layout.ne
         nothing = not (self.freed_u or self.freed_p or self.fixed_places or self.fixed_rows or self.bounded_rows)
         return whole and nothing and not (np.isfinite(self.low).any() or np.isfinite(self.high).any())
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Names of what is solved for."""
+        """Names of the unknowns v."""
         s = self.system
         names = [*s.states, *s.unknowns, *s.extras, *(s.inputs[k] for k in self.freed_u)]
         first = s.layout.n + s.layout.ne
@@ -233,7 +233,7 @@ class Search:
 
     @property
     def rows(self) -> tuple[str, ...]:
-        """What each equation says, in words."""
+        """Each equation in words."""
         s, size = self.system, self.system.layout
         inner = [*s.states, *s.unknowns, *s.extras]
         first = size.n + size.ne
@@ -334,7 +334,7 @@ class Search:
         return np.asarray(np.linalg.lstsq(jac, -right, rcond=1e-12)[0])
 
     def guesses(self, given: Mapping[str, float]) -> list[Array]:
-        """Places where the search begins: what is given, the model's own, then 0, 1 and seeded random places."""
+        """Return starting points: the given values, the model's own, then 0, 1 and seeded random values."""
         s = self.system
         places: list[Array] = []
         known = {**self.start, **given}
@@ -367,8 +367,8 @@ def _is_variable(model: Model, name: str) -> bool:
     return any(name in group for group in (model.states, model.inputs, model.parameters, model.delays, model.sampled))
 
 
-def _starts(model: Model, s: System, p: Array, bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Where each variable's search begins, as far as the model says."""
+def _starts(model: Model, s: CompiledSystem, p: Array, bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Return the starting value of each variable, as far as the model gives one."""
     found = {n: st.guess for n, st in model.states.items() if st.guess is not None}
     found |= {s.states[k]: v for k, v in s.start_values(p).items() if np.isfinite(v)}
     found |= {n: model.algebraic[n].start for n in s.unknowns}
@@ -379,7 +379,7 @@ def _starts(model: Model, s: System, p: Array, bounds: Mapping[str, tuple[float,
     return found
 
 
-def _equation_rows(s: System, at: At, moving: Collection[str]) -> tuple[int, ...]:
+def _equation_rows(s: CompiledSystem, at: At, moving: Collection[str]) -> tuple[int, ...]:
     size = s.layout
     rest = {k: size.main + i for i, k in enumerate(s.with_rest)}
     start = {k: size.main + size.n_rest + i for i, k in enumerate(s.with_start)} if at == "start" else {}
@@ -389,7 +389,7 @@ def _equation_rows(s: System, at: At, moving: Collection[str]) -> tuple[int, ...
 
 def _check(
     model: Model,
-    s: System,
+    s: CompiledSystem,
     fixed: Mapping[str, float],
     free: Collection[str],
     bounds: Mapping[str, tuple[float, float]],

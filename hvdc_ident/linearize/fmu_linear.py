@@ -49,16 +49,16 @@ def find_point(
     moving: Collection[str],
     time: float,
 ) -> OperatingPoint:
-    """The operating point; arguments as `find_operating_point`. The search begins where the FMU's initialisation ends.
+    """Return the operating point; arguments as `find_operating_point`. The search begins where the FMU's initialisation ends.
 
     at="start": the FMU stays there. Raises SteadyStateError, with the worst equation, where there is none.
     """
     model = fmu_of(given)
-    return _Search(model, dict(fixed), tuple(free), bounds, dict(guess), at, tuple(moving), time).point()
+    return _FmuSearch(model, dict(fixed), tuple(free), bounds, dict(guess), at, tuple(moving), time).point()
 
 
-class _Search:
-    """What is held and what is sought."""
+class _FmuSearch:
+    """Search for an operating point of an FMU: values held, values sought and their equations."""
 
     def __init__(
         self,
@@ -188,7 +188,7 @@ def linear_model(
     outputs: Sequence[str] | None,
     sensitivities: Sequence[str],
 ) -> LinearModel:
-    """A, B, C, D of an FMU at a point; derivatives by parameters from differences of points and Jacobians.
+    """Return A, B, C, D of an FMU at a point; derivatives by parameters from differences of points and Jacobians.
 
     provenance tells the method ("directional", or "finite-difference" where one column is), its error, and whether a
     limit is near. Raises UnknownNameError, or LinearizationError for an input that changes in steps only.
@@ -222,7 +222,7 @@ def linear_model(
 
 
 def error_of(given: External, point: OperatingPoint, outputs: Sequence[str] | None) -> float:
-    """The largest difference between the Jacobian and central differences, of each row's largest entry.
+    """Return the largest difference between the Jacobian and central differences, of each row's largest entry.
 
     Where differences are the Jacobian, it is that between two step sizes.
     """

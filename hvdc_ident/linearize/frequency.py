@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
+class FrequencyResponse:
     """A frequency response. omega: (n,) rad/s; values: (n, outputs, inputs) complex, in output unit per input unit.
 
     std: (n, outputs, inputs) standard deviation of the error's modulus, where one is known. coherence: of a recording.
@@ -136,11 +136,11 @@ def default_omega(model: LinearModel, points: int = 400) -> Array:
     return np.unique(np.concatenate([grid, inside[(inside > grid[0]) & (inside < grid[-1])]]))
 
 
-def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> Response:
+def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:
     """The response of every channel at omega in rad/s (default: around the poles)."""
     w = default_omega(model) if omega is None else _checked(omega)
     units = tuple((o, i) for o in model.output_units for i in model.input_units)
-    return Response(w, transfer(model, 1j * w), model.output_names, model.input_names, units)
+    return FrequencyResponse(w, transfer(model, 1j * w), model.output_names, model.input_names, units)
 
 
 def _checked(omega: Array | Sequence[float]) -> Array:
@@ -184,7 +184,9 @@ def sensitivity(
     return found
 
 
-def bands(model: LinearModel, omega: Array | Sequence[float], covariance: Array, parameters: Sequence[str]) -> Response:
+def bands(
+    model: LinearModel, omega: Array | Sequence[float], covariance: Array, parameters: Sequence[str]
+) -> FrequencyResponse:
     """The response with, as std, the first-order standard deviation of its error from a parameter covariance.
 
     covariance: (k, k) in the parameters' units, in the order of `parameters`, whose derivatives the model must have.
@@ -199,7 +201,7 @@ def bands(model: LinearModel, omega: Array | Sequence[float], covariance: Array,
     slopes = sensitivity(model, plain.omega, parameters)
     stacked = np.array([slopes[n] for n in parameters])
     variance = np.einsum("a...,ab,b...->...", stacked.conj(), cov, stacked).real
-    return Response(
+    return FrequencyResponse(
         plain.omega,
         plain.values,
         plain.output_names,

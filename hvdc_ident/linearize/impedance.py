@@ -1,4 +1,7 @@
-"""The impedance and admittance of a port: dq in the network's frame, whatever frame the model computes in, or dc."""
+"""Impedances of a port, dq in the network's frame or dc, and measured frequency responses.
+
+A measured response comes from data, from recordings, or from a simulation of the nonlinear model.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.expression.functions import TIME, symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.frequency import Response, sensitivity
+from hvdc_ident.linearize.frequency import FrequencyResponse, sensitivity
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.matrices import Array
@@ -30,7 +33,7 @@ Names = tuple[str, str] | tuple[str]
 
 @dataclass(frozen=True)
 class Port:
-    """Where an impedance is seen: d and q of an ac port, or one signal each of a dc port.
+    """Port at which an impedance is seen: d and q of an ac port, or one signal each of a dc port.
 
     source: the signals of a voltage (or current) behind the port that is disturbed; which side of the port it lies on
     decides what is seen: a source in the grid shows the station. voltage, current: expressions at the port, the current
@@ -61,7 +64,7 @@ class Port:
 
 def port_impedance(
     model: Model, port: Port, omega: Sequence[float] | Array, point: OperatingPoint | None = None
-) -> Response:
+) -> FrequencyResponse:
     """Return the impedance seen at a port at omega, rad/s: (n, 2, 2) over [d, q] in the network's frame, or (n, 1, 1).
 
     In voltage unit per current unit, delays exact. Raises UnknownNameError for a signal that is not there,
@@ -72,7 +75,7 @@ def port_impedance(
 
 def port_admittance(
     model: Model, port: Port, omega: Sequence[float] | Array, point: OperatingPoint | None = None
-) -> Response:
+) -> FrequencyResponse:
     """Return the admittance seen at a port, the inverse of `port_impedance`; raises as it does."""
     return port_response(port_model(model, port, point), port, omega, "admittance")
 
@@ -88,7 +91,7 @@ def port_model(
     return linearize(disturbed, at, inputs=inputs, outputs=outputs, sensitivities=sensitivities)
 
 
-def port_response(linear: LinearModel, port: Port, omega: Sequence[float] | Array, kind: str) -> Response:
+def port_response(linear: LinearModel, port: Port, omega: Sequence[float] | Array, kind: str) -> FrequencyResponse:
     """Return the "impedance" or "admittance" that a port's linear model (`port_model`) shows."""
     top, bottom = _parts(linear.response(np.asarray(omega, dtype=float)), port, kind)
     if (np.linalg.cond(bottom) > 1e14).any():
@@ -96,7 +99,7 @@ def port_response(linear: LinearModel, port: Port, omega: Sequence[float] | Arra
         moved = "both axes of the port" if len(port.axes) == 2 else "the port"
         raise LinearizationError(f"the {kind} does not exist: the disturbance does not move {moved}", hint=hint)
     values = top @ np.linalg.inv(bottom)
-    return Response(np.atleast_1d(np.asarray(omega, dtype=float)), values, port.axes, port.axes, source=kind)
+    return FrequencyResponse(np.atleast_1d(np.asarray(omega, dtype=float)), values, port.axes, port.axes, source=kind)
 
 
 def port_sensitivity(linear: LinearModel, port: Port, omega: Array, kind: str, names: Sequence[str]) -> Array:
@@ -307,7 +310,7 @@ def _factor(measured: Array, model: Array) -> float | None:
 
 def response_at_tones(
     time: Array, u: Array, y: Array, omega: Array, *, input: str = "u", output: str = "y"
-) -> Response:
+) -> FrequencyResponse:
     """Return the response at the frequencies at which a record was perturbed, by least squares on both signals.
 
     time: (n,) s, rows may be uneven. omega: (k,) rad/s. Each signal is a constant, a drift and a sine at each frequency;
@@ -345,12 +348,14 @@ def response_at_tones(
     h = phasors[:, 1] / phasors[:, 0]
     std = np.sqrt(scatter[:, 1] ** 2 + np.abs(h) ** 2 * scatter[:, 0] ** 2) / drive
     shape = (-1, 1, 1)
-    return Response(w, h.reshape(shape), (output,), (input,), (("", ""),), std.reshape(shape), source="recording")
+    return FrequencyResponse(
+        w, h.reshape(shape), (output,), (input,), (("", ""),), std.reshape(shape), source="recording"
+    )
 
 
 def response_from_record(
     time: Array, u: Array, y: Array, *, input: str = "u", output: str = "y", segments: int = 8, window: str = "hann"
-) -> Response:
+) -> FrequencyResponse:
     """The response from recorded input to recorded output by Welch's averages, with coherence and standard deviation.
 
     time: (n,) s; uneven rows are put on an even grid by straight lines. segments: how many, half overlapped; more give
@@ -385,7 +390,7 @@ def response_from_record(
     averages = max(1.0, segments * 0.947)  # half-overlapped Hann segments (Welch 1967)
     std = np.abs(h) * np.sqrt((1.0 - coherence) / (2.0 * averages * np.maximum(coherence, 1e-12)))
     shape = (-1, 1, 1)
-    return Response(
+    return FrequencyResponse(
         2 * np.pi * f[keep], h.reshape(shape), (output,), (input,), (("", ""),),
         std.reshape(shape), coherence.reshape(shape), "recording",
     )  # fmt: skip
@@ -402,7 +407,7 @@ def simulated_response(
     periods: int = 1,
     rtol: float = 1e-9,
     seed: int = 0,
-) -> Response:
+) -> FrequencyResponse:
     """The response measured on the nonlinear model by a multisine about its steady state: a check on the linear one.
 
     omega: wanted frequencies, rad/s; each is moved to a multiple of one base frequency, so read them from the result.
@@ -444,7 +449,7 @@ def simulated_response(
         spectrum = np.fft.fft(run.trajectory[name][1:]) / (count * periods)
         found[:, i, 0] = spectrum[harmonics * periods] / drive
     units = tuple((model.outputs[o].unit if o in model.outputs else "", model.inputs[input].unit) for o in outputs)
-    return Response(harmonics * base, found, tuple(outputs), (input,), units, source="simulation")
+    return FrequencyResponse(harmonics * base, found, tuple(outputs), (input,), units, source="simulation")
 
 
 def _sine(omega: float, phase: float) -> Any:

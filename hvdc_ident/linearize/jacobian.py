@@ -1,4 +1,4 @@
-"""The linear model at an operating point: exact A, B, C, D from the model's expression graph, and their derivatives."""
+"""Linearisation at an operating point: exact A, B, C, D from the model's expression graph, and their derivatives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.matrices import Array, Eliminated, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
-from hvdc_ident.linearize.system import System, system
+from hvdc_ident.linearize.system import CompiledSystem, system
 from hvdc_ident.model.definition import Model
 from hvdc_ident.model.external import AnyModel
 
@@ -35,7 +35,7 @@ def linearize(
     side: Side = "refuse",
     descriptor: bool = False,
 ) -> LinearModel:
-    """The linear model between inputs and outputs (of outputs or named signals; default all) at an operating point.
+    """Return the linear model between inputs and outputs (of outputs or named signals; default all) at an operating point.
 
     point: default, the steady state found from the model's values. pade_order: of every delay in the state space (the
     frequency response takes the delays exactly). sensitivities: parameters whose exact total derivatives of A, B, C, D
@@ -83,7 +83,7 @@ def linearize(
     return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side)
 
 
-def state_matrix(model: Model, s: System, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
+def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
     """A alone at a point given by its vectors: what `linearize` gives, without the rest. Raises as it does."""
     modes = modes_at(s, y, w, p, "refuse")
     jac = s.jacobian(y, w, p, modes)[: s.layout.main]
@@ -102,8 +102,8 @@ def state_matrix(model: Model, s: System, y: Array, w: Array, p: Array, pade_ord
     return np.asarray(reduced.result[: parts.n, : parts.n])
 
 
-def _refuse_flat_roots(s: System, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
-    """Raises where a square root in use stands at 0 and moves: its slope is infinite there."""
+def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
+    """Raise LinearizationError where a square root in use stands at 0 and moves: its slope is infinite there."""
     flat = s.flat_roots(y, w, p, modes)
     if not flat:
         return
@@ -161,7 +161,7 @@ def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str
     return float((np.abs(exact - other) / scale[:, None]).max(initial=0.0))
 
 
-def modes_at(s: System, y: Array, w: Array, p: Array, side: Side) -> Array:
+def modes_at(s: CompiledSystem, y: Array, w: Array, p: Array, side: Side) -> Array:
     """The branch of every switch at a point. Raises LinearizationError on a kink unless a side is chosen."""
     values = s.switches(y, w, p)
     modes = s.modes(y, w, p)
@@ -190,7 +190,7 @@ def modes_at(s: System, y: Array, w: Array, p: Array, side: Side) -> Array:
     return modes
 
 
-def _matters(s: System, y: Array, w: Array, p: Array, modes: Array, k: int) -> bool:
+def _matters(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, k: int) -> bool:
     other = modes.copy()
     other[k] = 1.0 - other[k]
     with np.errstate(all="ignore"):
@@ -200,7 +200,7 @@ def _matters(s: System, y: Array, w: Array, p: Array, modes: Array, k: int) -> b
 
 
 def _gradient(
-    s: System,
+    s: CompiledSystem,
     at: OperatingPoint,
     parts: Blocks,
     jac: Array,
@@ -229,7 +229,7 @@ def _gradient(
     return found
 
 
-def shift(s: System, at: OperatingPoint, which: list[int]) -> Array:
+def shift(s: CompiledSystem, at: OperatingPoint, which: list[int]) -> Array:
     """(columns + parameters, k) how the point and the parameters move for each of the chosen parameters."""
     size = s.layout
     total = np.zeros((size.columns + size.np, len(which)))
@@ -259,7 +259,7 @@ def shift(s: System, at: OperatingPoint, which: list[int]) -> Array:
 
 def _model(
     model: Model,
-    s: System,
+    s: CompiledSystem,
     at: OperatingPoint,
     parts: Blocks,
     jac: Array,
@@ -314,7 +314,7 @@ def _model(
     )  # fmt: skip
 
 
-def _chosen(s: System, inputs: Sequence[str] | None, model: str) -> list[int]:
+def _chosen(s: CompiledSystem, inputs: Sequence[str] | None, model: str) -> list[int]:
     names = s.inputs if inputs is None else tuple(inputs)
     for n in names:
         if n not in s.inputs:
@@ -322,7 +322,7 @@ def _chosen(s: System, inputs: Sequence[str] | None, model: str) -> list[int]:
     return [s.inputs.index(n) for n in names]
 
 
-def _not_finite(s: System, jac: Array, model: str) -> LinearizationError:
+def _not_finite(s: CompiledSystem, jac: Array, model: str) -> LinearizationError:
     i, j = (int(k) for k in np.argwhere(~np.isfinite(jac))[0])
     rows = [f"d({n})/dt" for n in s.states] + [*s.unknowns, *s.extras] + [f"output {n}" for n in s.outputs]
     columns = [*s.states, *s.unknowns, *s.inputs, *s.extras]

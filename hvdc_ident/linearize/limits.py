@@ -1,4 +1,4 @@
-"""What each switch of a model means: which named signal meets which limit there, and how far away it is."""
+"""Limits of a model: the signal that each switch of its graph limits, the level, and the margin to it."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Limit:
 
 
 def conditions(structure: Structure) -> tuple[Condition, ...]:
-    """The meaning of every switch of a structure, in the order of the switches; made before its code is compiled."""
+    """Return the meaning of every switch of a structure, in the order of the switches; made before its code is compiled."""
     g = structure.graph
     memo: dict[sp.Basic, int] = {}
     known = {v: k for k, v in enumerate(g.switches)}
@@ -112,7 +112,7 @@ def _text(e: Any) -> str:
 def _extremum(
     e: sp.Expr, name: str, structure: Structure, limiters: frozenset[sp.Basic], node: Node, note: Note
 ) -> None:
-    """Notes the pairwise comparisons of a min or max; a min with a max inside (or the reverse) is a limiter's two ends.
+    """Note the pairwise comparisons of a min or max; a min with a max inside (or the reverse) is a limiter's two ends.
 
     A single min or max is a choice: which side of it is the limit nobody can tell.
     """
@@ -158,7 +158,7 @@ def _definitions(structure: Structure) -> dict[str, sp.Basic]:
 
 
 def limits(structure: Structure, known: tuple[Condition, ...], values: Array) -> tuple[Limit, ...]:
-    """Every limiter that matters at a point, with its margin, from the switches' values.
+    """Return every limiter that matters at a point, with its margin, from the switches' values.
 
     A limiter inside a branch that another condition has switched off does not matter and is left out; conditions that
     are no limiters (kind "branch") are listed with their distance and are never active.

@@ -19,10 +19,10 @@ from hvdc_ident.notebook import Shown, Table
 if TYPE_CHECKING:
     import control
 
-    from hvdc_ident.linearize.frequency import Response
-    from hvdc_ident.linearize.margins import LoopMargins, Margins
+    from hvdc_ident.linearize.frequency import FrequencyResponse
     from hvdc_ident.linearize.modal import Mode, TransferFunction
     from hvdc_ident.linearize.reduce import Reduction
+    from hvdc_ident.linearize.stability_margins import LoopMargins, Margins
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +283,7 @@ class LinearModel(Shown):
         *,
         covariance: Array | None = None,
         parameters: Sequence[str] = (),
-    ) -> Response:
+    ) -> FrequencyResponse:
         """Return the frequency response at omega in rad/s (default: around the poles), with units; it draws itself.
 
         covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
@@ -307,8 +307,8 @@ class LinearModel(Shown):
         break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
         is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
         """
-        from hvdc_ident.linearize.loop import loop
-        from hvdc_ident.linearize.margins import loop_margins, margins
+        from hvdc_ident.linearize.open_loop import loop
+        from hvdc_ident.linearize.stability_margins import loop_margins, margins
         from hvdc_ident.model.definition import Model
 
         if break_at is None:

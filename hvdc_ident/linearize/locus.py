@@ -1,4 +1,4 @@
-"""Loci: how the eigenvalues move with a parameter, followed by their eigenvectors, and where stability is lost."""
+"""Root loci: eigenvalues along a parameter, followed by their eigenvectors, and the values at which stability changes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
-from hvdc_ident.linearize.equilibrium import Search
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch
 from hvdc_ident.linearize.jacobian import state_matrix
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.modal import ZERO, eigen
@@ -28,7 +28,7 @@ class StabilityLimit:
 
 
 @dataclass(frozen=True, eq=False)
-class Locus:
+class RootLocus:
     """Eigenvalues (points, modes) in rad/s along values of a parameter; column k is one mode throughout.
 
     limits: where stability is lost or won between the values.
@@ -42,7 +42,7 @@ class Locus:
 
     @property
     def stable(self) -> Array:
-        """(points,) whether every eigenvalue lies left of the axis, those that stay at 0 apart."""
+        """(points,) True where every eigenvalue lies left of the imaginary axis, those that stay at 0 apart."""
         return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
 
     def plot(self, ax: Any = None) -> Any:
@@ -69,8 +69,8 @@ class Locus:
 
 def root_locus(
     model: Model, parameter: str, values: Sequence[float] | Array, fixed: dict[str, float] | None = None
-) -> Locus:
-    """The eigenvalues of the model along values of a parameter (or input), each at its own operating point.
+) -> RootLocus:
+    """Return the eigenvalues of the model along values of a parameter (or input), each at its own operating point.
 
     Raises UnknownNameError, SteadyStateError with the value at which there is no operating point, and
     LinearizationError on a kink.
@@ -96,7 +96,7 @@ def root_locus(
         left = left_new
     table = np.array(found)
     unit = (model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]).unit
-    return Locus(parameter, unit, along, table, _limits(at, along, table))
+    return RootLocus(parameter, unit, along, table, _limits(at, along, table))
 
 
 class _Along:
@@ -106,11 +106,11 @@ class _Along:
         self.model, self.parameter = model, parameter
         own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
         start = {parameter: own.value}
-        self._search = Search.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        self._search = EquilibriumSearch.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
         names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
         self._place = names.index(parameter)
 
-    def _at(self, value: float) -> Search:
+    def _at(self, value: float) -> EquilibriumSearch:
         """The search at a value: nothing else in it changes but the guesses that stand on parameters."""
         key = "p" if self.parameter in self.model.parameters else "u"
         values = getattr(self._search, key).copy()
@@ -144,7 +144,7 @@ def match(before: Array, left: Array, after: Array, right: Array) -> Array:
 
 
 def _limits(at: _Along, values: Array, table: Array) -> tuple[StabilityLimit, ...]:
-    """Where a mode's real part changes sign, to the last digits: bisection on the mode nearest to the axis."""
+    """Return the values at which a mode's real part changes sign, to the last digits, by bisection."""
     found = []
     resting = at_zero(table)
     for k in range(values.size - 1):

@@ -1,4 +1,4 @@
-"""The arrays of this folder: real or complex."""
+"""Real or complex arrays, and the elimination of unknowns from block matrices with derivatives of the result."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Eliminated:
     right: Array
 
     def derivative(self, da: Array, db: Array, dc: Array, dd: Array) -> Array:
-        """The derivative of the result for derivatives of the blocks; blocks may have leading axes."""
+        """Return the derivative of the result for derivatives of the blocks; blocks may have leading axes."""
         return np.asarray(da - db @ self.right - self.left @ dc + self.left @ dd @ self.right)
 
 
 def eliminate(matrix: Array, rows: int, columns: int) -> Eliminated:
-    """The Schur complement that removes the rows and columns after the given counts.
+    """Return the Schur complement that removes the rows and columns after the given counts.
 
     A singular block gives the condition infinity and a result that must not be used.
     """

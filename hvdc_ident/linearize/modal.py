@@ -1,4 +1,8 @@
-"""Modes: eigenvalues with damping and frequency, participation, shapes, and how they move with parameters."""
+"""Modes, zeros and transfer functions of a linear model.
+
+Eigenvalues with damping and frequency, participation, shapes and derivatives by parameters; zeros from the system matrix,
+never from polynomials; transfer functions as zeros, poles and gain.
+"""
 
 from __future__ import annotations
 
@@ -250,7 +254,7 @@ RANK = 1e-11
 
 
 def zeros(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """The finite invariant zeros, complex, rad/s: infinite ones are deflated by orthogonal steps beforehand.
+    """Return the finite invariant zeros, complex, rad/s: infinite ones are deflated by orthogonal steps beforehand.
 
     Emami-Naeini and Van Dooren 1982 (doi 10.1016/0005-1098(82)90070-X): rank decisions on a balanced system, then a
     generalised eigenproblem. A system without any path from input to output has none by this definition.
@@ -275,7 +279,7 @@ def zeros(a: Array, b: Array, c: Array, d: Array) -> Array:
 
 
 def _balanced(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-    """The same system with states, inputs and outputs scaled so that rows and columns are alike in size."""
+    """Return the system with states, inputs and outputs scaled so that rows and columns are alike in size."""
     n, m, o = a.shape[0], b.shape[1], c.shape[0]
     whole = np.block([[a, b], [c, d]])
     t, rows, columns = np.ones(n), np.ones(o), np.ones(m)
@@ -374,7 +378,7 @@ class TransferFunction:
 
 
 def transfer_function(model: LinearModel, input: str, output: str) -> TransferFunction:
-    """Zeros, poles and gain of one channel; stable pole-zero pairs that cancel are left out and listed.
+    """Return zeros, poles and gain of one channel; stable pole-zero pairs that cancel are left out and listed.
 
     An unstable pair is never cancelled. A channel without a path is 0: no zeros, no poles, gain 0.
     """

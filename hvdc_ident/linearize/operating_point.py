@@ -12,7 +12,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.equilibrium import ACCURACY, At, Root, Search, homotopy, newton, weights
+from hvdc_ident.linearize.equilibrium import ACCURACY, At, EquilibriumSearch, Root, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.modal import ZERO
@@ -51,7 +51,7 @@ class OperatingPoint:
     method: str
     at: At = "steady"
     time: float = 0.0
-    search: Search | None = field(default=None, repr=False)
+    search: EquilibriumSearch | None = field(default=None, repr=False)
     branch: Branch = "own"
 
     def _repr_html_(self) -> str:
@@ -66,7 +66,7 @@ class OperatingPoint:
 
     @cached_property
     def stable(self) -> bool | None:
-        """Return whether no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
+        """True where no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
         return None if self.search is None else _stable(self, self.y, self.w)
 
     @cached_property
@@ -129,7 +129,7 @@ def find_operating_point(
     moving: Collection[str] = (),
     time: float = 0.0,
 ) -> OperatingPoint:
-    """The operating point at which every derivative is 0 and what is fixed holds.
+    """Return the operating point at which every derivative is 0 and the fixed values hold.
 
     With inputs and parameters alone it is the steady state that a simulation starts from.
 
@@ -163,11 +163,11 @@ def find_operating_point(
         from hvdc_ident.linearize.fmu_linear import find_point
 
         return find_point(model, fixed or {}, free, bounds or {}, guess or {}, at, moving, time)
-    search = Search.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
+    search = EquilibriumSearch.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
     return solve(model, search, guess or {})
 
 
-def solve(model: Model, search: Search, guess: Mapping[str, float] | None = None) -> OperatingPoint:
+def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | None = None) -> OperatingPoint:
     """The point a search leads to; SteadyStateError with the worst equation where it leads to none."""
     if search.is_plain and not guess:
         return point_of(model, search, *steady(model, search))
@@ -181,7 +181,7 @@ def solve(model: Model, search: Search, guess: Mapping[str, float] | None = None
     return point_of(model, search, root, "own" if own is None or same else "other")
 
 
-def steady(model: Model, search: Search) -> tuple[Root, Branch]:
+def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
     """The steady state that a simulation of the same inputs and parameters starts from, and its branch."""
     free = model if search.at == "start" else resting(model)
     try:
@@ -202,7 +202,7 @@ def steady(model: Model, search: Search) -> tuple[Root, Branch]:
     return Root(v, r, shares, 0, "newton"), found.branch
 
 
-def _own(model: Model, search: Search) -> Array | None:
+def _own(model: Model, search: EquilibriumSearch) -> Array | None:
     """The model's own steady state at the search's inputs and parameters; None where it has none there."""
     free = model if search.at == "start" else resting(model)
     at = equilibria(free)
@@ -212,7 +212,7 @@ def _own(model: Model, search: Search) -> Array | None:
         return None
 
 
-def _constrained(model: Model, search: Search, guess: Mapping[str, float], own: Array | None) -> Root:
+def _constrained(model: Model, search: EquilibriumSearch, guess: Mapping[str, float], own: Array | None) -> Root:
     """The root that the guess leads to, else one near the model's own steady state, else near its guesses."""
     best: Root | None = None
     starts = search.guesses(guess)
@@ -238,7 +238,7 @@ def _constrained(model: Model, search: Search, guess: Mapping[str, float], own: 
     raise _not_found(model, search, best)
 
 
-def _not_found(model: Model, search: Search, root: Root) -> SteadyStateError:
+def _not_found(model: Model, search: EquilibriumSearch, root: Root) -> SteadyStateError:
     worst = int(np.argmax(root.shares))
     names = search.variables
     on_bound = [n for n, v, a, b in zip(names, root.v, search.low, search.high, strict=True) if v in (a, b)]
@@ -253,7 +253,7 @@ def _not_found(model: Model, search: Search, root: Root) -> SteadyStateError:
     )
 
 
-def point_of(model: Model, search: Search, root: Root, branch: Branch = "own") -> OperatingPoint:
+def point_of(model: Model, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
     """The point of a solved search."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
@@ -293,7 +293,7 @@ def point_at(
     *,
     time: float = 0.0,
 ) -> OperatingPoint:
-    """The operating point at given states, which need not be at rest; unknowns are solved for.
+    """Return the operating point at given states, which need not be at rest; unknowns are solved for.
 
     Raises UnknownNameError for a name that is not a state, input or parameter, or a state left out; SteadyStateError
     where the unknowns have no solution.
@@ -308,7 +308,7 @@ def point_at(
 def continuation(
     model: AnyModel, name: str, values: Sequence[float], fixed: Mapping[str, float] | None = None
 ) -> tuple[OperatingPoint, ...]:
-    """The operating points along values of one parameter or input, each searched from the one before.
+    """Return the operating points along values of one parameter or input, each searched from the one before.
 
     A step that fails is halved up to ten times on the way. Raises SteadyStateError with the last value reached.
     """
@@ -347,7 +347,7 @@ def _step_to(
 
 
 def _notes(point: OperatingPoint) -> tuple[str, ...]:
-    """Sentences on a point that is unstable, not the model's own steady state, or far outside its states' own range.
+    """Return sentences on a point that is unstable, not the model's own steady state, or far outside its states' own range.
 
     Each names the other steady state where one is found: the model's own one, or those that the model runs to from here.
     """
@@ -402,7 +402,7 @@ def _fastest(point: OperatingPoint) -> str:
 
 
 def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
-    """The nearest of the stable steady states that the model runs to from here, or that its guesses lead to."""
+    """Return a sentence on the nearest stable steady state that the model runs to from here, or that its guesses lead to."""
     matrix = _matrix(point, point.y, point.w)
     assert matrix is not None
     values, vectors = np.linalg.eig(matrix)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.linearize.frequency import Response
+from hvdc_ident.linearize.frequency import FrequencyResponse
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.modal import Mode
 from hvdc_ident.notebook import axes_of
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize.locus import Locus
+    from hvdc_ident.linearize.locus import RootLocus
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
@@ -42,7 +42,7 @@ def axes_through_zero(axes: Any) -> None:
     axes.axvline(0.0, color=MARK, linewidth=0.6)
 
 
-def bode(responses: Sequence[Response], labels: Sequence[str] = (), ax: Any = None) -> Any:
+def bode(responses: Sequence[FrequencyResponse], labels: Sequence[str] = (), ax: Any = None) -> Any:
     """The two axes, gain above phase; every channel of every response is one curve, measured ones are dots."""
     gain, phase = pair = axes_of(ax, 7.0, 6.0, rows=2)
     k = 0
@@ -74,7 +74,7 @@ def bode(responses: Sequence[Response], labels: Sequence[str] = (), ax: Any = No
     return pair
 
 
-def nyquist(responses: Sequence[Response], modulus: float = 0.0, reach: float = 3.0, ax: Any = None) -> Any:
+def nyquist(responses: Sequence[FrequencyResponse], modulus: float = 0.0, reach: float = 3.0, ax: Any = None) -> Any:
     """The axes; reach: how far the axes go where the curves go further. modulus: radius of the disk around -1."""
     axes = axes_of(ax, 6.0, 6.0)
     k, largest = 0, 1.5
@@ -162,7 +162,7 @@ def shapes(mode: Mode, smallest: float = 0.01, ax: Any = None) -> Any:
     return axes
 
 
-def locus(found: Locus, left: float | None = None, ax: Any = None) -> Any:
+def locus(found: RootLocus, left: float | None = None, ax: Any = None) -> Any:
     """The axes: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
     axes = axes_of(ax, 6.5, 5.0)
     for k in range(found.eigenvalues.shape[1]):

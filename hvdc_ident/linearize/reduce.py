@@ -37,7 +37,7 @@ class Reduction:
     @property
     def error(self) -> Peak:
         """The L-infinity norm of whole - reduced, and where it is: between the stable parts, for the rest is kept."""
-        from hvdc_ident.linearize.compare import difference
+        from hvdc_ident.linearize.distance import difference
         from hvdc_ident.linearize.norms import Peak, linf_norm
 
         return Peak(0.0, 0.0) if self.stable is None else linf_norm(difference(*self.stable))
@@ -84,7 +84,7 @@ def staircase(a: Array, b: Array, tolerance: float = TOLERANCE) -> tuple[Array, 
 
 
 def minimal(model: LinearModel, tolerance: float = TOLERANCE) -> Reduction:
-    """The controllable and observable part, and the eigenvalues that were removed.
+    """Return the controllable and observable part, and the eigenvalues that were removed.
 
     Raises LinearizationError where an unstable or undamped mode would be cancelled: it is hidden, not gone.
     """
@@ -115,7 +115,7 @@ def uncontrollable_unobservable(a: Array, b: Array, c: Array) -> Array:
 
 
 def _scale(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
-    """The same system with states scaled by powers of two so that rows and columns of A are alike."""
+    """Return the system with states scaled by powers of two so that rows and columns of A are alike."""
     if a.shape[0] == 0:
         return a, b, c
     _, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
@@ -140,7 +140,7 @@ def _refuse_unstable(model: LinearModel, hidden: Array, verb: str) -> None:
 
 
 def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Array]:
-    """A, B, C, D without the zero eigenvalues that a Pade approximant leaves where a sliding mean stands.
+    """Return A, B, C, D without the zero eigenvalues that a Pade approximant leaves where a sliding mean stands.
 
     y' = (u - u(t - T))/T has no pole at 0; with the delay approximated it has one that no input reaches: what it keeps
     is the difference between y and the mean, which is 0 for ever. Models without delays are left as they are.
@@ -219,7 +219,7 @@ def _root(p: Array) -> Array:
 def balanced(
     model: LinearModel, order: int | None = None, bound: float | None = None, *, match_dc: bool = False
 ) -> Reduction:
-    """The model of fewer states by balanced truncation, with the bound 2 sum(removed Hankel values) on its error.
+    """Return the model of fewer states by balanced truncation, with the bound 2 sum(removed Hankel values) on its error.
 
     order: states that stay, or bound: the largest L-infinity error allowed (in output per input units). match_dc: the
     removed states are put at rest instead of left out (singular perturbation, Liu and Anderson 1989): the dc gain stays

@@ -9,7 +9,7 @@ import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression.functions import symbol
-from hvdc_ident.linearize.loop import signal_values
+from hvdc_ident.linearize.open_loop import signal_values
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
 from hvdc_ident.model.definition import Model
 

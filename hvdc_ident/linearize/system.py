@@ -1,4 +1,7 @@
-"""The expression graph evaluated in complex numbers: an independent check of the derivatives taken on it."""
+"""Values and exact derivatives of a model as machine code, which linearisation and operating points are made of.
+
+The same graph is also evaluated in complex numbers: an independent check of the derivatives taken on it.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +91,7 @@ _SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand: counts of states, unknowns, inputs, delays and sampled values, outputs, parameters."""
+    """Layout of rows and columns: counts of states, unknowns, inputs, delays and sampled values, outputs, parameters."""
 
     nx: int
     nz: int
@@ -120,7 +123,7 @@ class Layout:
         return self.n + self.nu + self.ne
 
 
-class System:
+class CompiledSystem:
     """Compiled values and derivatives of one model structure for one list of outputs; reusable for any values."""
 
     def __init__(self, model: Model, outputs: Sequence[str]) -> None:
@@ -183,7 +186,7 @@ class System:
     # --- values and derivatives ---
 
     def flat_roots(self, y: Array, w: Array, p: Array, m: Array) -> list[int]:
-        """The square roots whose argument is 0 at the point, where they have no slope."""
+        """Return the nodes of the square roots whose argument is 0 at the point, where they have no slope."""
         at = self._run("roots", len(self.roots), y, w, p, m)
         return [n for (n, _), value in zip(self.roots, at, strict=True) if value == 0.0]
 
@@ -287,10 +290,10 @@ class System:
         return np.array([v.imag for v in values]).reshape(size.main, size.columns) / 1e-30
 
 
-_system = by_structure(System, room=32)
+_system = by_structure(CompiledSystem, room=32)
 _by_identity = lru_cache(maxsize=64)(_system)
 
 
-def system(model: Model, outputs: Sequence[str] | None = None) -> System:
-    """The compiled system of a model for a list of outputs or signals (default all outputs), kept for later calls."""
+def system(model: Model, outputs: Sequence[str] | None = None) -> CompiledSystem:
+    """Return the compiled system of a model for a list of outputs or signals (default all outputs), kept for later calls."""
     return _by_identity(model, tuple(model.outputs if outputs is None else outputs))

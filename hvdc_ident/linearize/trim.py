@@ -1,4 +1,4 @@
-"""The inputs that are set for outputs to have given values at rest."""
+"""Trim: the inputs that are set so that outputs have given values at rest."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from hvdc_ident.errors import InputError, unknown_name
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.model.definition import Model
 from hvdc_ident.sensitivity.fisher import leading
-from hvdc_ident.sensitivity.rank.equations import Source, Start
+from hvdc_ident.sensitivity.rank.equations import EquationSource, Start
 from hvdc_ident.sensitivity.rank.invariants import (
     SPARE,
     Invariant,
@@ -30,7 +30,7 @@ from hvdc_ident.sensitivity.rank.invariants import (
     nulls,
     tied,
 )
-from hvdc_ident.sensitivity.rank.points import InputClass, Question, RealPoints, Rows
+from hvdc_ident.sensitivity.rank.points import InputClass, PointRows, Question, RealPoints
 from hvdc_ident.sensitivity.rank.prime_points import FieldPoints
 from hvdc_ident.sensitivity.rank.rings import PRIMES, NotRational, OutOfTime, PrimeField, context
 
@@ -40,7 +40,7 @@ CHECK = 0.4  # share of the time left that a confirmation may take
 FEW = 8  # members of a combination up to which polynomials are looked for
 
 
-Drawn = tuple[list[Rows], Callable[[], Rows], str]
+Drawn = tuple[list[PointRows], Callable[[], PointRows], str]
 
 
 class _Precise:
@@ -49,7 +49,7 @@ class _Precise:
     def __init__(self, points: RealPoints) -> None:
         self.points = points
 
-    def __call__(self) -> Rows:
+    def __call__(self) -> PointRows:
         with context():
             return self.points()
 
@@ -76,7 +76,7 @@ class _Ask:
         """Return the result's fields beside the question. Raises NotRational for a model outside the method, OutOfTime."""
         if self.model.delays or self.model.sampled:
             raise NotRational("it has delays or sampled parts")
-        source = Source(self.model, self.outputs, self._known_starts())
+        source = EquationSource(self.model, self.outputs, self._known_starts())
         if source.graph.switches:
             self._operating(source)
         self.regime_words += [x for x in source.active() if x.split(":")[0] not in self.regime]
@@ -92,7 +92,7 @@ class _Ask:
             return result
         return {"status": "not decided", "reason": "from this start one move of the inputs may show less than several"}
 
-    def _operating(self, source: Source) -> None:
+    def _operating(self, source: EquationSource) -> None:
         """Find the operating point. Its time, machine code included, does not count against the limit."""
         begun = time.thread_time()
         _ = source.point
@@ -103,7 +103,7 @@ class _Ask:
         mine = {n for n in self.starts if f"{n}_start" in self.names and self.model.states[n].start == "free"}
         return {n: "given" if n in mine else s for n, s in self.starts.items()}
 
-    def _question(self, source: Source, rest: Any, move: Any, moved: Mapping[str, Any]) -> Question:
+    def _question(self, source: EquationSource, rest: Any, move: Any, moved: Mapping[str, Any]) -> Question:
         places = list(self.model.parameters)
         inputs = tuple((1 + list(self.model.inputs).index(n), k) for n, k in moved.items())
         rested = all(s == "steady" for s in source.start.values())
@@ -146,7 +146,7 @@ class _Ask:
             return None
         return points[:1], next(m for m in makers if m.ring == points[0].ring), "prime field"
 
-    def _confirmed(self, q: Question, found: Rows) -> bool:
+    def _confirmed(self, q: Question, found: PointRows) -> bool:
         """True where a real point sees the same as a point of the field, which may lie on another branch; or time is short."""
         if q.highest and len(found.pivots) < len(self.names):
             return True  # it is asked again at the full order
@@ -158,7 +158,7 @@ class _Ask:
             return True
         return _pattern(real) == _pattern(found)
 
-    def _result(self, points: list[Rows], make: Callable[[], Rows], method: str) -> dict[str, Any]:
+    def _result(self, points: list[PointRows], make: Callable[[], PointRows], method: str) -> dict[str, Any]:
         rows = points[0]
         seen = tuple(self.names[k] for k in rows.seen)
         return {
@@ -175,7 +175,7 @@ class _Ask:
     # --- words ---
 
     def _combination(
-        self, members: tuple[int, ...], points: list[Rows], make: Callable[[], Rows]
+        self, members: tuple[int, ...], points: list[PointRows], make: Callable[[], PointRows]
     ) -> StructuralCombination:
         names = tuple(self.names[k] for k in members)
         if len(members) == 1:
@@ -191,7 +191,7 @@ class _Ask:
         return StructuralCombination(names, seen, words, free, directions, relative)
 
     def _named(
-        self, members: tuple[int, ...], points: list[Rows], make: Callable[[], Rows], free: int
+        self, members: tuple[int, ...], points: list[PointRows], make: Callable[[], PointRows], free: int
     ) -> tuple[Invariant, ...] | None:
         """Return the invariants of the members, from points enough to rule out chance; None where they have no simple form."""
         n = len(members)
@@ -225,7 +225,7 @@ class _Ask:
         return tuple(tuple(float(round(x, 12)) + 0.0 for x in v) for v in scaled), relative
 
 
-def _pattern(rows: Rows) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _pattern(rows: PointRows) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return rows.pivots, rows.seen
 
 

@@ -173,9 +173,9 @@ def _trimmed(trim: schema.Trim, linear: LinearModel) -> dict[str, Any]:
 
 
 def _margins(asked: schema.Linearize, linear: LinearModel) -> dict[str, Any]:
-    from hvdc_ident.linearize.compare import ncf_margin
-    from hvdc_ident.linearize.loop import loop, plant_and_controller
-    from hvdc_ident.linearize.margins import loop_margins
+    from hvdc_ident.linearize.distance import ncf_margin
+    from hvdc_ident.linearize.open_loop import loop, plant_and_controller
+    from hvdc_ident.linearize.stability_margins import loop_margins
 
     point = linear.point
     assert point is not None and isinstance(point.model, Model)
@@ -202,7 +202,7 @@ def _reduced(asked: schema.Reduce, linear: LinearModel) -> dict[str, Any]:
 def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:
     """The other model's linear model at the same inputs and, by name, parameters, against this one's."""
     from hvdc_ident.linearize import find_operating_point, linearize
-    from hvdc_ident.linearize.compare import compare
+    from hvdc_ident.linearize.distance import compare
 
     point, other = linear.point, study.compared
     assert point is not None and other is not None

@@ -14,7 +14,7 @@ from hvdc_ident.errors import InputError, LinearizationError, SteadyStateError, 
 from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.frequency import Response
+from hvdc_ident.linearize.frequency import FrequencyResponse
 from hvdc_ident.linearize.impedance import MeasuredResponse, Port, response_at_tones, response_from_record
 from hvdc_ident.linearize.response_file import ResponseFile, read_response
 from hvdc_ident.model.definition import Model
@@ -176,7 +176,7 @@ def _waveforms(table: schema.Response, path: Path) -> ResponseFile:
     record = read_waveforms(path, [sent, seen])
     u, y = record[sent], record[seen]
     if table.frequencies is None:
-        found: Response = response_from_record(record.time, u, y, input=sent, output=seen)
+        found: FrequencyResponse = response_from_record(record.time, u, y, input=sent, output=seen)
     else:
         omega = 2 * np.pi * np.array(table.frequencies)
         found = response_at_tones(record.time, u, y, omega, input=sent, output=seen)

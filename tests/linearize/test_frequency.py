@@ -23,9 +23,9 @@ from hvdc_ident.linearize.impedance import (
     response_from_record,
     simulated_response,
 )
-from hvdc_ident.linearize.loop import loop
-from hvdc_ident.linearize.margins import margins
 from hvdc_ident.linearize.modal import zeros
+from hvdc_ident.linearize.open_loop import loop
+from hvdc_ident.linearize.stability_margins import margins
 from hvdc_ident.linearize.symbolic import symbolic_transfer
 from hvdc_ident.models import load_model
 

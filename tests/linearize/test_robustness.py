@@ -7,11 +7,11 @@ from helpers import linear, stable
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize import find_operating_point
-from hvdc_ident.linearize.compare import compare, difference, gap, ncf_margin, nu_gap
-from hvdc_ident.linearize.loop import loop, plant_and_controller
-from hvdc_ident.linearize.margins import loop_margins, margins, structured_singular_value
+from hvdc_ident.linearize.distance import compare, difference, gap, ncf_margin, nu_gap
 from hvdc_ident.linearize.norms import hinf_norm, linf_norm, norms
+from hvdc_ident.linearize.open_loop import loop, plant_and_controller
 from hvdc_ident.linearize.reduce import balanced
+from hvdc_ident.linearize.stability_margins import loop_margins, margins, structured_singular_value
 from hvdc_ident.models import load_model
 
 

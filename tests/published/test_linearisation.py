@@ -11,9 +11,9 @@ import sympy as sp
 from hvdc_ident.expression import parse
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, point_at
-from hvdc_ident.linearize.compare import gap, nu_gap
-from hvdc_ident.linearize.margins import margins
+from hvdc_ident.linearize.distance import gap, nu_gap
 from hvdc_ident.linearize.norms import h2_norm, hinf_norm
+from hvdc_ident.linearize.stability_margins import margins
 from hvdc_ident.model.definition import Model, Output, Signal, State
 from hvdc_ident.parameters import Input, Parameter
 

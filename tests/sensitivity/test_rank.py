@@ -16,7 +16,7 @@ import sympy as sp
 
 from hvdc_ident.expression import parse
 from hvdc_ident.model.definition import Algebraic, Model, Output, State
-from hvdc_ident.sensitivity.rank.equations import Equations, Source
+from hvdc_ident.sensitivity.rank.equations import Equations, EquationSource
 from hvdc_ident.sensitivity.rank.rings import PRIMES, HighPrecision, NoSuchNumber, PrimeField, context, numerator, roots
 from hvdc_ident.sensitivity.rank.taylor import Taylor
 
@@ -80,7 +80,7 @@ def _series(derivative: str, start: float, order: int, algebraic: dict[str, Alge
         outputs={"y": Output(parse("x"))},
         algebraic=algebraic or {},
     )
-    source = Source(model, ["y"], {"x": "free"})
+    source = EquationSource(model, ["y"], {"x": "free"})
     e: Equations = source.equations({})
     taylor = Taylor(e, HighPrecision(), [Decimal(1)], [0], 0, thread_time() + 60)
     y = [Decimal(repr(start)), *(Decimal(repr(z.start)) for z in (algebraic or {}).values())]
@@ -122,7 +122,7 @@ def test_functions_of_time_against_closed_forms(function: str) -> None:
         states={"x": State(parse("a*time*0 + 1")), "s": State(parse("a"))},
         outputs={"y": Output(parse(f"{function}(s)"))},
     )
-    source = Source(model, ["y"], {"x": "free", "s": "free"})
+    source = EquationSource(model, ["y"], {"x": "free", "s": "free"})
     e = source.equations({})
     with context():
         taylor = Taylor(e, HighPrecision(), [Decimal(1)], [0], 0, thread_time() + 60)

@@ -36,7 +36,7 @@ def write(model: LinearModel, path: str | Path) -> Path:
 
 
 def read(path: str | Path) -> Any:
-    """What a file holds: a LinearModel; a Response of a .csv; transfer functions of a .zpk. Raises ModelError."""
+    """Return the contents of a file: a LinearModel, of a .csv a FrequencyResponse, of a .zpk transfer functions. Raises ModelError."""
     chosen = _format(Path(path))
     if not hasattr(chosen, "read"):
         raise ModelError("this format is for people and cannot be read back", where=str(path), hint="use .json or .mat")

@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_text
-from hvdc_ident.linearize.frequency import Response
+from hvdc_ident.linearize.frequency import FrequencyResponse
 from hvdc_ident.linearize.linear_model import LinearModel
 
 SUFFIX = ".csv"
@@ -24,11 +24,11 @@ def write(model: LinearModel, path: Path) -> Path:
 
 
 def _note(model: LinearModel) -> str:
-    """Where the response comes from, as comments below it: readers that take names from the first line still do."""
+    """Return the provenance as comments, put below the response so that names stay in the first line."""
     return "".join(f"# {' '.join(f'{k}: {v}'.split())}\n" for k, v in model.provenance.items())
 
 
-def text(response: Response) -> str:
+def text(response: FrequencyResponse) -> str:
     """CSV text: columns omega, `re OUTPUT from INPUT`, `im OUTPUT from INPUT`."""
     header, columns = ["omega"], [response.omega]
     for i, o in enumerate(response.output_names):
@@ -42,7 +42,7 @@ def text(response: Response) -> str:
     return stream.getvalue()
 
 
-def read(path: Path) -> Response:
+def read(path: Path) -> FrequencyResponse:
     """The response of a file that `write` wrote. Raises ModelError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -55,4 +55,4 @@ def read(path: Path) -> Response:
     channels = [h.removeprefix("re ").split(_ARROW) for h in rows[0][1::2]]
     outputs, inputs = tuple(dict.fromkeys(c[0] for c in channels)), tuple(dict.fromkeys(c[1] for c in channels))
     values = (data[:, 1::2] + 1j * data[:, 2::2]).reshape(-1, len(outputs), len(inputs))
-    return Response(data[:, 0], values, outputs, inputs, source=str(path.name))
+    return FrequencyResponse(data[:, 0], values, outputs, inputs, source=str(path.name))

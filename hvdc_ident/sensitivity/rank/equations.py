@@ -54,7 +54,7 @@ class Equations:
         return near if float(near) == value else Fraction(repr(value))
 
 
-class Source:
+class EquationSource:
     """The model's graph with its limiters, and the point at which each limiter's branch is read.
 
     start: per state "steady", "free" or "given". values: parameters, inputs and states by name at the operating point.
@@ -191,7 +191,7 @@ class Source:
 class _Branches:
     """A graph made again with one branch of every limiter, and inverse functions written with those that have series."""
 
-    def __init__(self, source: Source, holds: Mapping[int, bool], forced: Mapping[int, int]) -> None:
+    def __init__(self, source: EquationSource, holds: Mapping[int, bool], forced: Mapping[int, int]) -> None:
         self.origin, self.source, self.graph, self.holds, self.forced = (
             source,
             source.graph,

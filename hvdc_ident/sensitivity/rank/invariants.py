@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.sensitivity.rank.points import Rows
+from hvdc_ident.sensitivity.rank.points import PointRows
 from hvdc_ident.sensitivity.rank.rings import Array, Ring
 
 
@@ -135,7 +135,7 @@ def components(null: Array) -> list[tuple[int, ...]]:
     return sorted(tuple(sorted(g)) for g in groups if g)
 
 
-def nulls(rows: Rows) -> Array:
+def nulls(rows: PointRows) -> Array:
     """A basis (rows) of the null directions at a point."""
     return _null_space(rows.ring, rows.matrix, rows.pivots, len(rows.theta))
 
@@ -151,7 +151,7 @@ def _null_space(ring: Ring, reduced: Array, pivots: Sequence[int], columns: int)
     return basis
 
 
-def invariants(points: Sequence[Rows], members: Sequence[int]) -> tuple[Invariant, ...] | None:
+def invariants(points: Sequence[PointRows], members: Sequence[int]) -> tuple[Invariant, ...] | None:
     """Independent combinations of the members that hold all that is seen of them; None where they are not found.
 
     points: rows at points of one ring; the more, the more kinds of combination can be told from chance.
@@ -181,7 +181,7 @@ def _independent(found: Iterable[Invariant], theta: Sequence[Any], ring: Ring) -
     return chosen
 
 
-def _products(points: Sequence[Rows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:
+def _products(points: Sequence[PointRows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:
     ring, stacked = points[0].ring, []
     for r, d in zip(points, directions, strict=True):
         inverses = ring.zeros(len(members))
@@ -190,13 +190,13 @@ def _products(points: Sequence[Rows], members: Sequence[int], directions: Sequen
     return [Invariant(((Fraction(1), e),)) for e in _constant(np.concatenate(stacked), ring)]
 
 
-def _sums(points: Sequence[Rows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:
+def _sums(points: Sequence[PointRows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:
     n = len(members)
     units = [tuple(int(j == k) for j in range(n)) for k in range(n)]
     return [_sum_of(units, v) for v in _constant(np.concatenate(directions), points[0].ring)]
 
 
-def _polynomials(points: Sequence[Rows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:
+def _polynomials(points: Sequence[PointRows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:
     ring, n = points[0].ring, len(members)
     sets = [*combinations_with_replacement(range(n), 1), *combinations_with_replacement(range(n), 2)]
     terms = [tuple(s.count(k) for k in range(n)) for s in sets]

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.sensitivity.rank.equations import Equations, Source
+from hvdc_ident.sensitivity.rank.equations import Equations, EquationSource
 from hvdc_ident.sensitivity.rank.rings import Array, HighPrecision, NoSuchNumber, NotRational, Ring
 from hvdc_ident.sensitivity.rank.taylor import Taylor, inverse
 
@@ -33,7 +33,7 @@ class Question:
     Taylor order if it is not to be the usual one.
     """
 
-    source: Source
+    source: EquationSource
     rest: Equations
     move: Equations
     parameters: tuple[int, ...]
@@ -55,7 +55,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Rows:
+class PointRows:
     """Reduced rows over the parameters alone at one point, and the parameters' values there."""
 
     ring: Ring
@@ -83,7 +83,7 @@ class Base:
 Jump = Callable[[Base, list[Any], "set[int]", Random], list[Any]]
 
 
-def rows(question: Question, ring: Ring, base: Base, jump: Jump, random: Random, deadline: float) -> Rows:
+def rows(question: Question, ring: Ring, base: Base, jump: Jump, random: Random, deadline: float) -> PointRows:
     """The rows at one base point. jump: the unknowns right after the inputs have jumped to the given values."""
     q, nx = question, len(question.rest.derivatives)
     found: list[Array] = []
@@ -113,7 +113,7 @@ def rows(question: Question, ring: Ring, base: Base, jump: Jump, random: Random,
         watch(q.move, y, w, q.order)
     reduced, pivots = ring.rref(np.concatenate(found))
     first = sum(c < nx for c in pivots)
-    return Rows(ring, reduced[first:, nx:], tuple(c - nx for c in pivots[first:]), tuple(theta))
+    return PointRows(ring, reduced[first:, nx:], tuple(c - nx for c in pivots[first:]), tuple(theta))
 
 
 def stretches(q: Question) -> list[dict[int, InputClass]]:
@@ -167,7 +167,7 @@ class RealPoints:
     def __init__(self, question: Question, random: Random, deadline: float) -> None:
         self.q, self.ring, self.random, self.deadline = question, HighPrecision(), random, deadline
 
-    def __call__(self) -> Rows:
+    def __call__(self) -> PointRows:
         """The rows at one more point."""
         for spread in (0.2, 0.1, 0.05, 0.02, 0.01):
             try:

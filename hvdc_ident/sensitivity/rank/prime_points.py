@@ -15,7 +15,7 @@ from random import Random
 from typing import Any
 
 from hvdc_ident.sensitivity.rank.equations import Equations
-from hvdc_ident.sensitivity.rank.points import Base, Question, Rows, affected, rows
+from hvdc_ident.sensitivity.rank.points import Base, PointRows, Question, affected, rows
 from hvdc_ident.sensitivity.rank.rings import NoSuchNumber, NotRational, OutOfTime, PrimeField, numerator, roots
 from hvdc_ident.simulate.graph import Graph
 
@@ -369,7 +369,7 @@ class FieldPoints:
         free = {self.sparse.leaf_of[n] for n in (*self.leaves["w"], *self.leaves["y"]) if n in self.sparse.leaf_of}
         self.steps = plan(self.sparse, free, p)
 
-    def __call__(self) -> Rows:
+    def __call__(self) -> PointRows:
         """The rows at one more point."""
         for _ in range(TRIES):
             if time.thread_time() > self.deadline:

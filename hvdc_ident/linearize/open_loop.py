@@ -10,7 +10,7 @@ import numpy as np
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression.functions import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.linearize.frequency import Response, default_omega, transfer
+from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.matrices import Array
@@ -31,7 +31,7 @@ class Loop:
     signal: str
     open: LinearModel
 
-    def response(self, omega: Array | None = None) -> Response:
+    def response(self, omega: Array | None = None) -> FrequencyResponse:
         """L at omega in rad/s, delays exact."""
         return self.open.bode(omega)
 
@@ -50,20 +50,22 @@ class Loop:
             )
         return np.asarray(np.linalg.eigvals(a - b @ np.linalg.solve(through, c)), dtype=complex)
 
-    def sensitivity(self, omega: Array | None = None) -> Response:
+    def sensitivity(self, omega: Array | None = None) -> FrequencyResponse:
         """S = (1 + L)^-1."""
         return self._of(omega, lambda value, one: np.linalg.inv(one + value), "S")
 
-    def complementary(self, omega: Array | None = None) -> Response:
+    def complementary(self, omega: Array | None = None) -> FrequencyResponse:
         """T = (1 + L)^-1 L."""
         return self._of(omega, lambda value, one: np.linalg.solve(one + value, value), "T")
 
-    def _of(self, omega: Array | None, of: Callable[[Array, Array], Array], name: str) -> Response:
+    def _of(self, omega: Array | None, of: Callable[[Array, Array], Array], name: str) -> FrequencyResponse:
         w = default_omega(self.open) if omega is None else np.atleast_1d(np.asarray(omega, dtype=float))
         values = transfer(self.open, 1j * w)
         signals = self.open.input_names
         names = (name,) if len(signals) == 1 else tuple(f"{name} {n}" for n in signals)
-        return Response(w, of(values, np.eye(len(signals))), names, signals, source=f"{name} at '{self.signal}'")
+        return FrequencyResponse(
+            w, of(values, np.eye(len(signals))), names, signals, source=f"{name} at '{self.signal}'"
+        )
 
 
 def open_model(model: Model, signal: str) -> tuple[Model, str]:

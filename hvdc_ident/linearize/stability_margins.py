@@ -14,8 +14,8 @@ from hvdc_ident.errors import LinearizationError
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.loop import Loop
 from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.open_loop import Loop
 
 Curve = Callable[[float], complex]
 Curves = Callable[[Array], Array]

@@ -1,4 +1,4 @@
-"""Distances between two linear models for feedback, nu-gap and gap, and the margin they are compared with."""
+"""Distances between two linear models: nu-gap, gap and L-infinity difference, and the coprime factor margin."""
 
 from __future__ import annotations
 
