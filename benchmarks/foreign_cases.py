@@ -133,7 +133,8 @@ class Peer:
         rows = self.grid if rows is None else rows
         share = (rows - rows[0]) / (rows[-1] - rows[0])
         steps = [min((2 + k % 5) * STAIR, rows.size // 2) for k in range(len(self.inputs))]
-        jumps = rows[STAIR:-1:STAIR]  # none at the end, where FMPy sees no more of it
+        # None at the end, where FMPy sees no more of it.
+        jumps = rows[sorted({*range(STAIR, rows.size - 1, STAIR), *steps})]
         corners = np.sort(np.concatenate([rows, jumps]))
         place = np.searchsorted(rows, corners)
         after = np.ones(corners.size, dtype=bool)
