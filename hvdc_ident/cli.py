@@ -519,7 +519,7 @@ def report(
         folder = out or load_study(source, trust, _limits(deadline, load, memory)).folder
     page = write_report(folder)
     if pdf:
-        from hvdc_ident.report.pdf import write_pdf
+        from hvdc_ident.report.page import write_pdf
 
         _say(f"report: {write_pdf(page)}", json=json, quiet=quiet)
     if json:

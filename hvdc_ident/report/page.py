@@ -7,11 +7,11 @@ import pkgutil
 from functools import cache
 from pathlib import Path
 
-from hvdc_ident.files import write_text
+from hvdc_ident.errors import InputError
+from hvdc_ident.files import write_bytes, write_text
 from hvdc_ident.report.html import text
 from hvdc_ident.report.interactive import scripts
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 from hvdc_ident.words import with_study
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -92,3 +92,23 @@ def document(title: str, subtitle: str, body: str) -> str:
 def write_report(folder: Path) -> Path:
     """The path of report.html, written from what the folder holds."""
     return write_text(folder / "report.html", page(folder))
+
+
+def write_pdf(page: Path) -> Path:
+    """The path of the PDF beside a page. Raises InputError where the package is not installed."""
+    try:
+        from weasyprint import HTML
+    except (ImportError, OSError) as error:  # OSError: the system's text libraries are missing
+        raise InputError(
+            "a PDF cannot be written",
+            where=str(page),
+            got=str(error).splitlines()[0],
+            hint="pip install 'hvdc_ident[pdf]', or print the page from a browser",
+        ) from None
+    content = HTML(string=page.read_text("utf-8"), base_url=page.parent.as_uri(), url_fetcher=_nothing).write_pdf()
+    return write_bytes(page.with_suffix(".pdf"), content)
+
+
+def _nothing(url: str) -> dict[str, object]:
+    """The page needs nothing from outside, and nothing from outside is fetched."""
+    raise ValueError(f"the page asks for {url}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -76,3 +77,12 @@ def _filled(line: str) -> str:
     if ",," not in line and not line.rstrip().endswith(","):
         return line
     return ",".join(cell.strip() or "nan" for cell in line.split(","))
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page: its place, its heading, and its HTML from the results (empty: the part is left out)."""
+
+    order: int
+    title: str
+    render: Callable[[Results], str]

@@ -8,8 +8,7 @@ import pytest
 from hvdc_ident.errors import UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.models import load_model
-from hvdc_ident.models._avm_parameters import RATINGS
-from hvdc_ident.models.vsc_hvdc_avm import VARIANTS, model
+from hvdc_ident.models.vsc_hvdc_avm import RATINGS, VARIANTS, model
 from hvdc_ident.simulate import Tolerance, simulate
 from hvdc_ident.simulate.engine import engine
 

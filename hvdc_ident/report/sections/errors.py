@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from hvdc_ident.report.html import number, share, table, text
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 MOST = 36
 """Windows that are listed openly; more are folded under their count."""

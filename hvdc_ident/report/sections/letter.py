@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.report.letter import STAGE, letter_body, letter_of
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 
 def _render(results: Results) -> str:

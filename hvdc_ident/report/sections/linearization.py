@@ -8,8 +8,7 @@ import numpy as np
 
 from hvdc_ident.report.drawing import figure, svg
 from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 NEAREST = 5
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -7,8 +7,7 @@ import io
 import zipfile
 
 from hvdc_ident.report.html import table, text
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 ARCHIVE = "results.zip"
 SUFFIXES = (".json", ".csv", ".toml")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 LOW = 0.01
 """A p below this is marked."""

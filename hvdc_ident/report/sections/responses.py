@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.report.drawing import figure, svg
 from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 STYLES = {"given": "--", "fitted": "-"}

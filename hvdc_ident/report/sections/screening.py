@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.section import Section
+from hvdc_ident.report.results import Results, Section
 
 COLUMNS = {
     "morris": {"mu_star": "mean size of the effect", "mu": "mean effect", "sigma": "spread of the effect"},
