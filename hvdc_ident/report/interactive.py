@@ -16,7 +16,7 @@ from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)
-class Curve:
+class PlottedCurve:
     """A curve of a figure that zooms: columns by name. minus: a column taken off y. lower: in the strip below."""
 
     name: str
@@ -27,7 +27,7 @@ class Curve:
 
 
 def zoomable(
-    drawn: str, label: str, columns: Mapping[str, Array], curves: Sequence[Curve], titles: tuple[str, str, str]
+    drawn: str, label: str, columns: Mapping[str, Array], curves: Sequence[PlottedCurve], titles: tuple[str, str, str]
 ) -> str:
     """A `<figure>` with the drawing, which a button turns into an interactive one of the same curves.
 

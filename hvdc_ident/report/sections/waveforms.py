@@ -10,7 +10,7 @@ import numpy as np
 from hvdc_ident.experiment import recording_lines
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg, visible, visible_rows
 from hvdc_ident.report.html import text
-from hvdc_ident.report.interactive import Curve, zoomable
+from hvdc_ident.report.interactive import PlottedCurve, zoomable
 from hvdc_ident.report.results import Results, Section
 from hvdc_ident.trajectory import Array, Trajectory
 
@@ -150,7 +150,7 @@ def waveforms(
 
 def curves(
     output: str, unit: str, before: Trajectory | None, after: Trajectory | None
-) -> tuple[dict[str, Array], list[Curve], tuple[str, str, str]]:
+) -> tuple[dict[str, Array], list[PlottedCurve], tuple[str, str, str]]:
     """Return the waveforms for a figure that zooms: its columns, its curves, and the titles of its axes."""
     tables = {label: t for label, t in (("before", before), ("after", after)) if t is not None}
     shown = after if after is not None else before
@@ -158,11 +158,11 @@ def curves(
     columns = {"x": shown.time, "measured": shown[f"{output}.measured"]}
     columns |= {label: t[output] for label, t in tables.items() if len(t) == len(shown)}
     rows = np.unique(np.concatenate([visible_rows(c) for c in columns.values()]))
-    found = [Curve("measured", MEASURED, "measured")]
+    found = [PlottedCurve("measured", MEASURED, "measured")]
     for label, color in (("before", BEFORE), ("after", AFTER)):
         if label in columns:
-            found.append(Curve(label, color, label))
-            found.append(Curve(f"residual {label}", color, "measured", minus=label, lower=True))
+            found.append(PlottedCurve(label, color, label))
+            found.append(PlottedCurve(f"residual {label}", color, "measured", minus=label, lower=True))
     titles = ("time, s", f"{output}, {unit}" if unit else output, "residual")
     return {name: values[rows] for name, values in columns.items()}, found, titles
 
