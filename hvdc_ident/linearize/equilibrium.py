@@ -181,7 +181,8 @@ class EquilibriumSearch:
         time: float,
     ) -> EquilibriumSearch:
         """Return the equations for a model. Raises UnknownNameError, and ModelError for a value or bounds that cannot be."""
-        signals = [n for n in (*fixed, *bounds) if not _is_variable(model, n)]
+        variables_of = (model.states, model.inputs, model.parameters, model.delays, model.sampled)
+        signals = [n for n in (*fixed, *bounds) if not any(n in group for group in variables_of)]
         s = system(model, tuple(dict.fromkeys((*model.outputs, *signals))))
         _check(model, s, fixed, free, bounds, moving)
         size = s.layout
@@ -361,10 +362,6 @@ class EquilibriumSearch:
             if k:
                 v[-k:] = np.nan_to_num(values[list(self.bounded_rows)])
         return v
-
-
-def _is_variable(model: Model, name: str) -> bool:
-    return any(name in group for group in (model.states, model.inputs, model.parameters, model.delays, model.sampled))
 
 
 def _starts(model: Model, s: CompiledSystem, p: Array, bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:

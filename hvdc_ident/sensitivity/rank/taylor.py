@@ -263,7 +263,8 @@ class Taylor:
         self.c = self.series.c
         self._leaves(y, w)
         self._first()
-        loop = self._downstream() if self.nz else []
+        moving = set(self.moving)
+        loop = [n for n in g.reachable(e.residuals) if n in moving] if self.nz else []
         for k in range(1, order + 1):
             self._in_time()
             step = self.ring.number(Fraction(1, k))
@@ -337,9 +338,6 @@ class Taylor:
                 self.c[n][0, 1 : self.kept] = rows[j, 1:]
                 self.c[n][0, self.kept :] = ring.zeros(self.nz)
         self.series.compute(inner, 0)
-
-    def _downstream(self) -> list[int]:
-        return [n for n in self.equations.graph.reachable(self.equations.residuals) if n in set(self.moving)]
 
     def _unknowns(self, k: int) -> None:
         """Set the unknowns' coefficients of order k, in which the equations are linear."""
