@@ -73,6 +73,7 @@ class Run:
         self.outputs = np.empty((self.time.size, len(self.names)))
         self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
         self.set: list[float] | None = None  # what the inputs that are followed stand at
+        self.flat = False  # whether they stand, as they are set, until the segment's end
         self.row = 0
         self.end = float(self.time[-1])
         self.segment_end = self.end
@@ -118,9 +119,15 @@ class Run:
         """Return where the integration stopped, at `end` or at an event before it, with the event done."""
         self.counts.segments += 1
         self.positive = self.b.get_indicators() > 0.0
+        self.flat = False
+        self._place(t, y[: self.nx])
+        self.flat = all(self.inputs[k].is_flat(t, end) for k in self.follow)
         with warnings.catch_warnings(record=True) as said:  # of the integrator, told where it gives up
             warnings.simplefilter("always")
-            return self._steps(t, y, end, said)
+            try:
+                return self._steps(t, y, end, said)
+            finally:
+                self.flat = False
 
     def _steps(self, t: float, y: Array, end: float, said: list[warnings.WarningMessage]) -> tuple[float, Array]:
         solver = self._solver(t, y, end)
@@ -190,7 +197,7 @@ class Run:
         """Set the instant, the state and the continuous inputs."""
         self.b.set_time(t)
         self.b.set_states(x)
-        if self.follow:
+        if self.follow and not (self.flat and t < self.segment_end):
             u = [self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.follow]
             if u != self.set:  # held inputs, as stairs, stand for thousands of calls
                 self.followed.set(u)

@@ -80,6 +80,12 @@ class Moving:
         self._times, self._values = times.tolist(), values.tolist()
         self.constant = bool((values == values[0]).all())
 
+    def is_flat(self, begin: float, end: float) -> bool:
+        """Return whether the value stands from just after `begin` to just before `end`."""
+        inside = self._values[bisect_right(self._times, begin) : bisect_left(self._times, end)]
+        first = self.at(begin, False)
+        return self.at(end, True) == first and all(v == first for v in inside)
+
     def at(self, t: float, before_jump: bool) -> float:
         """The value at t, before the jump there or after it."""
         times, values = self._times, self._values
