@@ -73,7 +73,31 @@ def simulate(
     >>> run["Irorder2"].round(3).tolist()
     [0.4, 0.4, 0.495, 0.5, 0.5, 0.5]
     """
+    from hvdc_ident.experiment import Experiment
+    from hvdc_ident.model.definition import Model
     from hvdc_ident.simulate.engine import simulate as run
+
+    # What the engine takes as it is needs no study, whose rooms are slow to load.
+    texts = isinstance(sensitivities, str) or isinstance(outputs, str)
+    if (
+        isinstance(model, Model)
+        and isinstance(data, Experiment)
+        and (parameters is None or isinstance(parameters, dict))
+        and inputs is None
+        and not texts
+    ):
+        names = None if outputs is None else tuple(outputs)
+        return run(
+            model,
+            data,
+            parameters,
+            tuple(sensitivities or ()),
+            outputs=names,
+            tolerance=tolerance,
+            rtol=rtol,
+            method=method,
+            partial=partial,
+        )
     from hvdc_ident.study.assemble import names_of, subject_of, values_of
     from hvdc_ident.study.study import Study
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from threading import Lock
 from typing import Any, Literal
 
 import numpy as np
@@ -55,6 +56,7 @@ class Engine:
         self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
         self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
         self._explicit: bool | None = None
+        self._lock = Lock()
         self._states: dict[bool, tuple[Any, int]] = {}
 
     # --- the start ---
@@ -154,14 +156,15 @@ class Engine:
 
         The code that only the Rosenbrock method needs is there afterwards.
         """
-        if rosenbrock and self._late is None:
-            self._late = self.structure.compile_late()
-            for name, address in self._late.address.items():
-                self._address[NAMES.index(name)] = address
-            self._states.clear()
-        if rosenbrock not in self._states:
-            self._states[rosenbrock] = self._template(rosenbrock)
-        template, room = self._states[rosenbrock]
+        with self._lock:  # two threads that compile would free the code that one of them runs
+            if rosenbrock and self._late is None:
+                self._late = self.structure.compile_late()
+                for name, address in self._late.address.items():
+                    self._address[NAMES.index(name)] = address
+                self._states.clear()
+            if rosenbrock not in self._states:
+                self._states[rosenbrock] = self._template(rosenbrock)
+            template, room = self._states[rosenbrock]
         return template.copy(), np.zeros(room)
 
     def _template(self, rosenbrock: bool) -> tuple[Any, int]:

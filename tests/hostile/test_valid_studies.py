@@ -101,7 +101,7 @@ def test_where_the_structure_leaves_nothing_to_fit_there_are_verdicts_all_the_sa
     assert report["identifiable"] == []
     for command in ("fit", "diagnose", "letter"):
         result = ran(command, path)
-        assert result.exit_code == 1 and "hvdc-ident identify STUDY" in result.stderr, result.stderr
+        assert result.exit_code == 1 and f"hvdc-ident identify {path}" in result.stderr, result.stderr
 
 
 def test_a_run_goes_on_without_the_linear_model_that_there_is_none_of(tmp_path: Path) -> None:
