@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pickle
 import signal
@@ -21,7 +22,7 @@ from hvdc_ident import load_model, simulate
 from hvdc_ident.errors import InputError, ModelError, SimulationError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
-from hvdc_ident.fmu.folder import joined, sweep, unpacked
+from hvdc_ident.fmu.folder import LOCK, joined, sweep, unpacked
 from hvdc_ident.fmu.host import Limits, idle_cores
 from hvdc_ident.fmu.model import read_fmu
 
@@ -179,7 +180,10 @@ def test_nothing_runs_on_when_the_supervisor_is_killed_and_the_next_host_cleans_
     process.kill()
     process.wait()
     wait_until_gone(worker)
-    assert folder.exists()
+    with open(
+        folder / LOCK, "rb"
+    ) as lock:  # the process that the hang is in holds it until the system has ended that, too
+        fcntl.flock(lock, fcntl.LOCK_EX)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     sweep()
     assert not folder.exists()
