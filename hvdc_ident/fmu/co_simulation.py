@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from hvdc_ident.fmu.binding import DISCARD, ERROR, Ended, Failure, Vector
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
+from hvdc_ident.fmu.restart import SAME, apart, moving
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.trajectory import Array
 
 EARLY = 10_000  # early returns in one communication step
 TRIAL = 300  # rows of a trial from the first change of an input on: solvers' own steps may be tens of rows long
 PARTS = 4  # of a communication step, in the trial of held inputs on finer steps
-SAME = 1e-9  # share of an output's range that rounding alone may change in a repeated run
 
 Reading = Literal["restored", "recomputed", "never"]
 READINGS: tuple[Reading, ...] = ("restored", "recomputed", "never")
@@ -170,7 +170,7 @@ def _harmless_reading(time: Array, allowed: float, run: Callable[[Calls, Array],
     """Return the first way to read outputs after a change that leaves the run as it is; None where nothing moves."""
     undisturbed = run(Calls("never", plain=True), time)
     size = np.nan_to_num(np.ptp(undisturbed, axis=0))
-    if not (size > SAME * np.nan_to_num(np.abs(undisturbed)).max(axis=0, initial=0.0)).any():
+    if not moving(undisturbed).any():
         return None
     steady: NDArray[np.bool_] = np.ones(size.size, dtype=bool)
     for attempt in range(2):
@@ -179,10 +179,10 @@ def _harmless_reading(time: Array, allowed: float, run: Callable[[Calls, Array],
                 read = run(Calls(reading, plain=True), time)
             except (Failure, RunFailed):
                 continue
-            if (_apart(read, undisturbed) <= allowed * size)[steady].all():
+            if (apart(read, undisturbed) <= allowed * size)[steady].all():
                 return reading
         if attempt == 0:  # an output such as the time that the computation took is never repeated, and does not judge
-            steady = _apart(run(Calls("never", plain=True), time), undisturbed) <= allowed * size
+            steady = apart(run(Calls("never", plain=True), time), undisturbed) <= allowed * size
             if not steady.any():
                 return None
             if steady.all():
@@ -198,21 +198,14 @@ def _tried_slopes(time: Array, allowed: float, held: Calls, run: Callable[[Calls
     itself. A factor of 2 leaves room for the solver's noise.
     """
     finer, coarse = run(replace(held, parts=PARTS), time), run(held, time)
-    off, allowance = _apart(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
+    off, allowance = apart(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
     try:
-        sloped = _apart(run(replace(held, sloping=True), time), finer)
+        sloped = apart(run(replace(held, sloping=True), time), finer)
     except (Failure, RunFailed):
         return "ignored"
     if (sloped > 2.0 * off + allowance).any():
         return "ignored"
     return "followed" if (off > allowance).any() else "needless"
-
-
-def _apart(run: Array, other: Array) -> Array:
-    """(outputs,) the largest difference over rows; infinite where only one of them is not a number."""
-    apart = np.abs(run - other)
-    apart[np.isnan(run) & np.isnan(other)] = 0.0
-    return np.nan_to_num(apart, nan=np.inf).max(axis=0, initial=0.0)
 
 
 # --- one run ---

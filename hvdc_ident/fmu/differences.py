@@ -121,4 +121,9 @@ def _norm(change: Array, scale: Array) -> float:
     """Return the root mean square over rows of the output that changes most, in its range."""
     if not change.size:
         return 0.0
-    return float(np.sqrt(np.mean((change / scale) ** 2, axis=0)).max())
+    return float(rms(change / scale).max())
+
+
+def rms(rows: Array) -> Array:
+    """Return the root mean square over rows, (outputs,)."""
+    return np.asarray(np.sqrt(np.mean(rows**2, axis=0)))

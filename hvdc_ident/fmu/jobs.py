@@ -13,10 +13,10 @@ import numpy as np
 from hvdc_ident.fmu import co_simulation, exchange
 from hvdc_ident.fmu.binding import Block, Failure
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.differences import ENOUGH, SHORT, Step, derivative, first, noise_of, pair
+from hvdc_ident.fmu.differences import ENOUGH, SHORT, Step, derivative, first, noise_of, pair, rms
 from hvdc_ident.fmu.isolation import result
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed, failure
-from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moves
+from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moving
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.fmu.tangent import Point, Tangent
 from hvdc_ident.trajectory import Array
@@ -212,7 +212,7 @@ class _Simulation:
 
         way, rows = find_restart(self.jobs.make, run(self.signals))
         steps = [STIRRED * max(abs(v.start or 0.0), v.nominal) * v.continuous for v in d.inputs.values()]
-        if any(steps) and not moves(rows):  # at rest throughout: the start of a run is its end
+        if any(steps) and not moving(rows).any():  # at rest throughout: the start of a run is its end
             third = float(self.time[0] + (self.time[-1] - self.time[0]) / 3.0)
             way = self._stirred(run(self.signals.stirred(steps, third)), way)
         self.learned["restart"] = way
@@ -319,8 +319,14 @@ class _Simulation:
 
         finer: factor on the integrator's tolerance.
         """
+        self.jobs.runs += 1
         try:
-            return self._whole(plant, values, signals, names, counts, finer)
+            if plant.binding.exchange:
+                run = exchange.Run(plant, signals, self.time, names, finer * self.tolerance, counts=counts)
+                run.go(values)
+                return run.outputs
+            counts.segments += 1
+            return co_simulation.run(plant, values, signals, self.time, names, self.tolerance)
         except RunEnded as e:
             rows = self._padded(e, self.time.size)
             self.ended = (float(e.t or 0.0), len(e.rows) if e.rows is not None else 0)
@@ -332,24 +338,6 @@ class _Simulation:
         if not self.partial or rows is None or not rows.size:
             raise ended
         return np.vstack([rows, np.full((count - rows.shape[0], rows.shape[1]), np.nan)])
-
-    def _whole(
-        self,
-        plant: Plant,
-        values: Mapping[str, float],
-        signals: Signals,
-        names: tuple[str, ...],
-        counts: exchange.Counts,
-        finer: float,
-    ) -> Array:
-        """(n, names) of a run to the last row."""
-        self.jobs.runs += 1
-        if plant.binding.exchange:
-            run = exchange.Run(plant, signals, self.time, names, finer * self.tolerance, counts=counts)
-            run.go(values)
-            return run.outputs
-        counts.segments += 1
-        return co_simulation.run(plant, values, signals, self.time, names, self.tolerance)
 
     # --- derivatives that ride along ---
 
@@ -376,7 +364,7 @@ class _Simulation:
         plant = self.jobs.plant
         plain = exchange.Counts()
         outputs = self._rows(plant, self.values, self.signals, self.names, plain)
-        noise = _rms(outputs - self._rows(plant, self.values, self.signals, self.names, exchange.Counts(), 0.5))
+        noise = rms(outputs - self._rows(plant, self.values, self.signals, self.names, exchange.Counts(), 0.5))
         parameters = Block(plant.binding, tuple(self.description.parameters.values()))
         before = parameters.get().copy()
         try:
@@ -386,7 +374,7 @@ class _Simulation:
             moved = True
         plant.renew()
         size = np.abs(outputs).max(axis=0, initial=0.0)
-        if moved or (_rms(run.outputs - outputs) > SPREAD * (noise + self.tolerance * size)).any():
+        if moved or (rms(run.outputs - outputs) > SPREAD * (noise + self.tolerance * size)).any():
             return {n: len(names) > 1 and self._confirmed([n])[n] for n in names}
         return {n: self._agrees(n, run.gradients[:, :, j], outputs, noise) for j, n in enumerate(names)}
 
@@ -396,10 +384,10 @@ class _Simulation:
         size = self.sizes[name]
         runs = self._moving(name)
         found, bend = pair(runs, self._now(name), NEAR * size, low, high, outputs)
-        strength = _rms(found)
-        doubt = _rms(bend) * NEAR * size + 2.0 * noise / (NEAR * size)
+        strength = rms(found)
+        doubt = rms(bend) * NEAR * size + 2.0 * noise / (NEAR * size)
         told = (doubt <= TOLD * strength) | (strength <= 2.0 * noise / (NEAR * size))
-        return bool((told & (_rms(column - found) <= doubt + ENOUGH * strength)).all())
+        return bool((told & (rms(column - found) <= doubt + ENOUGH * strength)).all())
 
     def _tangent_run(
         self, names: Sequence[str], counts: exchange.Counts, most: int = exchange.MOST_STEPS
@@ -485,11 +473,3 @@ class _Simulation:
             at, (low, high) = self._now(name), self.bounds[name]
             moved[name] = at + (steps if high - at >= at - low else -steps) * SHORT * self.sizes[name]
         return self._run(*self._with(moved))
-
-
-def _rms(rows: Array) -> Array:
-    """(outputs,) root mean square over rows."""
-    return np.asarray(np.sqrt(np.mean(rows**2, axis=0)))
-
-
-__all__ = ["Failure", "Jobs"]

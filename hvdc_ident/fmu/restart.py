@@ -65,18 +65,26 @@ def _twice(make: Make, run: Callable[[Plant], Array], way: Way) -> tuple[Array, 
     raise AssertionError("unreachable: the process has ended")
 
 
+def apart(run: Array, other: Array) -> Array:
+    """Return the largest difference over rows, (signals,); infinite where only one of them is not a number."""
+    off = np.abs(run - other)
+    off[np.isnan(run) & np.isnan(other)] = 0.0
+    return np.asarray(np.nan_to_num(off, nan=np.inf).max(axis=0, initial=0.0))
+
+
+def moving(run: Array) -> NDArray[np.bool_]:
+    """Return which signals of a run move, (signals,): one at rest throughout cannot tell a start from an end."""
+    known = np.nan_to_num(run)
+    return np.asarray(np.ptp(known, axis=0) > SAME * np.abs(known).max(axis=0, initial=0.0))
+
+
 def _repeats(run: Array | None, first: Array, noise: Array) -> bool:
     """Return whether a run repeats the first. noise: (signals,) by how much two fresh processes differ."""
     if run is None:
         return False
     size = np.nan_to_num(np.abs(first)).max(axis=0, initial=0.0)
-    apart = np.where(np.isnan(run) & np.isnan(first), 0.0, np.abs(run - first)).max(axis=0, initial=0.0)
-    steady: NDArray[np.bool_] = noise <= SAME * size
+    off = apart(run, first)
+    steady = noise <= SAME * size
     if steady.any() or not noise.size:
-        return bool((apart <= SAME * size)[steady].all())
-    return bool((apart <= SPREAD * noise).all())
-
-
-def moves(run: Array) -> bool:
-    """Return whether any signal of a run moves: one at rest throughout cannot tell a start from an end."""
-    return bool((np.ptp(np.nan_to_num(run), axis=0) > SAME * np.nan_to_num(np.abs(run)).max(axis=0, initial=0.0)).any())
+        return bool((off <= SAME * size)[steady].all())
+    return bool((off <= SPREAD * noise).all())
