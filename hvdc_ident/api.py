@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 # The rooms are there before the package binds the verbs of the same names: an import of a room would replace them later.
 import hvdc_ident.fit
@@ -77,39 +77,26 @@ def simulate(
     from hvdc_ident.model.definition import Model
     from hvdc_ident.simulate.engine import simulate as run
 
-    # What the engine takes as it is needs no study, whose rooms are slow to load.
+    plant: Any = model
+    experiment, values, columns, rows = data, parameters, sensitivities or (), outputs
+    as_it_is = isinstance(model, Model) and isinstance(data, Experiment) and inputs is None
     texts = isinstance(sensitivities, str) or isinstance(outputs, str)
     if (
-        isinstance(model, Model)
-        and isinstance(data, Experiment)
-        and (parameters is None or isinstance(parameters, dict))
-        and inputs is None
-        and not texts
-    ):
-        names = None if outputs is None else tuple(outputs)
-        return run(
-            model,
-            data,
-            parameters,
-            tuple(sensitivities or ()),
-            outputs=names,
-            tolerance=tolerance,
-            rtol=rtol,
-            method=method,
-            partial=partial,
-        )
-    from hvdc_ident.study.assemble import names_of, subject_of, values_of
-    from hvdc_ident.study.study import Study
+        not as_it_is or texts or not isinstance(parameters, dict | None)
+    ):  # else no study is needed: its rooms load slowly
+        from hvdc_ident.study.assemble import names_of, subject_of, values_of
+        from hvdc_ident.study.study import Study
 
-    subject = subject_of(model)
-    plant = subject.model if isinstance(subject, Study) else subject
-    experiment = _experiment(subject, data, inputs)
+        subject = subject_of(model)
+        plant = subject.model if isinstance(subject, Study) else subject
+        experiment, values = _experiment(subject, data, inputs), values_of(parameters, plant)
+        columns, rows = names_of(sensitivities, "parameter") or (), names_of(outputs, "output")
     return run(
         plant,
         experiment,
-        values_of(parameters, plant),
-        names_of(sensitivities, "parameter") or (),
-        outputs=names_of(outputs, "output"),
+        cast("dict[str, float] | None", values),
+        tuple(columns),
+        outputs=None if rows is None else tuple(rows),
         tolerance=tolerance,
         rtol=rtol,
         method=method,
