@@ -102,7 +102,7 @@ class Peer:
         return float(text == "true") if text in ("true", "false") else float(variable.start or 0.0)
 
     def size(self, variable: Any) -> float:
-        """How far an input is moved: its start value's size, or 1; less where its maximum is nearer."""
+        """Return by how much an input is moved: its start value's size, or 1; less where its maximum is nearer."""
         start = self.start(variable)
         size = abs(start) or 1.0
         most = variable.max if variable.max is not None else getattr(variable.declaredType, "max", None)

@@ -309,7 +309,7 @@ def gain(path: Path, interface: str, told: Told) -> None:
 
 
 def diagnosed(path: Path, interface: str, told: Told, effect: str) -> None:
-    """What is hidden, looked for by `hvdc-ident diagnose`: named, in the set, or missed."""
+    """Verdict on what is hidden, looked for by `hvdc-ident diagnose`: named, in the set, or missed."""
     told({"stage": "fmpy"})
     peer = Peer(path, interface)
     continuous = [v.name for v in peer.inputs if v.type in REAL and v.variability == "continuous"]

@@ -83,7 +83,7 @@ class InputSignal:
 
     @property
     def is_constant(self) -> bool:
-        """Whether the signal never changes."""
+        """True where the signal never changes."""
         return bool((self.values == self.values[0]).all())
 
 

@@ -202,7 +202,7 @@ class _Whitened:
         return np.append(z - self.left.T @ r, 0.5 * float(r @ r))
 
     def room(self, j: int) -> tuple[float, float]:
-        """How far the bounds let go along the j-th coordinate, down and up."""
+        """Return how far the bounds let go along the j-th coordinate, down and up."""
         low, high = (b[self.inside] - self.x[self.inside] for b in self.problem.coordinates.bounds)
         axis = self.axes[:, j]
         with np.errstate(divide="ignore"):
