@@ -14,7 +14,7 @@ from hvdc_ident.study import schema
 from hvdc_ident.trajectory import Trajectory
 
 
-def raw_columns(table: schema.Experiment, columns: Sequence[str]) -> list[str]:
+def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[str]:
     """The columns to be read from the file where these are wanted, some of them made of phases or phasors."""
     made = {*(n for line in table.phases for n in line.gives), *(n for line in table.phasors for n in line.gives)}
     phases = [name for line in table.phases for name in (*line.voltage, *(line.current or ()))]
@@ -23,7 +23,7 @@ def raw_columns(table: schema.Experiment, columns: Sequence[str]) -> list[str]:
     return list(dict.fromkeys([*(c for c in columns if c not in made), *phases, *phasors, *map(str, references)]))
 
 
-def with_derived(table: schema.Experiment, data: Trajectory, place: str) -> Trajectory:
+def with_derived(table: schema.ExperimentTable, data: Trajectory, place: str) -> Trajectory:
     """The recording with the columns its phases and phasors give; the same object where none are asked for."""
     found = data
     for number, line in enumerate(table.phases, 1):
@@ -34,7 +34,7 @@ def with_derived(table: schema.Experiment, data: Trajectory, place: str) -> Traj
     return found
 
 
-def _of_phases(line: schema.Phases, data: Trajectory, where: str) -> Trajectory:
+def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajectory:
     _check_new(line.gives, data, where)
     window = line.window if line.window is not None else 1.0 / line.frequency  # one cycle
     try:
@@ -50,7 +50,7 @@ def _of_phases(line: schema.Phases, data: Trajectory, where: str) -> Trajectory:
         raise e.at(where) from None
 
 
-def _of_phasors(line: schema.Phasors, data: Trajectory, where: str) -> Trajectory:
+def _of_phasors(line: schema.PhasorsTable, data: Trajectory, where: str) -> Trajectory:
     _check_new(line.gives, data, where)
     how = PhasorSettings(line.frequency, line.window, line.magnitudes or "", line.reference or "")
     current = _columns(line.current) if line.current is not None else None
@@ -67,7 +67,7 @@ def _of_phasors(line: schema.Phasors, data: Trajectory, where: str) -> Trajector
     return replace(made, origin=replace(made.origin, converted=told))
 
 
-def _columns(phasor: schema.Phasor) -> PhasorColumns:
+def _columns(phasor: schema.PhasorTable) -> PhasorColumns:
     return PhasorColumns(tuple(phasor.magnitude), tuple(phasor.angle), phasor.unit or "")
 
 

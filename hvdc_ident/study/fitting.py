@@ -19,7 +19,7 @@ from hvdc_ident.fit.windowed import windowed_errors
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.model.definition import Model
 from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
-from hvdc_ident.study.schema import Fit
+from hvdc_ident.study.schema import FitTable
 from hvdc_ident.study.unknowns import priors
 
 if TYPE_CHECKING:
@@ -33,9 +33,9 @@ def problem_of(study: Study) -> Problem:
     return Problem(simulator, experiments, tuple(study.candidates.values()))
 
 
-def asked_of(study: Study) -> Fit:
+def asked_of(study: Study) -> FitTable:
     """The study's [fit], or its defaults."""
-    return study.settings.fit or Fit()
+    return study.settings.fit or FitTable()
 
 
 def with_settings(study: Study, problem: Problem) -> Problem:

@@ -61,7 +61,7 @@ def check_linear(study: Study, where: str) -> None:
         _known("output", asked.outputs or model.outputs, study.compared.outputs, f"{place}.compare")
 
 
-def _check_port(port: schema.Port, study: Study, where: str) -> None:
+def _check_port(port: schema.PortTable, study: Study, where: str) -> None:
     from hvdc_ident.expression import parse
 
     model = study.model
@@ -128,7 +128,7 @@ def modes_of(study: Study, linear: LinearModel) -> list[dict[str, Any]]:
 
 def analyses(study: Study, linear: LinearModel) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what is asked for beside the linear model, by key of the JSON, and the files to write beside it by name."""
-    asked = study.settings.linearize or schema.Linearize()
+    asked = study.settings.linearize or schema.LinearizeTable()
     scaled = linear.scaled(asked.scale)
     data: dict[str, Any] = {"norms": _norms(scaled)}
     files: dict[str, str] = {}
@@ -160,7 +160,7 @@ def _norms(linear: LinearModel) -> dict[str, Any]:
     return found
 
 
-def _trimmed(trim: schema.Trim, linear: LinearModel) -> dict[str, Any]:
+def _trimmed(trim: schema.TrimTable, linear: LinearModel) -> dict[str, Any]:
     point = linear.point
     assert point is not None
     free = trim.free
@@ -172,7 +172,7 @@ def _trimmed(trim: schema.Trim, linear: LinearModel) -> dict[str, Any]:
     return {"outputs": dict(trim.outputs), "inputs": dict(trim.inputs), "found": {n: found[n] for n in free}}
 
 
-def _margins(asked: schema.Linearize, linear: LinearModel) -> dict[str, Any]:
+def _margins(asked: schema.LinearizeTable, linear: LinearModel) -> dict[str, Any]:
     from hvdc_ident.linearize.distance import ncf_margin
     from hvdc_ident.linearize.open_loop import loop, plant_and_controller
     from hvdc_ident.linearize.stability_margins import loop_margins
@@ -193,7 +193,7 @@ def _margins(asked: schema.Linearize, linear: LinearModel) -> dict[str, Any]:
     return found
 
 
-def _reduced(asked: schema.Reduce, linear: LinearModel) -> dict[str, Any]:
+def _reduced(asked: schema.ReduceTable, linear: LinearModel) -> dict[str, Any]:
     """The reduced model with the error it has and the bound that was known beforehand."""
     found = linear.reduce(asked.order, asked.tolerance, match_dc=asked.match_dc)
     return {**found.to_dict(), "error": found.error.to_dict(), "states_before": len(linear.state_names)}
@@ -233,7 +233,7 @@ def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[
     return found
 
 
-def _locus(asked: schema.Locus, linear: LinearModel) -> dict[str, Any]:
+def _locus(asked: schema.LocusTable, linear: LinearModel) -> dict[str, Any]:
     """The eigenvalues along the parameter, all else as at the operating point."""
     import numpy as np
 
@@ -247,7 +247,7 @@ def _locus(asked: schema.Locus, linear: LinearModel) -> dict[str, Any]:
     return root_locus(point.model, asked.parameter, values, fixed).to_dict()
 
 
-def port_of(table: schema.Port) -> Port:
+def port_of(table: schema.PortTable) -> Port:
     """Return the port that a table of the study describes."""
     from hvdc_ident.linearize.impedance import Port
 
@@ -257,7 +257,7 @@ def port_of(table: schema.Port) -> Port:
     return Port(source, voltage, current, table.angle)
 
 
-def _ports(tables: list[schema.Port], linear: LinearModel) -> tuple[list[dict[str, Any]], dict[str, str]]:
+def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """The impedance of each port, and a file of each."""
     import numpy as np
 

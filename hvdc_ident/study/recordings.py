@@ -82,7 +82,7 @@ class Recordings:
 
 
 def read_experiments(
-    tables: Sequence[schema.Experiment], model: AnyModel, recordings: Recordings, where: str
+    tables: Sequence[schema.ExperimentTable], model: AnyModel, recordings: Recordings, where: str
 ) -> tuple[tuple[Experiment, ...], FrozenMap[FrozenMap[NoiseNote]]]:
     """The experiments, and where the noise of each output comes from."""
     wanted: dict[str, dict[str, list[str]]] = {}
@@ -133,7 +133,7 @@ def with_noise(experiment: Experiment) -> tuple[Experiment, FrozenMap[NoiseNote]
     return e.with_(event=event, noise=noise, noise_dof=e.noise_dof | dof, noise_profile=profile), FrozenMap(notes)
 
 
-def _check_names(table: schema.Experiment, model: AnyModel, place: str) -> None:
+def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> None:
     """Raises where the table names what the model does not have."""
     signals = [*table.inputs, *table.outputs, *table.drive]
     _known("input", table.inputs, model.inputs, f"{place}.inputs")
@@ -164,7 +164,7 @@ def _known(kind: str, names: Iterable[str], known: Collection[str], where: str) 
             raise unknown_name(kind, name, known, where=where)
 
 
-def _channels(table: schema.Experiment) -> list[tuple[str, str]]:
+def _channels(table: schema.ExperimentTable) -> list[tuple[str, str]]:
     """Signal of the model and recorded column, for inputs, driven slots and outputs; a column may serve twice."""
     pairs = []
     for signal, column in (*table.inputs.items(), *table.drive.items(), *table.outputs.items()):
@@ -182,7 +182,7 @@ def _channels(table: schema.Experiment) -> list[tuple[str, str]]:
 
 
 def _experiment(
-    table: schema.Experiment, model: AnyModel, data: Trajectory, place: str
+    table: schema.ExperimentTable, model: AnyModel, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
     data = with_derived(table, data, place)
@@ -233,7 +233,7 @@ def _experiment(
     return experiment, FrozenMap(notes)
 
 
-def _time(table: schema.Experiment, data: Trajectory, place: str) -> Array:
+def _time(table: schema.ExperimentTable, data: Trajectory, place: str) -> Array:
     """The rows' instants in s."""
     line = table.columns.get("time")
     if line is None:
@@ -264,13 +264,13 @@ def _time(table: schema.Experiment, data: Trajectory, place: str) -> Array:
 
 
 def _mapping(
-    table: schema.Experiment, model: AnyModel, signal: str, column: str, data: Trajectory, place: str
+    table: schema.ExperimentTable, model: AnyModel, signal: str, column: str, data: Trajectory, place: str
 ) -> tuple[float, float]:
     """Scale and offset: the value in the model's unit = scale x recorded + offset.
 
     Units of one kind are converted. Raises where the units contradict each other and neither scale nor base is given.
     """
-    line = table.columns.get(signal) or schema.Column()
+    line = table.columns.get(signal) or schema.ColumnTable()
     recorded = line.unit if line.unit is not None else data.unit(column)
     offset = line.offset or 0.0
     if line.unit is not None and data.unit(column) and not same_unit(line.unit, data.unit(column)):
@@ -304,7 +304,7 @@ def _mapping(
 
 
 def _conversion_words(
-    table: schema.Experiment,
+    table: schema.ExperimentTable,
     model: AnyModel,
     signal: str,
     column: str,
@@ -312,7 +312,7 @@ def _conversion_words(
     mapping: tuple[float, float],
 ) -> str:
     """Return what was done to a column beyond what the study states: the conversion of its unit; "" where nothing was."""
-    line = table.columns.get(signal) or schema.Column()
+    line = table.columns.get(signal) or schema.ColumnTable()
     if line.scale is not None or line.base is not None or mapping == (1.0, line.offset or 0.0):
         return ""
     return f"{signal}: from {line.unit or data.unit(column)} to {_unit(model, signal)}"
@@ -332,7 +332,9 @@ def _unit(model: AnyModel, signal: str) -> str:
     return ""
 
 
-def _input(table: schema.Experiment, signal: str, column: str, time: Array, values: Array, place: str) -> InputSignal:
+def _input(
+    table: schema.ExperimentTable, signal: str, column: str, time: Array, values: Array, place: str
+) -> InputSignal:
     kind = table.interpolation
     chosen = kind.get(signal) if isinstance(kind, dict) else kind
     missing = np.flatnonzero(np.isnan(values))
@@ -359,7 +361,7 @@ def _check_recorded(output: str, column: str, values: Array, place: str) -> None
         )
 
 
-def _time_unit(table: schema.Experiment, origin: Origin) -> str:
+def _time_unit(table: schema.ExperimentTable, origin: Origin) -> str:
     """The unit of the time as the file or the study says it, "" where neither does."""
     line = table.columns.get("time")
     if origin.time_unit or line is None:
@@ -367,7 +369,7 @@ def _time_unit(table: schema.Experiment, origin: Origin) -> str:
     return line.unit or (f"{line.scale:g} s" if line.scale is not None else "")
 
 
-def _event(table: schema.Experiment, inputs: Mapping[str, InputSignal], time: Array, place: str) -> float | None:
+def _event(table: schema.ExperimentTable, inputs: Mapping[str, InputSignal], time: Array, place: str) -> float | None:
     if table.event is None:
         return event_time(inputs)
     if not time[0] <= table.event <= time[-1]:
@@ -380,7 +382,7 @@ def _event(table: schema.Experiment, inputs: Mapping[str, InputSignal], time: Ar
     return table.event
 
 
-def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, float] | None:
+def _window(table: schema.ExperimentTable, time: Array, place: str) -> tuple[float, float] | None:
     if table.window is None:
         return None
     low, high = table.window
@@ -394,9 +396,9 @@ def _window(table: schema.Experiment, time: Array, place: str) -> tuple[float, f
     return low, high
 
 
-def _noise_columns(table: schema.Experiment) -> dict[str, str]:
+def _noise_columns(table: schema.ExperimentTable) -> dict[str, str]:
     """By output the column of its standard deviations, where one is named."""
-    return {o: n.column for o, n in table.noise.items() if isinstance(n, schema.NoiseColumn)}
+    return {o: n.column for o, n in table.noise.items() if isinstance(n, schema.NoiseTable)}
 
 
 def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, float], place: str) -> Array:
@@ -448,5 +450,5 @@ def _noise_dof(time: Array, event: float | None) -> float:
     return max(1.0, MEDIAN_EFFICIENCY * int((time < event).sum()))
 
 
-def _instrument(line: schema.Instrument) -> FrozenMap[float]:
+def _instrument(line: schema.InstrumentTable) -> FrozenMap[float]:
     return FrozenMap({k: float(v) for k, v in line.model_dump(by_alias=True, exclude_none=True).items()})

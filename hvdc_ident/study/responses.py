@@ -54,7 +54,7 @@ def read_responses(
     return tuple(found), sources
 
 
-def _checked(table: schema.Response, settings: schema.StudyFile, model: AnyModel, place: str) -> Port | None:
+def _checked(table: schema.ResponseTable, settings: schema.StudyFile, model: AnyModel, place: str) -> Port | None:
     """The port, where it is one. Raises where the table names what is not there."""
     _known("input", table.values, model.inputs, f"{place}.values")
     if table.trim is not None:
@@ -79,7 +79,7 @@ def _known(kind: str, names: Iterable[str] | None, known: Collection[str], where
             raise unknown_name(kind, name, known, where=where)
 
 
-def _response(table: schema.Response, port: Port | None, path: Path) -> MeasuredResponse:
+def _response(table: schema.ResponseTable, port: Port | None, path: Path) -> MeasuredResponse:
     if port is None:
         wanted = {"": (table.output or "", table.input or "")}
     else:
@@ -116,7 +116,7 @@ def _response(table: schema.Response, port: Port | None, path: Path) -> Measured
 
 
 def _noise(
-    table: schema.Response, file: ResponseFile, names: Sequence[str], keep: Array, values: Array
+    table: schema.ResponseTable, file: ResponseFile, names: Sequence[str], keep: Array, values: Array
 ) -> tuple[Array | None, float]:
     """(standard deviation of each value's modulus, independent numbers behind it): as stated, else as the file tells."""
     if table.noise is not None:
@@ -129,7 +129,7 @@ def _noise(
     return None, np.inf
 
 
-def _channels(table: schema.Response, file: ResponseFile, wanted: Sequence[str], where: str) -> dict[str, str]:
+def _channels(table: schema.ResponseTable, file: ResponseFile, wanted: Sequence[str], where: str) -> dict[str, str]:
     """The file's channel for each wanted one: as `columns` says, or by its name's end (Zdd, Ydq, Z11, "d from q")."""
     known = list(file.channels)
     for key, name in table.columns.items():
@@ -170,7 +170,7 @@ def _channels(table: schema.Response, file: ResponseFile, wanted: Sequence[str],
     return found
 
 
-def _waveforms(table: schema.Response, path: Path) -> ResponseFile:
+def _waveforms(table: schema.ResponseTable, path: Path) -> ResponseFile:
     """The response that a record in time shows: at the perturbation's frequencies, or by Welch's averages over all."""
     sent, seen = table.signals["input"], table.signals["output"]
     record = read_waveforms(path, [sent, seen])

@@ -76,13 +76,13 @@ Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name)]
 Interpolation = Literal["hold", "linear"]
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """A table of the study file: an unknown key, a text for a number and a number that is not finite are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=False, protected_namespaces=())
 
 
-class Effect(Table):
+class EffectTable(TomlTable):
     """[[model.effect]]: an effect that the model has from the start."""
 
     effect: Name
@@ -92,7 +92,7 @@ class Effect(Table):
     expression: Annotated[str, StringConstraints(max_length=2000)] | None = None
 
 
-class Model(Table):
+class ModelTable(TomlTable):
     """[model]: where the model comes from and what differs from it.
 
     Of an FMU: deadline: s that one run may take; load: s that it may take to begin; memory: MiB that it may take.
@@ -105,17 +105,17 @@ class Model(Table):
     load: Positive | None = None
     memory: Positive | None = None
     values: dict[Name, FiniteFloat] = {}
-    effect: list[Effect] = []
+    effect: list[EffectTable] = []
 
 
-class Prior(Table):
+class PriorTable(TomlTable):
     """What is known of a candidate beforehand: a normal distribution in the parameter's unit."""
 
     mean: FiniteFloat
     std: Positive
 
 
-class Candidate(Table):
+class ParameterTable(TomlTable):
     """One line of [parameters]: a parameter that may be estimated; what is left out is the model's own.
 
     given: the value that the model came with, the vendor's; start: where the search begins, else the given value.
@@ -127,19 +127,19 @@ class Candidate(Table):
     start: FiniteFloat | None = None
     min: FiniteFloat | None = None
     max: FiniteFloat | None = None
-    prior: Prior | None = None
+    prior: PriorTable | None = None
     tie: Annotated[str, StringConstraints(min_length=1, max_length=1000)] | None = None
     per_experiment: bool = Field(default=False, alias="per-experiment")
 
     @model_validator(mode="after")
-    def _tie_alone(self) -> Candidate:
+    def _tie_alone(self) -> ParameterTable:
         others = (self.given, self.start, self.min, self.max, self.prior)
         if self.tie is not None and (self.per_experiment or any(v is not None for v in others)):
             raise ValueError("tie: a tied parameter has neither start, bounds nor prior of its own, nor a given value")
         return self
 
 
-class Column(Table):
+class ColumnTable(TomlTable):
     """One line of an experiment's `columns`: the recorded column of a signal and how it gets the model's unit.
 
     model = scale x recorded + offset, or (recorded / base) + offset; the offset is in the model's unit.
@@ -152,13 +152,13 @@ class Column(Table):
     offset: FiniteFloat | None = None
 
     @model_validator(mode="after")
-    def _one_factor(self) -> Column:
+    def _one_factor(self) -> ColumnTable:
         if self.scale is not None and self.base is not None:
             raise ValueError("give either scale (model = scale x recorded) or base (model = recorded / base)")
         return self
 
 
-class Phases(Table):
+class PhasesTable(TomlTable):
     """One line of an experiment's `phases`: quantities made of three recorded phases.
 
     gives: the quantity of each new column, to be named in inputs, outputs, drive or columns like a recorded one.
@@ -172,7 +172,7 @@ class Phases(Table):
     gives: Annotated[dict[Name, Name], Field(min_length=1)]
 
 
-class Phasor(Table):
+class PhasorTable(TomlTable):
     """Magnitude and angle of a quantity: one column each, or three in the order of rotation; unit: deg or rad, of the angles."""
 
     magnitude: Annotated[list[Name], BeforeValidator(_one_or_three)]
@@ -180,13 +180,13 @@ class Phasor(Table):
     unit: Literal["deg", "rad"] | None = None
 
     @model_validator(mode="after")
-    def _as_many(self) -> Phasor:
+    def _as_many(self) -> PhasorTable:
         if len(self.magnitude) != len(self.angle):
             raise ValueError("angle: as many columns as magnitude are needed")
         return self
 
 
-class Phasors(Table):
+class PhasorsTable(TomlTable):
     """One line of an experiment's `phasors`: quantities made of recorded magnitudes and angles (`hvdc_ident.phasors`).
 
     magnitudes: how they are counted, for powers. window: s, over which the frequency is the angle's mean slope.
@@ -194,8 +194,8 @@ class Phasors(Table):
     gives: the quantity of each new column, to be named in inputs, outputs, drive or columns like a recorded one.
     """
 
-    voltage: Phasor
-    current: Phasor | None = None
+    voltage: PhasorTable
+    current: PhasorTable | None = None
     frequency: Positive | None = None
     window: Positive = 0.1
     magnitudes: Literal["phase-rms", "line-rms", "phase-peak", "pu"] | None = None
@@ -203,7 +203,7 @@ class Phasors(Table):
     gives: Annotated[dict[Name, Name], Field(min_length=1)]
 
 
-class Instrument(Table):
+class InstrumentTable(TomlTable):
     """One line of an experiment's `instrument`: the recording chain of an output."""
 
     window_mean: NotNegative | None = Field(default=None, alias="window-mean")
@@ -211,13 +211,13 @@ class Instrument(Table):
     accuracy_class: Positive | None = Field(default=None, alias="class")
 
 
-class NoiseColumn(Table):
+class NoiseTable(TomlTable):
     """One line of an experiment's `noise`, where every row has a standard deviation of its own, in the output's unit."""
 
     column: Name
 
 
-class Experiment(Table):
+class ExperimentTable(TomlTable):
     """[[experiment]]: one recording and what to make of it.
 
     noise: the standard deviation of an output in the model's unit, or the column that holds it in that of the output's.
@@ -228,22 +228,22 @@ class Experiment(Table):
     role: Literal["fit", "holdout"] = "fit"
     inputs: Columns = {}
     outputs: Columns
-    noise: dict[Name, Annotated[float | NoiseColumn, BeforeValidator(_known_noise)]] = {}
+    noise: dict[Name, Annotated[float | NoiseTable, BeforeValidator(_known_noise)]] = {}
     event: FiniteFloat | None = None
     window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
     values: dict[Name, FiniteFloat] = {}
-    columns: dict[Name, Column] = {}
+    columns: dict[Name, ColumnTable] = {}
     nuisance: list[Name] = []
     drive: Columns = {}
-    instrument: dict[Name, Instrument] = {}
-    phases: list[Phases] = []
-    phasors: list[Phasors] = []
+    instrument: dict[Name, InstrumentTable] = {}
+    phases: list[PhasesTable] = []
+    phasors: list[PhasorsTable] = []
     interpolation: Annotated[
         Interpolation | dict[Name, Interpolation] | None, BeforeValidator(_known_interpolation)
     ] = None
 
     @model_validator(mode="after")
-    def _ordered(self) -> Experiment:
+    def _ordered(self) -> ExperimentTable:
         if self.window and not self.window[0] < self.window[1]:
             raise ValueError("window: its end is not after its start")
         if not self.outputs:
@@ -251,7 +251,7 @@ class Experiment(Table):
         return self
 
 
-class Trim(Table):
+class TrimTable(TomlTable):
     """[linearize] trim: the values that outputs are to have at the operating point, and the inputs that are set for it.
 
     inputs: values of other inputs. free: inputs or parameters to be found; left out, the inputs that move the outputs.
@@ -262,7 +262,7 @@ class Trim(Table):
     free: Names | None = None
 
 
-class Reduce(Table):
+class ReduceTable(TomlTable):
     """[linearize] reduce: a model of fewer states, so many or as few as keep the error within a tolerance."""
 
     order: Annotated[int, Field(ge=0)] | None = None
@@ -270,20 +270,20 @@ class Reduce(Table):
     match_dc: bool = False
 
     @model_validator(mode="after")
-    def _one_way(self) -> Reduce:
+    def _one_way(self) -> ReduceTable:
         if (self.order is None) == (self.tolerance is None):
             raise ValueError("give either order (states that stay) or tolerance (largest error of the gain)")
         return self
 
 
-class Cut(Table):
+class PlantTable(TomlTable):
     """[linearize] plant: the signals that go into the plant and those the controller measures on it."""
 
     inputs: Annotated[Names, BeforeValidator(_as_list)]
     outputs: Annotated[Names, BeforeValidator(_as_list)]
 
 
-class Port(Table):
+class PortTable(TomlTable):
     """[[linearize.port]]: where an impedance is seen, d and q or one dc signal each; band: Hz."""
 
     name: FileName
@@ -295,7 +295,7 @@ class Port(Table):
     points: Annotated[int, Field(ge=2, le=100_000)] = 200
 
     @model_validator(mode="after")
-    def _ordered(self) -> Port:
+    def _ordered(self) -> PortTable:
         if not self.band[0] < self.band[1]:
             raise ValueError("band: its end is not above its start")
         if not len(self.source) == len(self.voltage) == len(self.current):
@@ -305,7 +305,7 @@ class Port(Table):
         return self
 
 
-class Locus(Table):
+class LocusTable(TomlTable):
     """[linearize] locus: the eigenvalues along values of one parameter or input, each at its own operating point."""
 
     parameter: Name
@@ -315,7 +315,7 @@ class Locus(Table):
     scale: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
-    def _ordered(self) -> Locus:
+    def _ordered(self) -> LocusTable:
         if not self.min < self.max:
             raise ValueError("max is not above min")
         if self.scale == "log" and self.min <= 0:
@@ -323,7 +323,7 @@ class Locus(Table):
         return self
 
 
-class Linearize(Table):
+class LinearizeTable(TomlTable):
     """[linearize]: between which inputs and outputs, where, and what is wanted of the linear model.
 
     side: of a limit that the operating point lies on, which derivative is taken; left out, such a point is refused.
@@ -336,18 +336,18 @@ class Linearize(Table):
     outputs: Names | None = None
     at: Literal["steady", "start"] = "steady"
     side: Literal["refuse", "below", "above"] = "refuse"
-    trim: Trim | None = None
+    trim: TrimTable | None = None
     break_at: Annotated[Names, BeforeValidator(_as_list)] | None = None
-    plant: Cut | None = None
-    reduce: Reduce | None = None
+    plant: PlantTable | None = None
+    reduce: ReduceTable | None = None
     compare: Name | None = None
     scale: dict[Name, Positive] = {}
     formula: Names | None = None
-    locus: Locus | None = None
-    port: list[Port] = []
+    locus: LocusTable | None = None
+    port: list[PortTable] = []
 
 
-class Response(Table):
+class ResponseTable(TomlTable):
     """[[response]]: a measured frequency response, from an input to an output, or at a port of [[linearize.port]].
 
     columns: the file's channel of each measured one (dd, dq, qd, qq at a port of two axes). signals: where data is a record
@@ -372,10 +372,10 @@ class Response(Table):
     relative_noise: Positive | None = None
     band: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
     values: dict[Name, FiniteFloat] = {}
-    trim: Trim | None = None
+    trim: TrimTable | None = None
 
     @model_validator(mode="after")
-    def _one_place(self) -> Response:
+    def _one_place(self) -> ResponseTable:
         if (self.port is None) == (self.input is None or self.output is None):
             raise ValueError("give either input and output, or port")
         if self.port is not None and (self.input or self.output):
@@ -389,7 +389,7 @@ class Response(Table):
         return self
 
 
-class Sweep(Table):
+class SweepTable(TomlTable):
     """[[sweep]]: the values of one parameter, listed or spread over a range.
 
     against: "data", "base", or another model, a shipped one or a path.
@@ -406,7 +406,7 @@ class Sweep(Table):
     values: Annotated[list[FiniteFloat], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> Sweep:
+    def _one_way(self) -> SweepTable:
         spread = (self.min, self.max, self.points)
         if self.values is not None and any(v is not None for v in spread):
             raise ValueError("give either values or min, max and points")
@@ -422,7 +422,7 @@ class Sweep(Table):
         return self
 
 
-class Screening(Table):
+class ScreeningTable(TomlTable):
     """[screening]: which parameters matter over their whole ranges, by Morris' elementary effects or Sobol's indices.
 
     parameters: default, all candidates; each over its bounds. trajectories: of Morris; samples: of Sobol, a power of 2.
@@ -436,13 +436,13 @@ class Screening(Table):
     against: Literal["data", "base"] = "data"
 
 
-class Identifiability(Table):
+class IdentifiabilityTable(TomlTable):
     """[identifiability]: asks for the stage. pair: two candidates whose common profile is wanted, on a grid."""
 
     pair: Annotated[list[Name], Field(min_length=2, max_length=2)] | None = None
 
 
-class Group(Table):
+class GroupTable(TomlTable):
     """One group of [fit] groups: these parameters against these outputs of these experiments (all where left out)."""
 
     parameters: Names
@@ -450,7 +450,7 @@ class Group(Table):
     experiments: Names | None = None
 
 
-class Fit(Table):
+class FitTable(TomlTable):
     """[fit]: how the candidates are estimated.
 
     starts: left out, 8, or 1 for an optimiser that searches the whole range by itself. whiten: true is "pre-event".
@@ -459,7 +459,7 @@ class Fit(Table):
     """
 
     mode: Literal["simultaneous", "individual"] = "simultaneous"
-    groups: list[Group] = []
+    groups: list[GroupTable] = []
     optimiser: Name = "trust-region"
     loss: Name = "linear"
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
@@ -470,7 +470,7 @@ class Fit(Table):
     tolerance: Name = "set-point-step-simulation"
 
     @model_validator(mode="after")
-    def _groups_fit_the_mode(self) -> Fit:
+    def _groups_fit_the_mode(self) -> FitTable:
         if self.mode == "individual" and not self.groups:
             raise ValueError('mode "individual" needs groups, one a controller')
         if self.groups and self.mode != "individual":
@@ -482,7 +482,7 @@ class Fit(Table):
         return self
 
 
-class Diagnose(Table):
+class DiagnoseTable(TomlTable):
     """[diagnose]: which effects to try ("all" may stand beside others), what is too small to matter, how many effects may be
     missing at most, and whether what the scores tell little of is refitted too where nothing else comes near the noise."""
 
@@ -492,18 +492,18 @@ class Diagnose(Table):
     thorough: bool = False
 
 
-class StudyFile(Table):
+class StudyFile(TomlTable):
     """The whole study file."""
 
     version: Literal[1] = Field(alias="schema")
     name: Name | None = None
-    model: Model
-    parameters: dict[Name, Candidate] = {}
-    experiment: list[Experiment] = []
-    response: list[Response] = []
-    linearize: Linearize | None = None
-    sweep: list[Sweep] = []
-    screening: Screening | None = None
-    identifiability: Identifiability | None = None
-    fit: Fit | None = None
-    diagnose: Diagnose | None = None
+    model: ModelTable
+    parameters: dict[Name, ParameterTable] = {}
+    experiment: list[ExperimentTable] = []
+    response: list[ResponseTable] = []
+    linearize: LinearizeTable | None = None
+    sweep: list[SweepTable] = []
+    screening: ScreeningTable | None = None
+    identifiability: IdentifiabilityTable | None = None
+    fit: FitTable | None = None
+    diagnose: DiagnoseTable | None = None

@@ -99,7 +99,7 @@ class Study(Shown):
         return axes
 
     @property
-    def _listed(self) -> dict[str, schema.Candidate]:
+    def _listed(self) -> dict[str, schema.ParameterTable]:
         """The lines of [parameters] that have a value of their own: all but ties."""
         return {n: line for n, line in self.settings.parameters.items() if line.tie is None}
 
@@ -190,7 +190,7 @@ def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyMode
     return model, sources
 
 
-def _limits(table: schema.Model) -> dict[str, float] | None:
+def _limits(table: schema.ModelTable) -> dict[str, float] | None:
     """The limits of an FMU that are stated, by their keys."""
     stated = {n: v for n in ("deadline", "load", "memory") if (v := getattr(table, n)) is not None}
     return stated or None
@@ -337,7 +337,7 @@ def check_questions(study: Study, where: str) -> None:
             _all_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
 
 
-def _check_sweep(line: schema.Sweep, model: AnyModel, where: str) -> None:
+def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
     """Raises where a swept value leaves the model's own bounds."""
     own = model.parameters[line.parameter]
     ends = line.values or [v for v in (line.min, line.max) if v is not None]
@@ -358,7 +358,7 @@ def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> No
         _all_known("candidate", [name], study.candidates, where)
 
 
-def _free_line(name: str, lines: Mapping[str, schema.Candidate], where: str, *, own: bool = False) -> None:
+def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, own: bool = False) -> None:
     """Raise StudyError for a parameter that follows others by its tie or, unless `own`, has a value in each experiment."""
     line = lines.get(name)
     if line is not None and line.tie is not None:

@@ -10,7 +10,7 @@ from hvdc_ident.sensitivity.sampling import Points, Samples, grid, latin_hypercu
 from hvdc_ident.study import schema
 
 
-def axes_of(tables: Sequence[schema.Sweep], seed: int, where: str = "sweep") -> tuple[Samples, ...]:
+def axes_of(tables: Sequence[schema.SweepTable], seed: int, where: str = "sweep") -> tuple[Samples, ...]:
     """One axis for each table; those sampled by a Latin hypercube together are one. Their product is the sweep."""
     axes: list[Samples] = []
     cube = [t for t in tables if t.sampling == "latin-hypercube"]
@@ -28,7 +28,7 @@ def axes_of(tables: Sequence[schema.Sweep], seed: int, where: str = "sweep") -> 
     return tuple(axes)
 
 
-def against_of(tables: Sequence[schema.Sweep], where: str = "sweep") -> str:
+def against_of(tables: Sequence[schema.SweepTable], where: str = "sweep") -> str:
     """What the sweep is compared with, "data", "base" or a model's name: every table that says so says the same."""
     said = {t.against for t in tables if t.against is not None}
     if len(said) > 1:
@@ -36,14 +36,14 @@ def against_of(tables: Sequence[schema.Sweep], where: str = "sweep") -> str:
     return said.pop() if said else "data"
 
 
-def wanted(tables: Sequence[schema.Sweep]) -> tuple[Literal["rmse", "poles", "bode"], ...]:
+def wanted(tables: Sequence[schema.SweepTable]) -> tuple[Literal["rmse", "poles", "bode"], ...]:
     """What any of the tables wants at each point, in a fixed order."""
     asked = {w for t in tables for w in t.want}
     kinds: tuple[Literal["rmse", "poles", "bode"], ...] = ("rmse", "poles", "bode")
     return tuple(k for k in kinds if k in asked)
 
 
-def _cube(tables: Sequence[schema.Sweep], seed: int, where: str) -> Samples:
+def _cube(tables: Sequence[schema.SweepTable], seed: int, where: str) -> Samples:
     points = {t.points for t in tables}
     if len(points) != 1 or None in points:
         raise StudyError(

@@ -86,7 +86,7 @@ def with_nuisances(
     return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own))), search=search) for e in experiments)
 
 
-def free_of(name: str, line: schema.Candidate, model: AnyModel) -> Free:
+def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> Free:
     """The unknown of a fit that a line of [parameters] describes; what it leaves out is the model's, its given value too.
 
     Raises StudyError where the bounds do not hold the start.

@@ -63,10 +63,10 @@ def diagnosed(
     from hvdc_ident.discrepancy import Options as Budget
     from hvdc_ident.discrepancy import diagnose
     from hvdc_ident.identifiability import gate
-    from hvdc_ident.study.schema import Diagnose
+    from hvdc_ident.study.schema import DiagnoseTable
 
     _need(study)
-    asked = study.settings.diagnose or Diagnose()
+    asked = study.settings.diagnose or DiagnoseTable()
     if not gate(report, diagnosis=True).fitted:
         raise NothingIdentified(
             "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own",

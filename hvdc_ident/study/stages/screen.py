@@ -19,11 +19,11 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     from hvdc_ident.sensitivity.global_screening import morris, sobol
     from hvdc_ident.study.at_work import workers_of
     from hvdc_ident.study.needs import need_candidates, need_experiments
-    from hvdc_ident.study.schema import Screening
+    from hvdc_ident.study.schema import ScreeningTable
 
     need_experiments(study, "screen")
     need_candidates(study, "screen")
-    asked = study.settings.screening or Screening()
+    asked = study.settings.screening or ScreeningTable()
     names = asked.parameters or list(study.candidates)
     ranges = {n: (study.candidates[n].min, study.candidates[n].max) for n in names}
     open_ended = [n for n, r in ranges.items() if not (math.isfinite(r[0]) and math.isfinite(r[1]))]
