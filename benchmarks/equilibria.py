@@ -22,7 +22,7 @@ from scipy.optimize import fsolve
 
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import ModelError, SteadyStateError
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from hvdc_ident.simulate.steady_state import equilibria
 
 PARAMETERS = {"H": 4.0, "K": 100.0, "TA": 0.02, "TC": 1.0, "KS": 8.0, "R": 0.05}

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
         simulated_response,
         symbolic_transfer,
     )
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model import Model
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.sensitivity import SweepResult, linear_sensitivities, morris, sobol

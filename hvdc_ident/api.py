@@ -74,7 +74,7 @@ def simulate(
     [0.4, 0.4, 0.495, 0.5, 0.5, 0.5]
     """
     from hvdc_ident.experiment import Experiment
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model import Model
     from hvdc_ident.simulate.engine import simulate as run
 
     plant: Any = model
@@ -251,7 +251,7 @@ def sensitivities(
     import numpy as np
 
     from hvdc_ident.errors import InputError
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model import Model
     from hvdc_ident.sensitivity.local_sensitivities import sensitivities as derivatives
     from hvdc_ident.study.assemble import experiments_of, names_of, subject_of, values_of
     from hvdc_ident.study.study import Study
@@ -503,7 +503,7 @@ def export(
     'link.mat'
     """
     from hvdc_ident.linearize import LinearModel
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model import Model
     from hvdc_ident.study.assemble import subject_of, values_of
     from hvdc_ident.study.export import export as write
     from hvdc_ident.study.study import Study

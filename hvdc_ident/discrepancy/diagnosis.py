@@ -28,8 +28,7 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel, recording
+from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 CLOSED = (

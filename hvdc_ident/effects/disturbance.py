@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.expression.functions import TIME
+from hvdc_ident.expression import TIME
 from hvdc_ident.frozen import FrozenMap
 
 

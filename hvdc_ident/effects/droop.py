@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.expression.functions import clip
+from hvdc_ident.expression import clip
 from hvdc_ident.frozen import FrozenMap
 
 

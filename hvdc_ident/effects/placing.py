@@ -11,12 +11,9 @@ import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.errors import InputError, ModelError, unknown_name
-from hvdc_ident.expression.functions import symbol
-from hvdc_ident.expression.parser import parse
+from hvdc_ident.expression import parse, symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
-from hvdc_ident.model.transform import fresh, home, rewritten, slot
+from hvdc_ident.model import AnyModel, Model, fresh, insertion_point, insertion_point_of, rewritten
 from hvdc_ident.parameters import Parameter
 
 COEFFICIENT = EffectParameter(0.0, neutral=0.0, min=-math.inf, optional=True, description="coefficient of the term")
@@ -73,8 +70,8 @@ class EffectUse:
 
     def within(self, model: AnyModel) -> EffectUse:
         """Return the use at this model's slots: what sat behind an effect that the model lacks sits where that one did."""
-        source = joined(home(model.slots, s) for s in self.sources)
-        return replace(self, at=tuple(home(model.slots, place) for place in self.at), source=source)
+        source = joined(insertion_point_of(model.slots, s) for s in self.sources)
+        return replace(self, at=tuple(insertion_point_of(model.slots, place) for place in self.at), source=source)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -169,7 +166,7 @@ def _at_one(
     where: str,
 ) -> Model:
     """The model with the effect at one of its slots. source: what is brought in there."""
-    kind, name = slot(model, place)
+    kind, name = insertion_point(model, place)
     circular = kind in ("signal", "algebraic") and _leads_back(model, name)
 
     def rewrite(m: Model, u: sp.Expr) -> tuple[Model, sp.Expr]:
@@ -227,7 +224,7 @@ def _check_places(model: Model, use: EffectUse, effect: Effect, where: str) -> N
     if not use.at:
         raise ModelError("the effect has no place", where=where, expected="at least one slot")
     for place in use.at:
-        kind = slot(model, place)[0]
+        kind = insertion_point(model, place)[0]
         if kind not in effect.places:
             raise ModelError(
                 f"the effect cannot sit at the {kind} '{place}'", where=where, expected=" or ".join(effect.places)
@@ -244,7 +241,7 @@ def _resolved(model: Model, value: float | str, where: str) -> float:
 
 
 def _source(model: Model, name: str, where: str) -> sp.Expr:
-    kind, name = slot(model, name) if name in model.slots else _no_source(model, name, where)
+    kind, name = insertion_point(model, name) if name in model.slots else _no_source(model, name, where)
     return model.outputs[name].value if kind == "output" else symbol(name)
 
 

@@ -28,10 +28,9 @@ import sympy as sp
 
 from hvdc_ident.effects.base import Effect, EffectParameter, Measure
 from hvdc_ident.effects.placing import EffectUse
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Output
-from hvdc_ident.model.transform import slot
+from hvdc_ident.model import Model, Output, insertion_point
 from hvdc_ident.parameters import Input
 from hvdc_ident.trajectory import Array
 
@@ -253,7 +252,7 @@ def clearance(effect: Effect, values: Mapping[str, float]) -> dict[str, float]:
 
 def sources(model: Model, place: str) -> tuple[str, ...]:
     """Inputs, signals, unknowns and states that an effect at this place may bring in without closing a circle."""
-    kind, name = slot(model, place)
+    kind, name = insertion_point(model, place)
     every = [*model.inputs, *model.signals, *model.algebraic, *model.states]
     if kind == "output":
         return tuple(every)
@@ -271,7 +270,7 @@ def sources(model: Model, place: str) -> tuple[str, ...]:
 
 def resistances(model: Model, place: str) -> tuple[str, ...]:
     """Parameters by which the slot's own equation divides: where a current is a voltage over one, its resistance."""
-    kind, name = slot(model, place)
+    kind, name = insertion_point(model, place)
     if kind not in ("signal", "algebraic"):
         return ()
     equation = model.signals[name].value if kind == "signal" else model.algebraic[name].equation

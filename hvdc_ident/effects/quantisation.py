@@ -6,7 +6,7 @@ import numpy as np
 import sympy as sp
 
 from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter, Extent
-from hvdc_ident.expression.functions import clip, where
+from hvdc_ident.expression import clip, where
 from hvdc_ident.frozen import FrozenMap
 
 BITS = 24

@@ -1,7 +1,34 @@
 """Expressions: text to sympy and back, safely."""
 
-from hvdc_ident.expression.functions import TIME, clip, symbol, where
-from hvdc_ident.expression.parser import parse
+from hvdc_ident.expression.functions import (
+    FUNCTIONS,
+    TIME,
+    Algebra,
+    GrammarFunction,
+    clip,
+    elementary,
+    function_of,
+    symbol,
+    where,
+)
+from hvdc_ident.expression.grammar import is_identifier, is_reserved
+from hvdc_ident.expression.parser import EXACT, normal, parse
 from hvdc_ident.expression.printer import to_text
 
-__all__ = ["TIME", "clip", "parse", "symbol", "to_text", "where"]
+__all__ = [
+    "EXACT",
+    "FUNCTIONS",
+    "TIME",
+    "Algebra",
+    "GrammarFunction",
+    "clip",
+    "elementary",
+    "function_of",
+    "is_identifier",
+    "is_reserved",
+    "normal",
+    "parse",
+    "symbol",
+    "to_text",
+    "where",
+]

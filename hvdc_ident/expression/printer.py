@@ -12,7 +12,7 @@ from sympy.logic.boolalg import And, Not, Or
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression.functions import function_of
 from hvdc_ident.expression.grammar import IDENTIFIER, is_reserved
-from hvdc_ident.expression.normal import EXACT
+from hvdc_ident.expression.parser import EXACT
 
 SUM, PRODUCT, POWER, ATOM = range(4)
 """How tightly a text holds together: what binds looser than its surroundings is put in parentheses."""

@@ -12,8 +12,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.simulator import Simulation, Simulator
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.impedance import MeasuredResponse
-from hvdc_ident.model.definition import State
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, State
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array, Trajectory

@@ -21,7 +21,7 @@ from hvdc_ident.files import digest
 from hvdc_ident.fmu.description import Description, Interface, Variable, read_description
 from hvdc_ident.fmu.host import Host, Limits
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Output
+from hvdc_ident.model import Output
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.result import Simulation

@@ -26,7 +26,7 @@ from hvdc_ident.identifiability.recommend import Recommendation, recommend
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.structure import structure as structure_of
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.fisher import collinear_subsets
 from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities, sensitivities
 from hvdc_ident.simulate.model_simulator import ModelSimulator

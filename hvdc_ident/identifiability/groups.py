@@ -17,7 +17,7 @@ from hvdc_ident.identifiability.assess import identifiability
 from hvdc_ident.identifiability.heterogeneity import Misspecification
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structure import Structure
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.matrices import Array, eliminate
 from hvdc_ident.linearize.system import CompiledSystem, Layout
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 MAX_ORDER = 12
 

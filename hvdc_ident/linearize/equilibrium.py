@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.system import CompiledSystem, system
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 Equations = Callable[[Array], tuple[Array, Array]]
 ACCURACY = 1e-10

@@ -17,7 +17,7 @@ from hvdc_ident.linearize.equilibrium import At, newton
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import Bounds, OperatingPoint
-from hvdc_ident.model.external import External
+from hvdc_ident.model import External
 
 ACCURACY = 1e-9
 """Largest scaled derivative that counts as rest: an FMU's own loops are solved no better."""

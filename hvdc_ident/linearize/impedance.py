@@ -15,17 +15,14 @@ import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, WaveformError, unknown_name
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.expression import parse
-from hvdc_ident.expression.functions import TIME, symbol
+from hvdc_ident.expression import TIME, parse, symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, sensitivity
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
-from hvdc_ident.model.definition import Model, Output
-from hvdc_ident.model.external import AnyModel
-from hvdc_ident.model.transform import fresh, rewritten
+from hvdc_ident.model import AnyModel, Model, Output, fresh, rewritten
 from hvdc_ident.parameters import Input
 
 Names = tuple[str, str] | tuple[str]

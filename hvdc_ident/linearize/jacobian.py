@@ -15,8 +15,7 @@ from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.matrices import Array, Eliminated, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
 from hvdc_ident.linearize.system import CompiledSystem, system
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 
 Side = Literal["refuse", "below", "above"]
 WELL_POSED = 1e12

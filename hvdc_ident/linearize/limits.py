@@ -10,8 +10,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
-from hvdc_ident.expression.functions import symbol
-from hvdc_ident.expression.printer import to_text
+from hvdc_ident.expression import symbol, to_text
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.simulate.structure import Structure
 

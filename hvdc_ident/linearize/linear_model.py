@@ -309,7 +309,7 @@ class LinearModel(Shown):
         """
         from hvdc_ident.linearize.open_loop import loop
         from hvdc_ident.linearize.stability_margins import loop_margins, margins
-        from hvdc_ident.model.definition import Model
+        from hvdc_ident.model import Model
 
         if break_at is None:
             return margins(self) if self.B.shape[1] == self.C.shape[0] == 1 else loop_margins(self)

@@ -15,7 +15,7 @@ from hvdc_ident.linearize.jacobian import state_matrix
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.modal import ZERO, eigen
 from hvdc_ident.linearize.operating_point import steady
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from hvdc_ident.linearize.matrices import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model import Model
 
 ZERO = 1e-8
 """An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer
 from hvdc_ident.linearize.jacobian import linearize
@@ -16,8 +16,7 @@ from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
 from hvdc_ident.linearize.reduce import without_sliding_means
-from hvdc_ident.model.definition import Model, Output, State
-from hvdc_ident.model.transform import driven, fresh
+from hvdc_ident.model import Model, Output, State, driven, fresh
 from hvdc_ident.parameters import Input
 
 

@@ -16,8 +16,7 @@ from hvdc_ident.linearize.equilibrium import ACCURACY, At, EquilibriumSearch, Ro
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.modal import ZERO
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.notebook import table_html
 from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting
 

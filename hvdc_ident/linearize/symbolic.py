@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.linearize.open_loop import signal_values
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 S = sp.Symbol("s")
 LARGEST = 6

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.expression.functions import FUNCTIONS
+from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, Function

@@ -9,7 +9,7 @@ import numpy as np
 from hvdc_ident.errors import SteadyStateError, unknown_name
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import OperatingPoint
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 
 DEPENDENT = 1e-8
 """Share of its length that is left of an output's row of gains, below which it follows from other outputs': gains are sums

@@ -13,9 +13,9 @@ from typing import Any
 import sympy as sp
 
 from hvdc_ident.errors import ExpressionError, InputError, ModelError, unknown_name
-from hvdc_ident.expression.printer import to_text
+from hvdc_ident.expression import to_text
 from hvdc_ident.files import write_text
-from hvdc_ident.model.coerce import SECTIONS, required_keys
+from hvdc_ident.model.check import SECTIONS, required_keys
 from hvdc_ident.model.definition import Model, Parameterisation
 
 SCHEMA = 1

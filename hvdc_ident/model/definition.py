@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import sympy as sp
 
 from hvdc_ident.errors import ModelError, unknown_name
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.notebook import Shown, Table
 from hvdc_ident.parameters import Input, Parameter
+
+if TYPE_CHECKING:
+    from hvdc_ident.experiment import Experiment
 
 Start: TypeAlias = sp.Expr | Literal["free"] | None
 
@@ -89,7 +92,7 @@ class Parameterisation:
 
 
 @dataclass(frozen=True)
-class Origin:
+class ModelOrigin:
     """The model that another one was made from, whose steady state the other one's is connected with.
 
     root: the model as it was given, with its own values. neutral: by rewritten signal or unknown of the other model,
@@ -125,7 +128,7 @@ class Model(Shown):
     sampled: FrozenMap[Sampled] = field(default_factory=FrozenMap)
     parameterisations: FrozenMap[Parameterisation] = field(default_factory=FrozenMap)
     description: str = ""
-    origin: Origin | None = field(default=None, compare=False, repr=False)
+    origin: ModelOrigin | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         from hvdc_ident.model.check import check, coerced
@@ -159,7 +162,7 @@ class Model(Shown):
             else:
                 raise unknown_name("parameter or input", name, [*parameters, *inputs], where=f"model '{self.name}'")
         return replace(
-            self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs), origin=self.origin or Origin(self)
+            self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs), origin=self.origin or ModelOrigin(self)
         )
 
     def with_effects(self, effects: Iterable[Any]) -> Model:
@@ -256,3 +259,89 @@ class Model(Shown):
     def __getstate__(self) -> dict[str, Any]:
         """Only the definition travels to another process: symbols hash anew there."""
         return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
+
+
+class External(Protocol):
+    """An FMU, or anything else with a model's names that can be run. Slots are its inputs and outputs."""
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+
+    @property
+    def parameters(self) -> FrozenMap[Parameter]:
+        """The parameters by name, with start values, units and bounds."""
+
+    @property
+    def inputs(self) -> FrozenMap[Input]:
+        """The inputs by name."""
+
+    @property
+    def outputs(self) -> FrozenMap[Output]:
+        """Outputs by name, with units; their expressions have no meaning."""
+
+    @property
+    def states(self) -> FrozenMap[Any]:
+        """The states by name, with units; none where it does not show them."""
+
+    @property
+    def signals(self) -> FrozenMap[Any]:
+        """None: it is closed."""
+
+    @property
+    def algebraic(self) -> FrozenMap[Any]:
+        """None: it is closed."""
+
+    @property
+    def slots(self) -> tuple[str, ...]:
+        """Names at which an effect may sit."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters, inputs and states."""
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters' values by name."""
+
+    @property
+    def text(self) -> str:
+        """Text that differs where the model or a value does."""
+
+    def with_values(self, values: Mapping[str, float]) -> External:
+        """The model with other parameter or input values."""
+
+    def recording(self, names: Iterable[str]) -> External:
+        """Return the model with these variables among its outputs. Raises InputError for what it cannot record."""
+
+    def records(self, name: str) -> bool:
+        """Return whether `recording` takes the name."""
+
+    def with_effects(self, effects: Iterable[Any]) -> External:
+        """The model with effects at its slots."""
+
+    def driven(self, slots: Iterable[str]) -> External:
+        """The model in which the slots follow a recorded column."""
+
+    def parameterised(self, name: str) -> External:
+        """The model in another parameterisation."""
+
+    def simulate(
+        self,
+        experiment: Experiment,
+        values: Mapping[str, float] | None = None,
+        sensitivities: Sequence[str] = (),
+        *,
+        outputs: Sequence[str] | None = None,
+        tolerance: Any = None,
+        partial: bool = False,
+    ) -> Any:
+        """A run: a `hvdc_ident.simulate.Simulation`."""
+
+
+AnyModel: TypeAlias = Model | External
+
+
+def recording(model: AnyModel, names: Iterable[str]) -> AnyModel:
+    """Return the model with the names among its outputs; equations have what they declare, and stay as they are."""
+    return model if isinstance(model, Model) else model.recording(names)

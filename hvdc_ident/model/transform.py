@@ -9,9 +9,9 @@ from typing import Any
 import sympy as sp
 
 from hvdc_ident.errors import ModelError, unknown_name
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Origin, Signal
+from hvdc_ident.model.definition import Model, ModelOrigin, Signal
 from hvdc_ident.parameters import Input, Parameter
 
 Renaming = Mapping[sp.Symbol, sp.Symbol]
@@ -43,7 +43,7 @@ def substituted(model: Model, renaming: Renaming) -> dict[str, Any]:
     }
 
 
-def slot(model: Model, name: str) -> tuple[str, str]:
+def insertion_point(model: Model, name: str) -> tuple[str, str]:
     """(kind, name) of a slot: input, signal, algebraic, state or output; "outputs.NAME" asks for the output."""
     if name.startswith("outputs."):
         if name[8:] in model.outputs:
@@ -68,8 +68,8 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
     rewrite u is a name of its own: `NAME_before_LABEL` for signals and unknowns (readers keep the name), else readers
     of an input or a state see `NAME_after_LABEL`. An unknown whose circle the effect opens becomes a signal by itself.
     """
-    kind, name = slot(model, name)
-    origin = model.origin or Origin(model)
+    kind, name = insertion_point(model, name)
+    origin = model.origin or ModelOrigin(model)
     if kind == "output":
         model, y = rewrite(model, model.outputs[name].value)
         return replace(model, outputs=model.outputs | {name: replace(model.outputs[name], value=y)})
@@ -86,12 +86,12 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
         return replace(
             model,
             signals=model.signals | {seen: Signal(y, unit)},
-            origin=Origin(origin.root, FrozenMap(neutral)),
+            origin=ModelOrigin(origin.root, FrozenMap(neutral)),
         )
     before = fresh(model, f"{name}_before_{label}")
     # What stood there so far, with the effects that it had, is now what readers of `before` see.
     moved = {before: origin.neutral[name]} if name in origin.neutral else {}
-    origin = Origin(origin.root, origin.neutral | moved | {name: symbol(before)})
+    origin = ModelOrigin(origin.root, origin.neutral | moved | {name: symbol(before)})
     if kind == "signal":
         old = model.signals[name]
         model = replace(model, signals=_inserted(model.signals, name, before, replace(old)))
@@ -132,7 +132,7 @@ def blended(model: Model) -> tuple[Model, str]:
     return made, name
 
 
-def home(slots: Collection[str], name: str) -> str:
+def insertion_point_of(slots: Collection[str], name: str) -> str:
     """The slot among these that a name of `rewritten` was made at, where the name itself is none of them; else the name."""
     found = name
     while found not in slots:
@@ -157,14 +157,14 @@ def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal)
 
 def _derived(model: Model) -> Model:
     """The model, with itself as what it comes from where it does not come from another."""
-    return model if model.origin else replace(model, origin=Origin(model))
+    return model if model.origin else replace(model, origin=ModelOrigin(model))
 
 
 def driven(model: Model, slots: tuple[str, ...]) -> Model:
     """The model in which the slots are inputs of the same name, to follow a recorded column."""
     model = _derived(model) if slots else model
     for given in slots:
-        kind, name = slot(model, given)
+        kind, name = insertion_point(model, given)
         if kind == "output":
             raise ModelError(
                 "an output cannot be driven",

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.host import Limits
@@ -100,7 +99,7 @@ def load_model(
     if limits is not None and suffix != ".fmu":
         raise _unlimited(text)
     if suffix == ".toml":
-        from hvdc_ident.model.card import read_card
+        from hvdc_ident.model import read_card
 
         return read_card(path)
     if suffix == ".fmu":

@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.simulate.engine import simulate
 from hvdc_ident.trajectory import Array
 

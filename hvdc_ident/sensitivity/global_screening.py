@@ -18,8 +18,7 @@ from hvdc_ident.errors import ComputationError, InputError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.sensitivity.derivatives import table_text
 from hvdc_ident.sensitivity.sampling import Samples
 from hvdc_ident.sensitivity.sweep_run import sweep

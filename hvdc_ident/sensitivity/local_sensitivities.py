@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.derivatives import (
     Ranges,
     Sensitivities,

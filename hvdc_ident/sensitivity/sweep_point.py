@@ -22,8 +22,7 @@ from hvdc_ident.errors import (
 )
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.sensitivity.sampling import Points
 from hvdc_ident.simulate.engine import Method, simulate
 from hvdc_ident.trajectory import Array

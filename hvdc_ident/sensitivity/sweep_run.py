@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hvdc_ident.executor import Executor, Progress, ends
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.sensitivity.sampling import AxesLike, Points, points_of
 from hvdc_ident.sensitivity.sweep_point import PointTask, Want, check, task_of
 from hvdc_ident.sensitivity.sweep_result import SweepResult

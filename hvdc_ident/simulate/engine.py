@@ -14,8 +14,7 @@ import numpy as np
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate.integrators import integrators
 from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, evaluate

@@ -13,7 +13,7 @@ from collections.abc import Container, Iterable, Mapping
 import sympy as sp
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.expression.functions import FUNCTIONS, elementary
+from hvdc_ident.expression import FUNCTIONS, elementary
 
 Key = tuple
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeVar
 
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 T = TypeVar("T")
 

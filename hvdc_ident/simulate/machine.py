@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import llvmlite.binding as llvm
 import numpy as np
 
-from hvdc_ident.expression.functions import FUNCTIONS
+from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.objects import compiled, kept, loaded
 from hvdc_ident.trajectory import Array

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.model.definition import Model, State
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model, State
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Tolerance, simulate
 from hvdc_ident.simulate.result import Simulation

@@ -9,10 +9,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.transform import fresh, rewritten
+from hvdc_ident.model import Model, fresh, rewritten
 from hvdc_ident.parameters import Parameter
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.transform import blended
+from hvdc_ident.model import Model, blended
 from hvdc_ident.simulate.integrators import entry
 from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, evaluate

@@ -16,8 +16,8 @@ from functools import cached_property
 import sympy as sp
 
 from hvdc_ident.errors import ModelError, unknown_name
-from hvdc_ident.expression.functions import symbol
-from hvdc_ident.model.definition import Model
+from hvdc_ident.expression import symbol
+from hvdc_ident.model import Model
 from hvdc_ident.simulate.elimination import Elimination, eliminate, solve_text
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function, Row, function_text

@@ -14,8 +14,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.impedance import MeasuredResponse
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.study.parse import checked, is_study

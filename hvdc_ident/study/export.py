@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import StudyError
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.values import ValueSet, value_set
 
@@ -130,7 +130,7 @@ def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearM
 
 def _card(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.files import write_text
-    from hvdc_ident.model.card import write_card
+    from hvdc_ident.model import write_card
 
     head = f"# {' '.join(chosen.note.split())}\n" if chosen else ""
     return Written(write_text(path, head + write_card(_model(source, chosen))))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.model.card import read_card
+from hvdc_ident.model import read_card
 from hvdc_ident.report.letter import STAGE, write_letter
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.export import export

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import HvdcIdentError, SteadyStateError, StudyError, unknown_name
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.study import schema
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from hvdc_ident.files import digest
 from hvdc_ident.fit.noise import FEWEST_QUIET
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.derived import raw_columns, with_derived
 from hvdc_ident.trajectory import Array, Origin, Trajectory

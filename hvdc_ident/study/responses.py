@@ -17,8 +17,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse
 from hvdc_ident.linearize.impedance import MeasuredResponse, Port, response_at_tones, response_from_record
 from hvdc_ident.linearize.response_file import ResponseFile, read_response
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear_analysis import port_of
 from hvdc_ident.trajectory import Array

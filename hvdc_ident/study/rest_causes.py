@@ -13,8 +13,7 @@ import numpy as np
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate.engine import engine
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.conversions import EXCHANGE_SHARE, LARGEST, Conversion, input_conversions

@@ -25,7 +25,7 @@ from scipy.stats import norm
 
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.conversions import Conversion, conversions
 from hvdc_ident.study.rest_causes import POSITIVE, Cause, common_cause, exchanged, input_after_failure

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.study.study import Study
 
 

@@ -15,8 +15,7 @@ from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize.impedance import MeasuredResponse
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel, recording
+from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.notebook import Shown, Table, axes_of
 from hvdc_ident.study import schema

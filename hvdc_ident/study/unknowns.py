@@ -10,12 +10,12 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.study import schema
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.prior import Prior
-    from hvdc_ident.model.external import AnyModel
+    from hvdc_ident.model import AnyModel
 
 
 def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:

@@ -18,7 +18,7 @@ from hvdc_ident.executor import Progress
 from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.files import write_text
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.stage import silent

@@ -17,7 +17,7 @@ from hvdc_ident.fit import Free, Problem, fit, fit_each
 from hvdc_ident.fit.bootstrap import cluster_sandwich
 from hvdc_ident.fit.per_experiment import half_width, spread
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.simulator import ModelSimulator

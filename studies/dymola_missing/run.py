@@ -27,7 +27,7 @@ from hvdc_ident import load_study, simulate  # noqa: E402
 from hvdc_ident.discrepancy import Options, diagnose  # noqa: E402
 from hvdc_ident.experiment import Experiment  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
-from hvdc_ident.model.definition import Model  # noqa: E402
+from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402
 from hvdc_ident.trajectory import Trajectory  # noqa: E402
 

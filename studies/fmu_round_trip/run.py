@@ -25,8 +25,7 @@ from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.files import json_text, write_text
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.linearize import linearize
-from hvdc_ident.model import Model
-from hvdc_ident.model.card import save_card
+from hvdc_ident.model import Model, save_card
 from hvdc_ident.models import load_model, shipped_models
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.pipeline import run_stage

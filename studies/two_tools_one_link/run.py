@@ -28,8 +28,7 @@ from hvdc_ident.experiment import Experiment, InputSignal, experiment  # noqa: E
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.formats import read_waveforms  # noqa: E402
 from hvdc_ident.frozen import FrozenMap  # noqa: E402
-from hvdc_ident.model import read_card  # noqa: E402
-from hvdc_ident.model.definition import Model  # noqa: E402
+from hvdc_ident.model import Model, read_card  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402
 from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402
 from hvdc_ident.trajectory import Array, Trajectory  # noqa: E402

@@ -25,7 +25,7 @@ from common.work import processes  # noqa: E402
 from hvdc_ident.experiment import Experiment, InputSignal, experiment  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.frozen import FrozenMap  # noqa: E402
-from hvdc_ident.model.definition import Model  # noqa: E402
+from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.models import load_model, vsc_hvdc_avm  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402
 from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402

@@ -8,8 +8,7 @@ from cases import FREE, TIME, TRUE, experiments, model
 from meters import filtered
 
 from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.model import Model, parse_card
-from hvdc_ident.model.card import write_card
+from hvdc_ident.model import Model, parse_card, write_card
 
 
 def polynomials(told: str) -> list[list[float]]:

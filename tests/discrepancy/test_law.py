@@ -18,11 +18,9 @@ from hvdc_ident.discrepancy.outside.law import _levels, law
 from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.trials.library import hats
 from hvdc_ident.discrepancy.trials.state import Search
-from hvdc_ident.expression.functions import symbol
-from hvdc_ident.expression.parser import parse
+from hvdc_ident.expression import parse, symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model import Model, parse_card
-from hvdc_ident.model.card import write_card
+from hvdc_ident.model import Model, parse_card, write_card
 from hvdc_ident.trajectory import Array
 
 Meter = Callable[[dict[str, Array]], Array]

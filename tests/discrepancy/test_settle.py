@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial, clear
 from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.transform import home
+from hvdc_ident.model import insertion_point_of
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_what_could_not_be_looked_for_again_stays_and_is_told(first: Refit, monk
     ],
 )
 def test_the_slot_that_a_name_was_made_at(slots: str, name: str, found: str) -> None:
-    assert home(slots.split(), name) == found
+    assert insertion_point_of(slots.split(), name) == found
 
 
 def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Refit) -> None:

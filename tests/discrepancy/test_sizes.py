@@ -10,7 +10,7 @@ from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.discrepancy.findings.sizes import size_curves
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from hvdc_ident.trajectory import Trajectory
 
 LOOP = parse_card("""

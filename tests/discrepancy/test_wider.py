@@ -28,7 +28,7 @@ from hvdc_ident.discrepancy.trials.select import Pick, Trial, clear
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import Probe
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.trajectory import Array
 
 PERIOD = 0.033

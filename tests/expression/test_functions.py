@@ -10,8 +10,7 @@ import pytest
 import sympy as sp
 
 import hvdc_ident as hi
-from hvdc_ident.expression import functions, parse, symbol, to_text
-from hvdc_ident.expression.functions import FUNCTIONS, GrammarFunction
+from hvdc_ident.expression import FUNCTIONS, GrammarFunction, functions, parse, symbol, to_text
 from hvdc_ident.fmu.export.modelica_text import Printer
 from hvdc_ident.linearize.system import evaluate
 from hvdc_ident.simulate.graph import Graph

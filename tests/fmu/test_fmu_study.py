@@ -11,7 +11,7 @@ from c_models import TWIN, spring
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
-from hvdc_ident.model.card import save_card
+from hvdc_ident.model import save_card
 
 pytestmark = needs_compiler
 

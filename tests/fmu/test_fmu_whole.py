@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free
 from hvdc_ident.fmu.export import export_fmu
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from hvdc_ident.trajectory import Trajectory
 
 pytestmark = needs_compiler

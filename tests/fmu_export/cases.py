@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hvdc_ident.model import Model
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import Model, parse_card
 from hvdc_ident.models import load_model
 
 ZOO = """

@@ -97,7 +97,7 @@ def test_the_start_may_be_numbers():
 def test_a_function_without_a_word_is_named():
     import sympy as sp
 
-    from hvdc_ident.expression.functions import symbol
+    from hvdc_ident.expression import symbol
 
     model = Model(name="odd", inputs={"u": 1.0}, outputs={"y": sp.besselj(0, symbol("u"))})
     with pytest.raises(ExpressionError, match="besselj"):

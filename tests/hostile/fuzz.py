@@ -25,7 +25,7 @@ import numpy as np
 from hvdc_ident.errors import InputError
 from hvdc_ident.expression import parse
 from hvdc_ident.formats import formats, read_waveforms
-from hvdc_ident.model.card import read_card, write_card
+from hvdc_ident.model import read_card, write_card
 from hvdc_ident.models import load_model
 from hvdc_ident.study.study import load_study
 

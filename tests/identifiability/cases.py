@@ -6,7 +6,7 @@ import numpy as np
 
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.experiment import InputSignal, experiment
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import simulate
 from hvdc_ident.trajectory import trajectory

@@ -17,7 +17,7 @@ from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.combinations import held_of
 from hvdc_ident.identifiability.local_rank import local_rank
 from hvdc_ident.identifiability.structure import numerical_structure, structure
-from hvdc_ident.model.definition import Delay, Model, Sampled
+from hvdc_ident.model import Delay, Model, Sampled
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from tests.fit.simulators import Closed, Run

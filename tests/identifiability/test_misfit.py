@@ -13,7 +13,7 @@ from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.study.stages.identify import told
 from tests.fit.simulators import recorded

@@ -10,7 +10,7 @@ import pytest
 from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.identifiability import gated_fit, identifiability
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from tests.fit.simulators import recorded

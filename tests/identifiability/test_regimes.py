@@ -10,7 +10,7 @@ import pytest
 from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free
 from hvdc_ident.identifiability import identifiability
-from hvdc_ident.model.definition import Model, State
+from hvdc_ident.model import Model, State
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import recorded
 

@@ -5,12 +5,11 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, UnknownNameError
-from hvdc_ident.expression import parse
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import parse, symbol
 from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import find_operating_point, jacobian_error, linearize, one_sided, point_at
 from hvdc_ident.linearize.system import system
-from hvdc_ident.model.definition import Algebraic, Model, Output, Signal, State
+from hvdc_ident.model import Algebraic, Model, Output, Signal, State
 from hvdc_ident.models import load_model, shipped_models
 from hvdc_ident.parameters import Input, Parameter
 from tests.effort import calls

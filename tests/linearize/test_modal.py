@@ -10,7 +10,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.locus import match, root_locus
 from hvdc_ident.linearize.modal import gradient_of
-from hvdc_ident.model.definition import Model, Output, State
+from hvdc_ident.model import Model, Output, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
 from tests.effort import calls

@@ -9,7 +9,7 @@ from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.linearize import find_operating_point
 from hvdc_ident.linearize.impedance import Port, port_admittance, port_impedance
 from hvdc_ident.linearize.open_loop import signal_value
-from hvdc_ident.model.definition import Model, Output, Signal, State
+from hvdc_ident.model import Model, Output, Signal, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
 

@@ -14,7 +14,7 @@ from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, p
 from hvdc_ident.linearize.distance import gap, nu_gap
 from hvdc_ident.linearize.norms import h2_norm, hinf_norm
 from hvdc_ident.linearize.stability_margins import margins
-from hvdc_ident.model.definition import Model, Output, Signal, State
+from hvdc_ident.model import Model, Output, Signal, State
 from hvdc_ident.parameters import Input, Parameter
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import pytest
 
 from hvdc_ident.expression import parse
-from hvdc_ident.model.definition import Model, Output, State
+from hvdc_ident.model import Model, Output, State
 from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
 
 

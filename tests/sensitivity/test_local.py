@@ -12,8 +12,7 @@ import hvdc_ident
 from hvdc_ident.errors import UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.linearize import find_operating_point, linearize
-from hvdc_ident.model.card import parse_card
-from hvdc_ident.model.definition import Model, Sampled
+from hvdc_ident.model import Model, Sampled, parse_card
 
 mpl.use("Agg")
 CARD = """

@@ -15,7 +15,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.expression import parse
-from hvdc_ident.model.definition import Algebraic, Model, Output, State
+from hvdc_ident.model import Algebraic, Model, Output, State
 from hvdc_ident.sensitivity.rank.equations import Equations, EquationSource
 from hvdc_ident.sensitivity.rank.rings import PRIMES, HighPrecision, NoSuchNumber, PrimeField, context, numerator, roots
 from hvdc_ident.sensitivity.rank.taylor import Taylor

@@ -10,7 +10,7 @@ import pytest
 
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.experiment import experiment
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from hvdc_ident.sensitivity.global_screening import morris, sobol
 
 mpl.use("Agg")

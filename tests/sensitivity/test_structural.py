@@ -10,7 +10,7 @@ import pytest
 from hvdc_ident.errors import InputError, UnknownNameError
 from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.expression import parse
-from hvdc_ident.model.definition import Algebraic, Delay, Model, Output, Signal, State
+from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
 from hvdc_ident.models import load_model
 from hvdc_ident.sensitivity import structural
 from hvdc_ident.sensitivity.rank.rings import NotRational

@@ -9,7 +9,7 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 
 
 class root_of(sp.Function):

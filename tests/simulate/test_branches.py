@@ -14,7 +14,7 @@ from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.experiment import experiment
 from hvdc_ident.linearize import linearize
-from hvdc_ident.model.card import parse_card, write_card
+from hvdc_ident.model import parse_card, write_card
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.steady_state import equilibria, with_guesses
 

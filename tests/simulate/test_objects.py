@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.experiment import InputSignal, experiment
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import Engine, Tolerance, entries, machine, objects, simulate
 from hvdc_ident.simulate.integrators import integrators

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.experiment import InputSignal, experiment
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import simulate
 
 CARD = """

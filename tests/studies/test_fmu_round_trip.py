@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hvdc_ident.fmu.export import build
-from hvdc_ident.model.card import parse_card
+from hvdc_ident.model import parse_card
 from tests.studies.study_module import expected, load
 
 STUDY, KNOWN = load("fmu_round_trip"), expected("fmu_round_trip")

@@ -16,7 +16,7 @@ from hvdc_ident.notebook import Table as TextTable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from hvdc_ident.model.external import AnyModel
+    from hvdc_ident.model import AnyModel
 
 Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
 AUGMENTED = "augmented-model.toml"

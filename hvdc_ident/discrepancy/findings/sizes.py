@@ -11,7 +11,7 @@ from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.words import quantity
 

@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array

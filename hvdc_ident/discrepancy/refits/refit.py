@@ -20,8 +20,7 @@ from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.trajectory import Array
 

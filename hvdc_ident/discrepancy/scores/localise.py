@@ -13,8 +13,7 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.transform import slot
+from hvdc_ident.model import Model, insertion_point
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
@@ -220,4 +219,4 @@ def _even(e: Experiment, output: str) -> tuple[Array, Array]:
 def _is_inner(model: Model, name: str) -> bool:
     """Whether a recorded output is a signal of the model, not a mere output or an input."""
     inner = name in model.signals or name in model.algebraic or name in model.states
-    return inner and slot(model, name)[0] != "input"
+    return inner and insertion_point(model, name)[0] != "input"

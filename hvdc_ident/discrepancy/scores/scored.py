@@ -24,8 +24,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.residual import Block, Treatment
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.trajectory import Array
 
 Path = Along | Ends

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.trials.select import Pick
 from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 Views = Callable[[], Sequence[View]]
 """The models that are looked at, worked out when they are asked for first."""

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from hvdc_ident.discrepancy.signatures.march import hold, march
 from hvdc_ident.effects import Effect, EffectUse, alone
 from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.expression.functions import FUNCTIONS, symbol
+from hvdc_ident.expression import FUNCTIONS, symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.check import ordered_signals
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model, ordered_signals
 from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function

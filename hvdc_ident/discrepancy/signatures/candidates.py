@@ -23,9 +23,7 @@ from hvdc_ident.effects import (
 )
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model
-from hvdc_ident.model.external import AnyModel
-from hvdc_ident.model.transform import slot as slot_of
+from hvdc_ident.model import AnyModel, Model, insertion_point
 from hvdc_ident.trajectory import Array
 
 Signals = Mapping[str, tuple[Array, ...]]
@@ -191,7 +189,7 @@ def kind_of(model: AnyModel, place: str) -> str:
     Raises UnknownNameError for a place that is no slot.
     """
     if isinstance(model, Model):
-        return slot_of(model, place)[0]
+        return insertion_point(model, place)[0]
     if place in model.inputs:
         return "input"
     if place.removeprefix("outputs.") in model.outputs:

@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.signatures.grid import instants
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import External
+from hvdc_ident.model import External
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.trajectory import Array
 

@@ -17,10 +17,9 @@ from hvdc_ident.discrepancy.signatures.grid import instants
 from hvdc_ident.discrepancy.signatures.kernel import propagate
 from hvdc_ident.discrepancy.signatures.tangent import Partials, Tangent, tangent
 from hvdc_ident.experiment import Experiment
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Output
-from hvdc_ident.model.transform import slot
+from hvdc_ident.model import Model, Output
 from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.recording import with_recording
 from hvdc_ident.trajectory import Array
@@ -275,4 +274,4 @@ def _memory(parts: Tangent, plant: Model, time: Array, p: Array) -> tuple[NDArra
     return before, share
 
 
-__all__ = ["Along", "along", "places", "slot"]
+__all__ = ["Along", "along", "places"]

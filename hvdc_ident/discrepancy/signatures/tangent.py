@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.expression.functions import symbol
-from hvdc_ident.model.definition import Model
+from hvdc_ident.expression import symbol
+from hvdc_ident.model import Model
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, Function

@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.trials.select import Pick
 from hvdc_ident.effects import effects
 from hvdc_ident.fit import Free
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Array
 

@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.trials.select import Pick, Trial
 from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 
 RACE = Race()
 HEAT = Race(sprint=5, reach=0.4, second=20)

@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.external import AnyModel
+from hvdc_ident.model import AnyModel
 from hvdc_ident.trajectory import Array
 
 

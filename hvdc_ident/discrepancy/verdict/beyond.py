@@ -23,7 +23,7 @@ from hvdc_ident.discrepancy.trials.select import Trial
 from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import ModelError
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 TRIED = 6
 """Formulas, the best by regression, that are refitted."""

@@ -17,7 +17,7 @@ from hvdc_ident.fmu.export import build
 from hvdc_ident.fmu.export.description import KINDS, build_description, description
 from hvdc_ident.fmu.export.program import Program, tableau
 from hvdc_ident.fmu.export.variables import Variables
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 VERSIONS = ("2.0", "3.0")
 _SHARED = (

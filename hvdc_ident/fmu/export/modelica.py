@@ -7,12 +7,12 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.files import write_text
 from hvdc_ident.fmu.export.description import SI
 from hvdc_ident.fmu.export.modelica_text import Printer, identifier
 from hvdc_ident.fmu.export.program import Program
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 
 
 def save_modelica(model: Model, path: str | Path) -> Path:

@@ -9,7 +9,7 @@ import sympy as sp
 from sympy.logic.boolalg import And, Not, Or
 
 from hvdc_ident.errors import ExpressionError
-from hvdc_ident.expression.functions import clip, elementary
+from hvdc_ident.expression import clip, elementary
 
 KEYWORDS = frozenset(
     """algorithm and annotation assert block break class connect connector constant constrainedby der discrete each else

@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fmu.export import text
-from hvdc_ident.model.definition import Model
+from hvdc_ident.model import Model
 from hvdc_ident.simulate import tableaus
 from hvdc_ident.simulate.elimination import Elimination
 from hvdc_ident.simulate.engine import engine

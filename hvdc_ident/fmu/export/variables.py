@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
-from hvdc_ident.expression.functions import symbol
+from hvdc_ident.expression import symbol
 from hvdc_ident.fmu.export.program import Program
 
 

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import InputError, SteadyStateError, unknown_name
-from hvdc_ident.expression.functions import FUNCTIONS
-from hvdc_ident.model.definition import Model
+from hvdc_ident.expression import FUNCTIONS
+from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.rank.rings import Array, NotRational
 from hvdc_ident.simulate.engine import engine
 from hvdc_ident.simulate.graph import Graph

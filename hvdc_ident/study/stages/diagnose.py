@@ -23,7 +23,7 @@ class NothingIdentified(ComputationError):
 def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.discrepancy.findings.sizes import size_curves
-    from hvdc_ident.model.definition import Model
+    from hvdc_ident.model import Model
     from hvdc_ident.study.at_work import executor_of
 
     _need(study)

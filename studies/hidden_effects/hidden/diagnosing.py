@@ -21,8 +21,7 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model import Model
-from hvdc_ident.model.card import read_card
+from hvdc_ident.model import Model, read_card
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.trajectory import Trajectory
 

@@ -14,7 +14,7 @@ from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.model.definition import Model, Output
+from hvdc_ident.model import Model, Output
 from hvdc_ident.models import load_model
 from hvdc_ident.study.simulator import ModelSimulator
 from hvdc_ident.study.waveforms import Campaign, Noise, recorded
