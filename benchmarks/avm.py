@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.engine import Engine

@@ -20,15 +20,14 @@ from typing import Any
 import numpy as np
 import usage
 
+from hvdc_ident.data import Experiment, InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse
-from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.executors.local import LocalPool
-from hvdc_ident.trajectory import Trajectory
 
 ROWS, END, EVENT, NOISE = 1000, 0.999, 0.1, 1e-3
 HIDDEN = EffectUse("lag", ("Vdc1_m",), FrozenMap({"T": 0.005}))

@@ -21,7 +21,7 @@ import numpy as np
 import sympy as sp
 from numba import njit
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.engine import Tolerance, engine, simulate
@@ -203,7 +203,7 @@ def fresh_structure(slot):
 FIRST_RUN = f"""
 import numpy as np
 from hvdc_ident import load_model, simulate
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 inputs = {{n: InputSignal.step(*s) for n, s in {STEPS}.items()}}
 case = experiment("steps", np.linspace(0.0, 1.5, 3001), inputs)
 simulate(load_model("vsc-hvdc-link"), case, sensitivities={GAINS})

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu.export.fmu import export_fmu
 from hvdc_ident.fmu.host import Limits
 from hvdc_ident.fmu.model import FmuModel, read_fmu

@@ -21,7 +21,7 @@ from fmpy.fmi2 import FMU2Model
 from fmpy.fmi3 import FMU3Model
 from fmpy.simulation import instantiate_fmu, simulate_fmu
 
-from hvdc_ident.experiment import Experiment, InputSignal
+from hvdc_ident.data import Experiment, InputSignal
 from hvdc_ident.fmu.model import FmuModel, read_fmu
 from hvdc_ident.simulate.engine import Tolerance
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import Engine, simulate
 

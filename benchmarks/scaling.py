@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from usage import cpu_below, peak
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
 
 TERMINALS = (2, 4, 8, 16, 33, 66)

@@ -31,8 +31,8 @@ from hvdc_ident.api import (
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
+    from hvdc_ident.data import Experiment, InputSignal, Trajectory, multisine, ramp, step
     from hvdc_ident.discrepancy import Diagnosis
-    from hvdc_ident.experiment import Experiment
     from hvdc_ident.fit.result import FitResult
     from hvdc_ident.formats import read_waveforms
     from hvdc_ident.identifiability import IdentifiabilityReport
@@ -69,10 +69,8 @@ if TYPE_CHECKING:
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.sensitivity import SweepResult, linear_sensitivities, morris, sobol
-    from hvdc_ident.signals import InputSignal, multisine, ramp, step
     from hvdc_ident.simulate.result import Simulation
     from hvdc_ident.study.study import Study, load_study
-    from hvdc_ident.trajectory import Trajectory
 
     __version__: str
 
@@ -142,8 +140,8 @@ __all__ = [
 _imported = offered(
     __name__,
     {
+        "data": "Experiment InputSignal Trajectory multisine ramp step",
         "discrepancy": "Diagnosis",
-        "experiment": "Experiment",
         "fit.result": "FitResult",
         "formats": "read_waveforms",
         "identifiability": "IdentifiabilityReport",
@@ -154,10 +152,8 @@ _imported = offered(
         "models": "load_model",
         "parameters": "Input Parameter",
         "sensitivity": "SweepResult linear_sensitivities morris sobol",
-        "signals": "InputSignal multisine ramp step",
         "simulate.result": "Simulation",
         "study.study": "Study load_study",
-        "trajectory": "Trajectory",
     },
 )
 

@@ -18,9 +18,9 @@ import hvdc_ident.simulate  # noqa: F401
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from hvdc_ident.data import Array, Experiment, SignalLike
     from hvdc_ident.discrepancy import Diagnosis
     from hvdc_ident.executor import Executor, Progress
-    from hvdc_ident.experiment import Experiment, SignalLike
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.linearize import LinearModel, OperatingPoint
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from hvdc_ident.study.export import FmuOptions
     from hvdc_ident.study.study import Study
     from hvdc_ident.study.summary import Summary
-    from hvdc_ident.trajectory import Array
 
 Values: TypeAlias = "Mapping[str, float] | FitResult | None"
 Names: TypeAlias = "str | Iterable[str] | None"
@@ -73,7 +72,7 @@ def simulate(
     >>> run["Irorder2"].round(3).tolist()
     [0.4, 0.4, 0.495, 0.5, 0.5, 0.5]
     """
-    from hvdc_ident.experiment import Experiment
+    from hvdc_ident.data import Experiment
     from hvdc_ident.model import Model
     from hvdc_ident.simulate.engine import simulate as run
 
@@ -530,8 +529,8 @@ def _are_times(data: Any) -> bool:
 
 def _experiment(subject: Any, data: Any, inputs: Mapping[str, SignalLike] | None) -> Experiment:
     """Return the experiment that is meant, with these inputs in place of its own. Raises InputError."""
+    from hvdc_ident.data import Experiment
     from hvdc_ident.errors import InputError, unknown_name
-    from hvdc_ident.experiment import Experiment
     from hvdc_ident.study.study import Study
 
     if inputs is not None and not isinstance(inputs, Mapping):

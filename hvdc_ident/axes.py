@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
 
 LINE, MARK, HELD = "#1f5fa8", "#999999", "#b0b0b0"
 FINEST = 1e-4

@@ -155,7 +155,7 @@ def _end(code: int, message: str) -> NoReturn:
 
 def _pasteable(text: str, study: Path | None, out: Path | None, trust: bool) -> str:
     """The text with the commands in it as they are to be typed here, by the arguments of the command that says it."""
-    from hvdc_ident.words import with_study
+    from hvdc_ident.text import with_study
 
     options = [*(("--out", str(out)) if out else ()), *(("--trust",) if trust else ())]
     return text if study is None else with_study(text, str(study), *options)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.experiment import Experiment, InputSignal, experiment
+from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
 from hvdc_ident.files import json_text, write_text
 from hvdc_ident.fit import Free
 from hvdc_ident.fit.uncertainty import autocorrelation
@@ -27,7 +27,6 @@ from hvdc_ident.simulate import simulate
 from hvdc_ident.study.study import Study, load_study
 from hvdc_ident.study.sweeps import axes_of
 from hvdc_ident.study.tables import csv_text
-from hvdc_ident.trajectory import Array, trajectory
 
 REFERENCE = "vsc-hvdc-avm"  # the switch: any model with the link's names
 OUTPUT = "Irorder1"

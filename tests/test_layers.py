@@ -11,9 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-errors lazy executor files frozen words units notebook parameters trajectory axes signals waveform experiment phases
-phasors expression model effects models formats simulate fmu linearize sensitivity fit identifiability discrepancy
-report study api cli
+errors lazy executor files immutable text display data parameters axes expression model effects models formats simulate
+fmu linearize sensitivity fit identifiability discrepancy report study api cli
 """.split()  # noqa: SIM905 - one list of words, read as such
 
 # Rooms with rooms inside, and the order of those.

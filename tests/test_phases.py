@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvdc_ident.data import Trajectory
+from hvdc_ident.data.phases import PhaseFilter, quantities
 from hvdc_ident.errors import InputError
-from hvdc_ident.phases import PhaseFilter, quantities
-from hvdc_ident.trajectory import Trajectory
 
 F = 50.0
 V, I, PHI, START = 325.0, 10.0, 0.6, 0.4

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hvdc_ident.errors import InputError, UnknownNameError, WaveformError
-from hvdc_ident.formats import write_csv
-from hvdc_ident.phasors import (
+from hvdc_ident.data import Trajectory, trajectory
+from hvdc_ident.data.phasors import (
     PhasorColumns,
     PhasorSettings,
     frequency_noise,
@@ -17,9 +16,10 @@ from hvdc_ident.phasors import (
     sliding_frequency,
     unwrapped,
 )
+from hvdc_ident.errors import InputError, UnknownNameError, WaveformError
+from hvdc_ident.formats import write_csv
 from hvdc_ident.study.study import load_study
 from hvdc_ident.study.summary import summary, summary_text
-from hvdc_ident.trajectory import Trajectory, trajectory
 
 TIME = np.arange(101) * 0.02
 VOLTAGE, CURRENT = PhasorColumns(("U",), ("U ang",)), PhasorColumns(("I",), ("I ang",))

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from hvdc_ident.units import conversion, is_unit, same_unit, seconds_of
+from hvdc_ident.data import conversion, is_unit, same_unit, seconds_of
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hvdc_ident.data import (
+    InputSignal,
+    event_time,
+    input_signal,
+    noise_estimate,
+    noise_floor,
+    pre_event_ar,
+    row_scatter,
+)
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.experiment import InputSignal
-from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor, pre_event_ar, row_scatter
 
 T = np.arange(501) * 1e-3
 

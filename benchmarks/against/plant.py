@@ -9,14 +9,13 @@ import engine as link_bench  # of the folder above
 import numpy as np
 from numba import njit
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.engine import engine, simulate
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.simulate.structure import NAMES
-from hvdc_ident.trajectory import Trajectory
 
 RTOL = 1e-6
 STEP = (0.1, 1.0, 1.019)

@@ -8,7 +8,7 @@ from typing import Any
 import engine as link_bench  # of the folder above
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import Tolerance, simulate
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.findings.ambiguity import separating
 from hvdc_ident.discrepancy.findings.bode import responses
 from hvdc_ident.discrepancy.findings.explain import found_of
@@ -25,9 +26,8 @@ from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
 from hvdc_ident.discrepancy.verdict.lines import detectable, lines
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Simulator
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 

@@ -12,7 +12,7 @@ from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.effects.placing import EffectUse, apply, each_its_own, joined
 from hvdc_ident.effects.probing import Probe, SlotSignal, alone, clearance, probes, resistances, scanned, sources
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 
 __all__ = [

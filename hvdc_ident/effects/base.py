@@ -13,10 +13,10 @@ from typing import Literal, Protocol
 
 import sympy as sp
 
+from hvdc_ident.data import Array
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Delay, Model, Sampled, Signal, State, fresh
-from hvdc_ident.trajectory import Array
 
 SLOT_KINDS = ("input", "signal", "algebraic", "state", "output")
 FOLLOW = 2e-4

@@ -12,7 +12,7 @@ import sympy as sp
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.errors import InputError, ModelError, unknown_name
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, fresh, insertion_point, insertion_point_of, rewritten
 from hvdc_ident.parameters import Parameter
 

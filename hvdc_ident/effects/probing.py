@@ -26,13 +26,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.data import Array
 from hvdc_ident.effects.base import Effect, EffectParameter, Measure
 from hvdc_ident.effects.placing import EffectUse
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output, insertion_point
 from hvdc_ident.parameters import Input
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import sympy as sp
 
 from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter, Extent
 from hvdc_ident.expression import clip, where
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 BITS = 24
 """Levels from -2^(BITS - 1) to 2^(BITS - 1) steps; beyond, the last one holds, as in a converter."""

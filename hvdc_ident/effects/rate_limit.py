@@ -7,7 +7,7 @@ import sympy as sp
 
 from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
 from hvdc_ident.expression import clip
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:

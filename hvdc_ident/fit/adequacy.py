@@ -16,12 +16,12 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtri
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.noise import ESTIMATED, FLOOR, GIVEN, MISFIT, from_misfit, scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.weights import MAD
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 LEVEL = 1e-3
 """Chance of a verdict against the model or the noise where both are right, over all outputs together."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc, stdtrit
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.nuisance import observe, unknown_of
@@ -21,8 +22,7 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import compared_rows, per_deviation, stretches
 from hvdc_ident.fit.residual_tests import ljung_box
 from hvdc_ident.fit.result import FitResult
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
-from hvdc_ident.trajectory import Array
 
 FEWEST = 3
 """Fewer experiments have no scatter worth the name."""

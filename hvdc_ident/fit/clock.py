@@ -10,13 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.nuisance import TIME_SHIFT, unknown_of
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.starts import Optimum
-from hvdc_ident.trajectory import Array
 
 MOST = 80
 """Stretches that are tried in an experiment; of more, every so many."""

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import adequacy
@@ -30,8 +31,7 @@ from hvdc_ident.fit.rough import LUCK, Trend, residual_at, threshold_of, trend_o
 from hvdc_ident.fit.starts import DISTINCT, Optimum, best_first, distinct, latin_hypercube
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 STARTS = 8
 """Runs of a multistart, where nothing else is said."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.estimate import fit
@@ -18,7 +18,7 @@ from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual_tests import residual_tests
 from hvdc_ident.fit.result import Covariance, FitResult, Status
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
 

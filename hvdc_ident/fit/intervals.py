@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import stdtrit
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.nuisance import unit_of, unknown_of
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.uncertainty import Uncertainty
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.trajectory import Array
 
 ONE_SIDED = 1.353
 """Half the 90 % quantile of chi-square with one degree of freedom: the 95 % limit of a parameter on its bound."""

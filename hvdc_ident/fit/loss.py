@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)

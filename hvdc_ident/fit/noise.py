@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hvdc_ident.data import Experiment, noise_estimate, noise_floor, row_scatter
 from hvdc_ident.errors import StudyError
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.waveform import noise_estimate, noise_floor, row_scatter
 
 FLOOR = 1e-6
 """No standard deviation is below this share of an output's range."""

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.simulator import Simulator, WithInputs, WithStates
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.parameters import Input
-from hvdc_ident.trajectory import Array, Trajectory
 
 TIME_SHIFT = "time-shift"
 REACH = 0.2

@@ -9,10 +9,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.unknown import Coordinates, Free
-from hvdc_ident.trajectory import Array
 
 LONGEST = 10.0
 """A step changes a logarithm by at most this: no parabola holds over four decades, and on a plateau its minimum lies anywhere."""

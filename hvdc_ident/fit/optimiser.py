@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.trajectory import Array
 
 Outcome = Literal["converged", "max-evaluations", "stopped", "stalled", "flat", "failed"]
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.estimate import fit
@@ -17,7 +18,6 @@ from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.trajectory import Array
 
 
 def fit_each(

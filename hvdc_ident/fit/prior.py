@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import StudyError
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)

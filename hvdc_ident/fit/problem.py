@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.loss import LOSSES, Loss
 from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
 from hvdc_ident.fit.nuisance import unknown_of, unknowns
@@ -24,8 +24,7 @@ from hvdc_ident.fit.spectrum import Band
 from hvdc_ident.fit.unknown import Coordinates, Free
 from hvdc_ident.fit.unsettled import centred, loose_states, recentred
 from hvdc_ident.fit.whitening import AR
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.objective import Objective, Reached, descend
@@ -29,8 +30,7 @@ from hvdc_ident.fit.profile_walk import (
 )
 from hvdc_ident.fit.rough import Trend
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 __all__ = [
     "ONE_SIDED",

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.objective import Objective, Reached, descend
-from hvdc_ident.trajectory import Array
 
 JOINT = 2.996
 """Rise of the cost on the border of a joint 95 % region of two parameters: half the chi-square quantile, 2 degrees."""

@@ -16,10 +16,10 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.objective import LONGEST, Reached
 from hvdc_ident.fit.unknown import Coordinates, Free
-from hvdc_ident.trajectory import Array
 
 TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""

@@ -9,16 +9,15 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, StudyError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band, transformed
 from hvdc_ident.fit.unsettled import freed
 from hvdc_ident.fit.whitening import AR, GAP, segments, whitened
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 LARGEST = 1e100
 """Residuals and derivatives beyond this leave the range of floats (1e308) once products of two are scaled and summed: no

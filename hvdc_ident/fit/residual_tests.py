@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.fit.residual import Block
-from hvdc_ident.trajectory import Array
 
 
 def residual_tests(blocks: Sequence[Block], experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:

@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hvdc_ident.data import Array
+from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.fit.adequacy import Adequacy
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import Shown, Table, axes_of, data_frame
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 NOT_ASKED = "not a candidate"
 """The reason of a parameter that is held because nobody asked for it."""

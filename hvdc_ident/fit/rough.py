@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.simulator import approximate
 from hvdc_ident.fit.uncertainty import SINGULAR
-from hvdc_ident.trajectory import Array
 
 TWO_SIDED = 1.92
 """Rise of the cost at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""

@@ -13,8 +13,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.rounded import log_chances, residuals
-from hvdc_ident.trajectory import Array
 
 REACH = 10.0
 """Standard deviations beyond half a step to which the mean of g^2 is integrated."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError
 from hvdc_ident.fit.optimiser import OptimiserResult, Outcome
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.trajectory import Array
 
 
 class BudgetSpentError(Exception):

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR
-from hvdc_ident.trajectory import Array, Trajectory
 
 
 class Simulation(Protocol):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit.whitening import segments
-from hvdc_ident.trajectory import Array
 
 Band = tuple[float, float]
 

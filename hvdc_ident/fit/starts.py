@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.trajectory import Array
 
 DISTINCT = 1.92
 """Half the 95 % quantile of chi-square with one degree of freedom: costs that differ by less are as good."""

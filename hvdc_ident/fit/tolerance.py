@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hvdc_ident.errors import StudyError, unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 WINDOWS = ("before", "during", "after")
 ERRORS = ("max", "mean", "mean_absolute")

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import solve_banded
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.noise import MISFIT
 from hvdc_ident.fit.problem import stacked
 from hvdc_ident.fit.residual import Block
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.rough import Trend

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import StudyError
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.trajectory import Array
 
 LOG_FROM = 10.0
 """From this ratio of bounds on, a positive unknown is scaled by its logarithm."""

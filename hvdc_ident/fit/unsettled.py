@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.fit.nuisance import TIME_SHIFT, observe
 from hvdc_ident.fit.simulator import Simulator, WithStates
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.residual import Block

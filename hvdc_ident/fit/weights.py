@@ -8,14 +8,14 @@ from typing import Literal
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, unknown_name
 from hvdc_ident.fit.noise import MISFIT, floor_of, source_of
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.starts import Optimum, best_first, distinct
 from hvdc_ident.fit.whitening import autoregression, before_event
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 Whiten = Literal["no", "pre-event", "residual"]
 WHITEN = ("no", "pre-event", "residual")

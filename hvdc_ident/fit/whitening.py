@@ -11,9 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import StudyError
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.trajectory import Array
 
 AR = tuple[float, ...]
 MOST = 8

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.tolerance import WINDOWS, Profile
-from hvdc_ident.trajectory import Array
 
 Span = tuple[float, float]
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from fmpy.fmi1 import FMICallException
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import REAL, Description, Variable
 from hvdc_ident.fmu.messages import NOW, START, STOP, no_progress
-from hvdc_ident.trajectory import Array
 
 Failure = FMICallException
 """Raised by a call that returned discard, error or fatal; `.function`, `.status`."""

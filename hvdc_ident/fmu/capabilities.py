@@ -21,7 +21,7 @@ from hvdc_ident.fmu.description import (
     platforms,
     read_description,
 )
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
@@ -260,7 +260,7 @@ def _words(look: Callable[[FmuModel, Capabilities], str], model: FmuModel, found
 
 def _two_runs(model: FmuModel, found: Capabilities) -> str:
     """Return whether a second run equals the first."""
-    from hvdc_ident.experiment import experiment
+    from hvdc_ident.data import experiment
 
     if not model.outputs:
         return ""

@@ -20,12 +20,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.binding import DISCARD, ERROR, Ended, Failure, Vector
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
 from hvdc_ident.fmu.restart import SAME, apart, moving
 from hvdc_ident.fmu.signals import Signals
-from hvdc_ident.trajectory import Array
 
 EARLY = 10_000  # early returns in one communication step
 TRIAL = 300  # rows of a trial from the first change of an input on: solvers' own steps may be tens of rows long

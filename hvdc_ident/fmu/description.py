@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier, first_bytes, machine_of
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 Interface = Literal["model-exchange", "co-simulation"]
 INTERFACES: tuple[Interface, ...] = ("model-exchange", "co-simulation")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
 
 SHORT = 1e-3  # step of the differences that show the noise, in sizes of the parameter: as long as those of a search
 FARTHER = 4.0  # the second pair's step, in those of the first

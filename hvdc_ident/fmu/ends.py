@@ -17,18 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fmu.grid import joined, kept_rows, refined, signal_of
 from hvdc_ident.fmu.passage import ALONG, added, entrance, exit_
 from hvdc_ident.fmu.run import Direction, bare, changed, inputs_of
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.engine import simulate as engine_run
 from hvdc_ident.simulate.recording import chains_of
 from hvdc_ident.simulate.result import Simulation
-from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel

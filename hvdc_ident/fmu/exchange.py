@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.binding import DISCARD, Block, Failure
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
 from hvdc_ident.fmu.signals import Moving, Signals
 from hvdc_ident.fmu.tangent import Tangent
-from hvdc_ident.trajectory import Array
 
 MOST_STEPS = 200_000
 MOST_EVENTS = 100_000

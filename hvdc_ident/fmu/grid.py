@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.experiment import InputSignal
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array, InputSignal
 
 FIRST = 256  # intervals to begin with
 HOLDS = 1e-5  # of the signal's range: what lines may be off by

@@ -27,13 +27,13 @@ from threading import Lock
 from typing import IO, Any
 
 import hvdc_ident
+from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, unknown_name
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
 from hvdc_ident.fmu.folder import Folder, joined
 from hvdc_ident.fmu.folder import unpacked as new_folder
 from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_file, progress_in, unpacked
-from hvdc_ident.trajectory import Array
 
 Answer = tuple[dict[str, Any], dict[str, Array]]
 PATIENCE = 5.0  # s for the supervisor to tell how a worker ended, of which it needs a few milliseconds

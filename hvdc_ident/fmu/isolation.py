@@ -10,9 +10,9 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.messages import packed, unpacked
 from hvdc_ident.fmu.plant import RunFailed, failure
-from hvdc_ident.trajectory import Array
 
 Part = tuple[dict[str, Any], dict[str, Array]]
 """A heading and arrays."""

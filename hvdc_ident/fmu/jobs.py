@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu import co_simulation, exchange
 from hvdc_ident.fmu.binding import Block, Failure
 from hvdc_ident.fmu.description import Description
@@ -19,7 +20,6 @@ from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed, failure
 from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moving
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.fmu.tangent import Point, Tangent
-from hvdc_ident.trajectory import Array
 
 KEPT_STEPS = 1000
 Answer = tuple[dict[str, Any], dict[str, Array]]

@@ -13,7 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
 
 PROCESS, BEGAN, START, STOP, NOW = range(5)
 """Places in `progress`: the process that has the FMU, when its run began (s of the monotonic clock), and of the run the

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.effects.placing import EffectUse
 from hvdc_ident.errors import ModelError, unknown_name
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import digest
 from hvdc_ident.fmu.description import Description, Interface, Variable, read_description
 from hvdc_ident.fmu.host import Host, Limits
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Output
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Tolerance

@@ -12,7 +12,7 @@ from hvdc_ident.effects import EffectUse, effects, joined
 from hvdc_ident.effects.placing import apply
 from hvdc_ident.errors import InputError, ModelError, unknown_name
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.parameters import Input, Parameter
 

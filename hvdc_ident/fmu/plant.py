@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.binding import DISCARD, ERROR, FATAL, Binding, Block, Failure, Update, refusal
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.trajectory import Array
 
 TAKEN = 1e-6  # share by which a value may change as it is set: an FMU may keep it in single precision
 ITERATIONS = 1000  # of the discrete part at one instant

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import ModelError
 from hvdc_ident.fmu.model import FmuModel
 from hvdc_ident.fmu.run import about, changed
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.isolation import die_like, in_new_process
 from hvdc_ident.fmu.plant import Plant, RunFailed
-from hvdc_ident.trajectory import Array
 
 Way = Literal["reset", "instance", "process"]
 Make = Callable[[dict[str, Any]], Plant]

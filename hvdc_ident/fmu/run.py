@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, unknown_name
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fmu.signals import Signals
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.result import Simulation, Statistics
-from hvdc_ident.trajectory import Array, Trajectory
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array, InputSignal
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fmu.binding import Failure, Vector
 from hvdc_ident.fmu.plant import Plant, RunFailed
-from hvdc_ident.trajectory import Array
 
 STEP = float(np.cbrt(np.finfo(float).eps))  # of a central difference, in sizes of the variable
 AGREES = 1e-5  # of a row's largest entry: directional derivatives that differ by more from differences are not used

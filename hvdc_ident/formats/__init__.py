@@ -22,9 +22,8 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Trajectory, scaled
 from hvdc_ident.errors import InputError, WaveformError, unknown_name
-from hvdc_ident.trajectory import Array, Trajectory
-from hvdc_ident.units import scaled
 
 __all__ = [
     "MAX_BYTES",

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hvdc_ident.data import Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats._columns import damaged
-from hvdc_ident.trajectory import Origin, Trajectory
 
 START = 20.0  # s for a process to begin and a small file to be read
 RATE = 5e6  # bytes a second, at least

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import MAX_BYTES
-from hvdc_ident.trajectory import Array, Trajectory
 
 TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo", "time_s", "t_s")
 """What a time vector is called, lower case, in the order of preference."""

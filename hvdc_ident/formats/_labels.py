@@ -6,8 +6,8 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
+from hvdc_ident.data import is_unit
 from hvdc_ident.formats import FORMULA_START
-from hvdc_ident.units import is_unit
 
 TIME_WORDS = (
     "time", "zeit", "temps", "tiempo", "tempo", "tijd", "timestamp", "zeitstempel", "datetime", "date/time", "date time",

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
 from hvdc_ident.formats._columns import check_size, damaged, own_names, package
-from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "comtrade"
 SUMMARY = "COMTRADE 1991, 1999 and 2013 of recorders and relays, ASCII, binary, float32, or all in one .cff"

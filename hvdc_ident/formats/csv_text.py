@@ -21,12 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import LONGEST, event_rows, once, pick
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
 from hvdc_ident.formats._labels import merged, names_and_units, time_column
-from hvdc_ident.trajectory import Array, Origin, Trajectory
-from hvdc_ident.units import scaled, seconds_of
 
 NAME = "csv"
 SUMMARY = (

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import MAX_BYTES, event_rows, pick
-from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "dymola-mat"
 SUMMARY = "result files of Dymola and OpenModelica (MATLAB v4)"

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
-from hvdc_ident.trajectory import Array, Trajectory
-from hvdc_ident.units import scaled, seconds_of
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"

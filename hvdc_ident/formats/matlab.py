@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._apart import read_apart
@@ -22,7 +23,6 @@ from hvdc_ident.formats._columns import check_size, damaged, joined, package, ti
 from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
 from hvdc_ident.formats.dymola_mat import matrices_of, starts_as_version_4
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
-from hvdc_ident.trajectory import Array, Trajectory
 
 NAME = "matlab"
 SUMMARY = "MATLAB and Simulink, versions 4 to 7.3: time vector, time in the first column, or structure with time"

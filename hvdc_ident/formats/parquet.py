@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Trajectory
 from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._columns import check_size, damaged, package, time_name
-from hvdc_ident.trajectory import Trajectory
 
 NAME = "parquet"
 SUMMARY = "Parquet tables with a column `time`"

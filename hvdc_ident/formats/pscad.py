@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import once, pick
 from hvdc_ident.formats._columns import check_size, damaged, own_names
-from hvdc_ident.trajectory import Array, Origin, Trajectory
 
 NAME = "pscad"
 SUMMARY = "PSCAD output: the .inf, with its numbered .out files beside it"

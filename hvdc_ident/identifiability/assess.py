@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.noise import unknown_noise
 from hvdc_ident.fit.profile import Walk
 from hvdc_ident.fit.simulator import inputs_of
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability import narrow, verdicts
 from hvdc_ident.identifiability.evidence import pair_of, thresholds, told_by_noise
 from hvdc_ident.identifiability.findings import Findings
@@ -26,6 +25,7 @@ from hvdc_ident.identifiability.recommend import Recommendation, recommend
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.structure import structure as structure_of
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.fisher import collinear_subsets
 from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities, sensitivities

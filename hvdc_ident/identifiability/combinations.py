@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
+from hvdc_ident.immutable import FrozenMap
 
 SMALL = 1e-2
 """Parts of a direction below this share of its largest are not members."""

@@ -9,17 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile
 from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.verdicts import Verdict
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.fisher import independent, pivoted_order, rise_over_range
-from hvdc_ident.trajectory import Array
 
 DRAWS = 999
 SCATTER = 0.1

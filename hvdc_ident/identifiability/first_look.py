@@ -10,11 +10,11 @@ import numpy as np
 
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.noise import from_misfit
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import combinations_of
 from hvdc_ident.identifiability.pilot import unfitted
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.fisher import independent, null_directions
-from hvdc_ident.words import listed, quantity
+from hvdc_ident.text import listed, quantity
 
 HALF_95 = 1.96
 """Half the width of a normal distribution's central 95 %, in standard deviations."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.fit import Estimate, FitResult, Problem
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 
 @dataclass(frozen=True)

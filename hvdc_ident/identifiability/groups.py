@@ -7,16 +7,16 @@ from dataclasses import replace
 from functools import reduce
 from typing import Any
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import StudyError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.individual import Group, part_of
 from hvdc_ident.fit.simulator import Simulator
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.assess import identifiability
 from hvdc_ident.identifiability.heterogeneity import Misspecification
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structure import Structure
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 

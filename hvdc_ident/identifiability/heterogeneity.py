@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.uncertainty import score_covariance
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 LEVEL = 0.01
 TELLS = 0.01

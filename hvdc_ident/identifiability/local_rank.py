@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.starts import latin_hypercube
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, held_of
 from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR, null_directions
-from hvdc_ident.trajectory import Array
 
 METHOD = "numerical, local"
 POINTS = 5

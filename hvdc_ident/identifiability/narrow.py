@@ -9,11 +9,11 @@ from functools import partial
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import Profile, Profiles, Walk, profiles, trend_profiles
 from hvdc_ident.fit.rough import LUCK, Trend, roughness, trend_of
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability import verdicts
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
 from hvdc_ident.identifiability.evidence import (
@@ -32,6 +32,7 @@ from hvdc_ident.identifiability.optima import other_optima
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.fisher import (
     independent,
     inflation_index,
@@ -39,7 +40,6 @@ from hvdc_ident.sensitivity.fisher import (
     pivoted_order,
     rise_over_range,
 )
-from hvdc_ident.trajectory import Array
 
 WORTH = 0.02
 """A fall of the cost by less than this share of a threshold moves no interval: the walks of profiles restart from there too."""

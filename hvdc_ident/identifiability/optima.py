@@ -8,11 +8,11 @@ from itertools import combinations
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.objective import LeastSquares, Reached, descend
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.pilot import Optimum
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 TRIED = 6
 """At most so many exchanged points are begun from: about a third of what the profiles of as many parameters cost."""

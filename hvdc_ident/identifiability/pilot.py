@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
@@ -21,9 +22,8 @@ from hvdc_ident.fit.rough import Trend
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import misfit_weights
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.fisher import Information
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.frequency_data import in_time
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.advice import advice
 from hvdc_ident.identifiability.merit import Merit, half_widths, merit
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.trial import Move, Trial, double_trials, single_trials
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Input
-from hvdc_ident.trajectory import Array
 
 NEW_SIGNAL = 1.1
 """Recording another signal is advised only where it raises the smallest eigenvalue by more than this factor."""

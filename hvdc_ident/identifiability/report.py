@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import Profile
 from hvdc_ident.fit.profile_pair import PairProfile
 from hvdc_ident.fit.result import plain
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.heterogeneity import Heterogeneity, Misspecification
 from hvdc_ident.identifiability.optima import OtherOptimum
 from hvdc_ident.identifiability.recommend import Recommendation
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
-from hvdc_ident.notebook import Shown, Table, data_frame
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.fisher import Collinear
 from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
 

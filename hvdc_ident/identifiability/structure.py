@@ -8,12 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Experiment
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.frequency_data import in_time
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.local_rank import METHOD, local_rank
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.rank.invariants import StructuralCombination
 from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability

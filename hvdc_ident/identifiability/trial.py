@@ -8,9 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array, Experiment, InputSignal
+from hvdc_ident.immutable import FrozenMap
 
 Shape = Literal["step", "ramp", "multisine"]
 FACTORS = (1.0, -1.0, 2.0)

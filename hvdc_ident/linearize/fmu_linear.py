@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.errors import LinearizationError, ModelError, SimulationError, SteadyStateError, unknown_name
 from hvdc_ident.fmu.model import FmuModel
 from hvdc_ident.fmu.point import FmuPoint, at_point, smooth_inputs
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, newton
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.matrices import Array

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.display import data_frame
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.notebook import data_frame
 
 if TYPE_CHECKING:
     import xarray

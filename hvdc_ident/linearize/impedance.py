@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import LinearizationError, WaveformError, unknown_name
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import TIME, parse, symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, sensitivity
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel

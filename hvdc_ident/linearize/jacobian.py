@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delays import Blocks, DelayFree, channels
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel

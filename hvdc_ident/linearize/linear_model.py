@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delays import DelayFree
 from hvdc_ident.linearize.matrices import Array, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint
-from hvdc_ident.notebook import Shown, Table
 
 if TYPE_CHECKING:
     import control

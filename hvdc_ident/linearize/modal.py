@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.matrices import Array
 
 if TYPE_CHECKING:

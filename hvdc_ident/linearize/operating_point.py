@@ -10,14 +10,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hvdc_ident.display import table_html
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import ACCURACY, At, EquilibriumSearch, Root, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.modal import ZERO
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.notebook import table_html
 from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.display import axes_of
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.linearize.frequency import FrequencyResponse
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.modal import Mode
-from hvdc_ident.notebook import axes_of
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.locus import RootLocus

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.matrices import Array
 
 LARGEST = 50_000_000  # bytes

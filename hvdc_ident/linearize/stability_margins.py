@@ -11,7 +11,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.sparse.csgraph import connected_components
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.matrices import Array

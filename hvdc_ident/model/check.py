@@ -14,7 +14,7 @@ import sympy as sp
 
 from hvdc_ident.errors import InputError, ModelError, UnknownNameError, unknown_name
 from hvdc_ident.expression import EXACT, FUNCTIONS, is_identifier, is_reserved, normal, parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model.definition import Algebraic, Delay, Output, Parameterisation, Sampled, Signal, State
 from hvdc_ident.parameters import Input, Parameter
 

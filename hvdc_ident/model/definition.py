@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import sympy as sp
 
+from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import Shown, Table
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Input, Parameter
 
 if TYPE_CHECKING:
-    from hvdc_ident.experiment import Experiment
+    from hvdc_ident.data import Experiment
 
 Start: TypeAlias = sp.Expr | Literal["free"] | None
 

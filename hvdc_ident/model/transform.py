@@ -10,7 +10,7 @@ import sympy as sp
 
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model.definition import Model, ModelOrigin, Signal
 from hvdc_ident.parameters import Input, Parameter
 

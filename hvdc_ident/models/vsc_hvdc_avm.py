@@ -16,7 +16,7 @@ from typing import Literal
 
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.expression import parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
 from hvdc_ident.models.vsc_hvdc_link import physical
 from hvdc_ident.parameters import Input, Parameter

@@ -8,7 +8,7 @@ reactive power; positive power flows from a grid into its converter. Equations: 
 from __future__ import annotations
 
 from hvdc_ident.expression import parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Algebraic, Model, Output, Parameterisation, Signal, State
 from hvdc_ident.models._phasor_station import control_p, control_q, control_vdc, grid_impedance, plant
 from hvdc_ident.parameters import Input, Parameter

@@ -14,7 +14,7 @@ import re
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.expression import parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Algebraic, Model, Output, Signal, State
 from hvdc_ident.models._phasor_station import control_p, control_q, control_vdc, grid_impedance, plant
 from hvdc_ident.parameters import Input, Parameter

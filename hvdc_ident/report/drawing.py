@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

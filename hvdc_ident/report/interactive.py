@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
 
+from hvdc_ident.data import Array
 from hvdc_ident.report.html import text
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)

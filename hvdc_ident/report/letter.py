@@ -18,7 +18,7 @@ from hvdc_ident.files import write_text
 from hvdc_ident.report.drawing import AFTER, MEASURED, figure, svg, visible_rows
 from hvdc_ident.report.html import text
 from hvdc_ident.report.results import Results
-from hvdc_ident.words import form_of, listed, span
+from hvdc_ident.text import form_of, listed, span
 
 FILE = "letter.html"
 STAGE = "discrepancy"

@@ -12,7 +12,7 @@ from hvdc_ident.files import write_bytes, write_text
 from hvdc_ident.report.html import text
 from hvdc_ident.report.interactive import scripts
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.words import with_study
+from hvdc_ident.text import with_study
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 STYLE = """

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Trajectory
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import csv_name
-from hvdc_ident.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

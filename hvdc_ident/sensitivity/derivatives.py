@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import StudyError, unknown_name
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.engine import simulate
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray

@@ -13,8 +13,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
+from hvdc_ident.immutable import FrozenMap
 
 EQUAL = 1e-9
 """Share of the largest magnitude by which two entries of a direction differ and are still equal."""

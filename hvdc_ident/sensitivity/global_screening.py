@@ -14,15 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import ComputationError, InputError, StudyError
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.sensitivity.derivatives import table_text
 from hvdc_ident.sensitivity.sampling import Samples
 from hvdc_ident.sensitivity.sweep_run import sweep
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray

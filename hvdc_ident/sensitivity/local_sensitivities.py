@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.derivatives import (
     Ranges,
@@ -23,7 +23,6 @@ from hvdc_ident.sensitivity.derivatives import (
     table_text,
     trajectory_sensitivities,
 )
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, StudyError
-from hvdc_ident.trajectory import Array
 
 MOST = 10_000_000
 

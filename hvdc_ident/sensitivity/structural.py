@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hvdc_ident.errors import InputError, unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.fisher import leading
 from hvdc_ident.sensitivity.rank.equations import EquationSource, Start

@@ -12,6 +12,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import (
     ComputationError,
     HvdcIdentError,
@@ -20,12 +21,10 @@ from hvdc_ident.errors import (
     StudyError,
     unknown_name,
 )
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.sensitivity.sampling import Points
 from hvdc_ident.simulate.engine import Method, simulate
-from hvdc_ident.trajectory import Array
 
 DONE, FAILED = b"\x00", b"\x01"
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
+from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.files import csv_cell
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import Shown, Table, data_frame
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.sampling import Points, Samples
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     import xarray

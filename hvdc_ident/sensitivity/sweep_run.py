@@ -10,14 +10,13 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.executor import Executor, Progress, ends
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.sensitivity.sampling import AxesLike, Points, points_of
 from hvdc_ident.sensitivity.sweep_point import PointTask, Want, check, task_of
 from hvdc_ident.sensitivity.sweep_result import SweepResult
-from hvdc_ident.trajectory import Array
 
 CHUNK = 2048  # points looked up, queued or written at a time
 PROBE, WORTH = 0.3, 2.0  # s: points run here first; work left that is worth starting other processes for

@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
-from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate.integrators import integrators
 from hvdc_ident.simulate.kept import by_structure
@@ -23,7 +23,6 @@ from hvdc_ident.simulate.status import HINTS
 from hvdc_ident.simulate.status import NAMES as STATUS
 from hvdc_ident.simulate.steady_state import Equilibria
 from hvdc_ident.simulate.structure import NAMES, Structure, padded
-from hvdc_ident.trajectory import Array, Trajectory
 
 Method = Literal["auto", "explicit", "rosenbrock"]
 

@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 import llvmlite.binding as llvm
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.objects import compiled, kept, loaded
-from hvdc_ident.trajectory import Array
 
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
 LANES = 4  # instants that a function over several of them takes at once

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, SteadyStateError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.model import AnyModel, Model, State
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Tolerance, simulate

@@ -8,9 +8,9 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Experiment
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, fresh, rewritten
 from hvdc_ident.parameters import Parameter
 

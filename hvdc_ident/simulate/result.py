@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import Shown, Table
-from hvdc_ident.trajectory import Array, Trajectory
+from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
     import xarray

@@ -16,14 +16,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, blended
 from hvdc_ident.simulate.integrators import entry
 from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, evaluate
 from hvdc_ident.simulate.structure import ACCURACY, NAMES, TINY, Structure
-from hvdc_ident.trajectory import Array
 
 Branch = Literal["own", "unconnected"]
 

@@ -9,10 +9,10 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
+from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.errors import InputError, StudyError, unknown_name
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import FitResult, Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.impedance import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.models import is_shipped, load_model
@@ -21,7 +21,6 @@ from hvdc_ident.study.parse import checked, is_study
 from hvdc_ident.study.recordings import with_noise
 from hvdc_ident.study.study import Study, candidates_of, check_questions, load_study
 from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
-from hvdc_ident.trajectory import Trajectory
 
 ModelLike: TypeAlias = AnyModel | Study | str | Path
 """A model, a study's model, a shipped name, or the path of a model card, an FMU or a study."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import permutations
 from math import log, pi, sqrt
 
+from hvdc_ident.data import PREFIXED, PREFIXES, UNITS, conversion, same_unit
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.units import PREFIXED, PREFIXES, UNITS, conversion, same_unit
 
 SIGN_SHARE, OTHER_SHARE, BOTH_SHARE = 0.5, 0.4, 0.1
 """Prior probabilities, given that a channel is wrong: its sign (the commonest mistake), one of the other known

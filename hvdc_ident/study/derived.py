@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Trajectory
+from hvdc_ident.data.phases import PhaseFilter, quantities
+from hvdc_ident.data.phasors import PhasorColumns, PhasorSettings, frequency_noise, phasor_quantities
 from hvdc_ident.errors import InputError, StudyError
-from hvdc_ident.phases import PhaseFilter, quantities
-from hvdc_ident.phasors import PhasorColumns, PhasorSettings, frequency_noise, phasor_quantities
 from hvdc_ident.study import schema
-from hvdc_ident.trajectory import Trajectory
 
 
 def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[str]:

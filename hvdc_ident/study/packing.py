@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 PACKAGE = "hvdc_ident"
 _KIND = "!"

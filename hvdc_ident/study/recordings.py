@@ -9,18 +9,29 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hvdc_ident.data import (
+    Array,
+    Experiment,
+    InputSignal,
+    Origin,
+    Trajectory,
+    conversion,
+    event_time,
+    input_signal,
+    noise_estimate,
+    noise_floor,
+    same_unit,
+    scaled,
+    seconds_of,
+)
 from hvdc_ident.errors import InputError, StudyError, unknown_name
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.files import digest
 from hvdc_ident.fit.noise import FEWEST_QUIET
 from hvdc_ident.formats import files_of, read_waveforms
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.derived import raw_columns, with_derived
-from hvdc_ident.trajectory import Array, Origin, Trajectory
-from hvdc_ident.units import conversion, same_unit, scaled, seconds_of
-from hvdc_ident.waveform import event_time, input_signal, noise_estimate, noise_floor
 
 TIME_SHIFT = "time-shift"
 MEDIAN_EFFICIENCY = 0.37

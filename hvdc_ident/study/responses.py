@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, LinearizationError, SteadyStateError, StudyError, unknown_name
 from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse
 from hvdc_ident.linearize.impedance import MeasuredResponse, Port, response_at_tones, response_from_record
 from hvdc_ident.linearize.response_file import ResponseFile, read_response
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear_analysis import port_of
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study

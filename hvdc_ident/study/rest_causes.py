@@ -10,15 +10,14 @@ from itertools import combinations
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate.engine import engine
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.conversions import EXCHANGE_SHARE, LARGEST, Conversion, input_conversions
 from hvdc_ident.study.rest_comparison import FINEST, Comparison, apart, freed, run_of
-from hvdc_ident.trajectory import Array
 
 SCALE = math.log(1.0 / FINEST)
 """The range of a mismatch: its logarithm, from FINEST to 1."""

@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment, noise_floor, pre_event_ar
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.noise import MISFIT, source_of
 from hvdc_ident.fit.nuisance import observe, unknowns
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.conversions import Conversion
-from hvdc_ident.trajectory import Array
-from hvdc_ident.waveform import noise_floor, pre_event_ar
 
 FINEST = 1e-3
 """No model's level or movement is expected nearer to the plant's than this share, so a nearer match proves no more."""

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any
 
 from scipy.stats import norm
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Experiment
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.conversions import Conversion, conversions
 from hvdc_ident.study.rest_causes import POSITIVE, Cause, common_cause, exchanged, input_after_failure
 from hvdc_ident.study.rest_comparison import FINEST, NONE, Comparison, Record, freed, run_of
-from hvdc_ident.words import listed
+from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study

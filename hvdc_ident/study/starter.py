@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.files import write_text
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.model import Model
 from hvdc_ident.study.study import Study
 

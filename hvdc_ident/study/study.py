@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Experiment
+from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.errors import InputError, StudyError, unknown_name
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.impedance import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
-from hvdc_ident.notebook import Shown, Table, axes_of
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear_analysis import check_linear
 from hvdc_ident.study.parse import parse_study

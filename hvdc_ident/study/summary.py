@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from hvdc_ident.experiment import Experiment, recording_lines
+from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.recordings import noise_line
 from hvdc_ident.study.responses import described

@@ -10,10 +10,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.files import csv_cell
 from hvdc_ident.fit.residual import compared_rows
-from hvdc_ident.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.assessment import Curve

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import InputError, StudyError, unknown_name
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.study import schema
 

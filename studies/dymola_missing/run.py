@@ -24,12 +24,11 @@ from common.ending import markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
 from hvdc_ident import load_study, simulate  # noqa: E402
+from hvdc_ident.data import Experiment, Trajectory  # noqa: E402
 from hvdc_ident.discrepancy import Options, diagnose  # noqa: E402
-from hvdc_ident.experiment import Experiment  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402
-from hvdc_ident.trajectory import Trajectory  # noqa: E402
 
 STUDY = HERE.parent / "dymola_waveform" / "study.toml"
 DATA = HERE / "../../../shared/data/dymola/TwoNodePowerSystem.mat"

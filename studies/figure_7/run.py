@@ -15,7 +15,7 @@ sys.path.insert(0, str(HERE.parent))
 from common import ending, paper  # noqa: E402
 from common.ending import markdown, number  # noqa: E402
 
-from hvdc_ident.experiment import Experiment  # noqa: E402
+from hvdc_ident.data import Experiment  # noqa: E402
 from hvdc_ident.models import load_model  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402
 from hvdc_ident.study.waveforms import Campaign, Noise, recorded  # noqa: E402

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hvdc_ident.data import Experiment, InputSignal, experiment
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.experiment import Experiment, InputSignal, experiment
 from hvdc_ident.files import json_text, write_text
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.linearize import linearize

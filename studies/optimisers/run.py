@@ -16,11 +16,10 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident import load_model, simulate
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.optimisers import catalogue, is_global, optimiser
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import trajectory
 
 TRUE = {"KIP": 30.0, "KPP": 0.0, "KIQ": 30.0, "KPQ": 0.0, "KPVDC": 24.0, "KIVDC": 734.7}
 FREE = (

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.experiment import Experiment, InputSignal, experiment
+from hvdc_ident.data import Experiment, InputSignal, experiment
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate

@@ -17,14 +17,13 @@ import numpy as np
 from scipy.stats import binom
 
 from hvdc_ident import load_model, simulate
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.identifiability.evidence import thresholds
 from hvdc_ident.identifiability.pilot import pilot
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import trajectory
 
 TRUE = {"KPVDC": 24.0, "KIVDC": 734.7}
 FREE = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950))

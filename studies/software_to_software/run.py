@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, Trajectory, experiment, trajectory
 from hvdc_ident.formats import read_waveforms
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.trajectory import Trajectory, trajectory
 
 HERE = Path(__file__).resolve().parent
 DATA = HERE.parents[2] / "shared" / "data" / "dymola" / "TwoNodePowerSystem.mat"

@@ -18,12 +18,11 @@ sys.path.insert(0, str(HERE.parent))
 from common import ending, paper  # noqa: E402
 from common.ending import markdown, number  # noqa: E402
 
+from hvdc_ident.data import Array, Experiment  # noqa: E402
 from hvdc_ident.errors import SimulationError  # noqa: E402
-from hvdc_ident.experiment import Experiment  # noqa: E402
 from hvdc_ident.fit import Problem  # noqa: E402
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion  # noqa: E402
-from hvdc_ident.frozen import FrozenMap  # noqa: E402
-from hvdc_ident.trajectory import Array  # noqa: E402
+from hvdc_ident.immutable import FrozenMap  # noqa: E402
 
 SETUPS = {**{kind: (kind,) for kind in paper.CONTROLLERS}, "all three": tuple(paper.CONTROLLERS)}
 DATA = {"the link itself": paper.LINK, "the average-value link": paper.REFERENCE}

@@ -23,15 +23,14 @@ from common import diagnosing, ending  # noqa: E402
 from common.ending import markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory, experiment  # noqa: E402  # noqa: E402
 from hvdc_ident.discrepancy import Options, diagnose  # noqa: E402
-from hvdc_ident.experiment import Experiment, InputSignal, experiment  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.formats import read_waveforms  # noqa: E402
-from hvdc_ident.frozen import FrozenMap  # noqa: E402
+from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model, read_card  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402
 from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402
-from hvdc_ident.trajectory import Array, Trajectory  # noqa: E402
 
 DATA = HERE / "../../../shared/data/dynawo"
 EUROSTAG = {  # output of the card: file, column, by what it is divided to be per unit of 1000 MVA

@@ -22,9 +22,9 @@ from common import ending, paper  # noqa: E402
 from common.ending import markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
-from hvdc_ident.experiment import Experiment, InputSignal, experiment  # noqa: E402
+from hvdc_ident.data import Experiment, InputSignal, experiment  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
-from hvdc_ident.frozen import FrozenMap  # noqa: E402
+from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.models import load_model, vsc_hvdc_avm  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402

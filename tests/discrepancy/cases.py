@@ -9,10 +9,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Model, Trajectory
+from hvdc_ident.data import Array
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
-from hvdc_ident.trajectory import Array
 
 CARD = """
 schema = 1

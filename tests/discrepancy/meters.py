@@ -9,8 +9,8 @@ from cases import EVENT, RUNS, SIGMA, TIME, corners, experiments
 from scipy.signal import TransferFunction, lsim
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
+from hvdc_ident.immutable import FrozenMap
 
 
 def filtered(numerator: list[float], denominator: list[float]) -> tuple[Experiment, ...]:

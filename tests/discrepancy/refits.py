@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.refits.nominal import nominal
 from hvdc_ident.discrepancy.refits.refit import Job, Refit, judged
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.effects import Probe
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.trials.formula import formula_job
 from hvdc_ident.discrepancy.trials.library import Term
 from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
 from hvdc_ident.discrepancy.trials.state import Round
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 
 def bent(third: float, level: float, options: Options | None = None) -> Diagnosis:

@@ -5,7 +5,7 @@ import pytest
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy.findings.bode import derivative_spectrum, recorded
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 STEP, LAG = 2e-3, 0.02
 TIME = np.arange(500) * STEP

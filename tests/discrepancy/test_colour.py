@@ -11,11 +11,11 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.noise.colour import RHO, TANH, likelihood, together, without_common
 from hvdc_ident.discrepancy.noise.records import Noise, draws, noise_of
 from hvdc_ident.fit import Problem
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 BEFORE = 50
 SIGMA = {"a": 1.0, "b": 0.3, "c": 5.0}

@@ -11,11 +11,11 @@ from cases import FREE, TRUE, experiments, model
 
 import hvdc_ident
 from hvdc_ident import Experiment, InputSignal, Trajectory, load_model, simulate
+from hvdc_ident.data import experiment
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.experiment import experiment
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 FEW = ["lag", "delay", "limit", "gain", "offset", "deadband", "second-order"]
 

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.trials.select import Pick, Trial
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.discrepancy.verdict.doubts import Doubt, _turned, doubt
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 
 def chance(refit: Refit) -> float:

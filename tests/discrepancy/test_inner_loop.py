@@ -11,9 +11,9 @@ from meters import records
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.signatures.candidates import entries
-from hvdc_ident.trajectory import Array
 
 WN, ZETA = 60.0, 0.6
 

@@ -11,14 +11,14 @@ from refits import plain
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.scores.inversion import Inversion
 from hvdc_ident.discrepancy.scores.scan import _looked
 from hvdc_ident.discrepancy.scores.scored import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import SlotSignal, effects
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 STEP = 0.11
 

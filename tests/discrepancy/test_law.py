@@ -12,6 +12,7 @@ from cases import FREE, SIGMA, TIME, TRUE, experiments, model
 from refits import plain
 
 from hvdc_ident import Experiment, simulate
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
 from hvdc_ident.discrepancy.outside.hidden import Regression
 from hvdc_ident.discrepancy.outside.law import _levels, law
@@ -19,9 +20,8 @@ from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.trials.library import hats
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, parse_card, write_card
-from hvdc_ident.trajectory import Array
 
 Meter = Callable[[dict[str, Array]], Array]
 

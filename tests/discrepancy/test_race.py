@@ -13,7 +13,7 @@ from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
 from hvdc_ident.discrepancy.trials.race import Race
 from hvdc_ident.discrepancy.trials.state import Search
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 SEARCH = Search("all", None, FrozenMap(), Options(), 0)

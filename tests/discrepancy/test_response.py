@@ -11,7 +11,7 @@ from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.discrepancy.signatures.block import block
 from hvdc_ident.discrepancy.signatures.grid import instants
 from hvdc_ident.discrepancy.signatures.response import along
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 
 def _closed_loop() -> StateSpace:

@@ -24,7 +24,7 @@ from hvdc_ident.discrepancy.trials.select import Pick, Trial, behinds, shortlist
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.discrepancy.verdict.judge import _half_told, _named
 from hvdc_ident.effects import Probe
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.refits.refit import METHOD
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free, Problem
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 LAG = 0.03

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.trials.jobs import job_of
 from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial, clear
 from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of
 
 

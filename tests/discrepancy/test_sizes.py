@@ -6,12 +6,12 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal
+from hvdc_ident.data import Trajectory
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.discrepancy.findings.sizes import size_curves
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
-from hvdc_ident.trajectory import Trajectory
 
 LOOP = parse_card("""
 schema = 1

@@ -13,7 +13,7 @@ from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.signatures.candidates import own_sources
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 
 CARD = """

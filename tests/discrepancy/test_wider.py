@@ -14,6 +14,7 @@ from refits import answered, beside, plain
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal, simulate
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.discrepancy.refits.adequacy import loud_after_breaks
 from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
@@ -27,9 +28,8 @@ from hvdc_ident.discrepancy.trials.refitted import on_bound, once_more, refitted
 from hvdc_ident.discrepancy.trials.select import Pick, Trial, clear
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import Probe
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.trajectory import Array
 
 PERIOD = 0.033
 WINDOW = 0.05

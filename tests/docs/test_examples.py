@@ -9,9 +9,9 @@ import pytest
 
 WITH_EXAMPLES = (
     "hvdc_ident.api",
-    "hvdc_ident.experiment",
+    "hvdc_ident.data.experiment",
     "hvdc_ident.formats",
-    "hvdc_ident.signals",
+    "hvdc_ident.data.signals",
     "hvdc_ident.linearize.distance",
     "hvdc_ident.linearize.jacobian",
     "hvdc_ident.linearize.open_loop",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 SIZES = {name: dict(effect.example) for name, effect in effects().items()}
 SOURCE = "Vdc2"

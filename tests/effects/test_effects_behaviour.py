@@ -9,9 +9,9 @@ import pytest
 from scipy import integrate, signal
 
 from hvdc_ident import load_study
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import EffectUse, alone, effects
-from hvdc_ident.experiment import InputSignal, experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import EffectUse, SlotSignal, alone, clearance, effects, probes, resistances, sources
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit.unknown import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.effects.sizes import NAMES, SIZES

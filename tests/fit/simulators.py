@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, Trajectory, experiment, trajectory
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import Experiment, experiment
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.trajectory import Array, Trajectory, trajectory
 
 Formula = Callable[[Array, dict[str, float]], tuple[Array, dict[str, Array]]]
 """From the times and all parameters: an output, and its derivative by each parameter."""

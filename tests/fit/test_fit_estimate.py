@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from hvdc_ident.experiment import InputSignal
+from hvdc_ident.data import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded, step_response
 

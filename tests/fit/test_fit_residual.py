@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError, SimulationError, SteadyStateError, StudyError
-from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.residual import whitened
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded, step_response

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from hvdc_ident import load_model, simulate
+from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem, fit, fit_each
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import trajectory
 from tests.fit.link import STEPS, TIME, TRUTH, link, step
 
 TABLES = Path(__file__).resolve().parents[3] / "shared" / "data" / "paper" / "tables.toml"

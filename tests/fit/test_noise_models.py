@@ -11,8 +11,8 @@ from scipy.linalg import toeplitz
 from scipy.optimize import least_squares
 from scipy.stats import binom
 
+from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.loss import LOSSES, loss
 from hvdc_ident.fit.prior import Prior

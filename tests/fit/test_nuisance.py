@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from hvdc_ident import Model, simulate
+from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import StudyError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.nuisance import unit_of
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import trajectory
 from tests.fit.link import STEPS, TIME, TRUTH, link, step
 from tests.fit.simulators import Closed, decay, parameters, recorded
 

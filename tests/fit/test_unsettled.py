@@ -9,12 +9,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from hvdc_ident import Model, simulate
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.unsettled import recentred
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import trajectory
 
 TIME = np.linspace(0.0, 3.0, 61)
 SPRING = Model(

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import windowed
 from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.tolerance import shipped, tolerance

@@ -15,8 +15,8 @@ from c_models import FAULTS, FAULTY, FAULTY_CODE, FAULTY_VARIABLES, broken
 from fmu_limits import PATIENT, QUICK
 
 from hvdc_ident import load_model, simulate
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.model import read_fmu
 from hvdc_ident.sensitivity.sweep_run import sweep
 

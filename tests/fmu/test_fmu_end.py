@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from hvdc_ident import simulate
 from hvdc_ident.cli import app
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import InputSignal, experiment
 
 pytestmark = needs_compiler
 

@@ -8,11 +8,11 @@ from c_fmu import needs_compiler
 from c_models import FAULTY, TWIN, spring
 
 from hvdc_ident import simulate
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.discrepancy.signatures.candidates import candidates
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.host import Limits
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 pytestmark = needs_compiler
 

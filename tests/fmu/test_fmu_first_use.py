@@ -11,8 +11,8 @@ from c_models import CLOCK, begun, response, spring
 from fmu_limits import PATIENT
 
 from hvdc_ident import simulate
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.model import read_fmu
 
 pytestmark = needs_compiler

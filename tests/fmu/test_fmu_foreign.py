@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvdc_ident.data import experiment
 from hvdc_ident.errors import InputError, SimulationError
-from hvdc_ident.experiment import experiment
 from hvdc_ident.fmu.description import INTERFACES
 from hvdc_ident.fmu.host import Limits
 from hvdc_ident.fmu.model import read_fmu

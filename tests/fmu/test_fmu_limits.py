@@ -19,8 +19,8 @@ from c_models import FAULTY, FAULTY_CODE, FOUR
 from fmu_limits import PATIENT
 
 from hvdc_ident import load_model, simulate
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError, ModelError, SimulationError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
 from hvdc_ident.fmu.folder import LOCK, joined, sweep, unpacked
 from hvdc_ident.fmu.host import Limits, idle_cores
@@ -118,7 +118,7 @@ HOST = """
 import os, sys, time
 import numpy as np
 from hvdc_ident import load_model, simulate
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 model = load_model(sys.argv[1], interface="co-simulation")
 step = experiment("step", np.linspace(0.0, 0.5, 26), {"u": InputSignal.step(0.1, 0.0, 1.0)})
 simulate(model, step)

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from hvdc_ident import find_operating_point, linearize, load_model, simulate
 from hvdc_ident.cli import app
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 
 pytestmark = needs_compiler
 

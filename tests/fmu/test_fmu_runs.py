@@ -11,7 +11,7 @@ from c_models import BALL, COUNTER, FAULTY, TRIANGLE, response, spring
 from scipy.signal import lsim
 
 from hvdc_ident import load_model, simulate
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu.host import Limits
 from hvdc_ident.fmu.model import read_fmu
 

@@ -56,7 +56,7 @@ TRUE = {"d": 0.6, "k": 9.0}
 def study(folder, interface):
     """A study of the spring's FMU, or of its twin in equations, with noisy records of a spring of other values."""
     from hvdc_ident import simulate
-    from hvdc_ident.experiment import InputSignal, experiment
+    from hvdc_ident.data import InputSignal, experiment
 
     random, time = np.random.default_rng(3), np.linspace(0.0, 5.0, 101)
     for name, level in (("step", 1.0), ("back", -0.7)):

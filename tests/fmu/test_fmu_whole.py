@@ -12,12 +12,11 @@ from typer.testing import CliRunner
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
+from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.model import parse_card
-from hvdc_ident.trajectory import Trajectory
 
 pytestmark = needs_compiler
 

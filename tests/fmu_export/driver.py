@@ -15,7 +15,7 @@ from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Model, FMU2Slave
 from fmpy.fmi3 import FMU3Model, FMU3Slave
 
-from hvdc_ident.experiment import InputSignal
+from hvdc_ident.data import InputSignal
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.model import Model
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ExpressionError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fmu.export.modelica import modelica, output_name
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model

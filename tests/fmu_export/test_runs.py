@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu.model import read_fmu
 from hvdc_ident.simulate import simulate
 from tests.fmu_export.driver import cosimulate

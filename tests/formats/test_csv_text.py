@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hvdc_ident import formats as catalogue
+from hvdc_ident.data import Trajectory, trajectory
 from hvdc_ident.errors import UnknownNameError, WaveformError
 from hvdc_ident.formats import convert, csv_text, list_signals, read_waveforms, write_csv
-from hvdc_ident.trajectory import Trajectory, trajectory
 
 DIALECTS = {
     "comma": "time,a,b\n0,1.5,-2\n0.5,1e-3,+4\n",

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import scipy.io
 
+from hvdc_ident.data import trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import convert, csv_text, files_of, formats, list_signals, read_waveforms, write_csv
-from hvdc_ident.trajectory import trajectory
 
 ROWS = ((0.0, 1.5, -2.0), (0.5, 1e-3, 4.0))
 """What every file of STYLES holds: time in s, U in kV, P in MW."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import simulate
-from hvdc_ident.trajectory import trajectory
 from tests.fit.simulators import Closed, recorded
 
 T = np.linspace(0.0, 1.0, 101)

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
+from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError
-from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Group
 from hvdc_ident.identifiability import identifiability, identifiability_by_group
 from tests.identifiability.cases import on_model, pi_loop

@@ -9,8 +9,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from hvdc_ident.data import Experiment, InputSignal
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.identifiability import identifiability

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from hvdc_ident.data import InputSignal
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.identifiability import gate, gated_fit, identifiability

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hvdc_ident.experiment import InputSignal
+from hvdc_ident.data import InputSignal
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.identifiability import gated_fit, identifiability
 from hvdc_ident.model import Model

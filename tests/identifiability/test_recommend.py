@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hvdc_ident.experiment import InputSignal
+from hvdc_ident.data import InputSignal
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability import identifiability

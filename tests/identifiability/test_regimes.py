@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hvdc_ident.experiment import InputSignal
+from hvdc_ident.data import InputSignal
 from hvdc_ident.fit import Free
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.model import Model, State

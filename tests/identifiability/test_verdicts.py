@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hvdc_ident import load_model
+from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError, SimulationError, StudyError
-from hvdc_ident.experiment import InputSignal
 from hvdc_ident.fit import Free
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.parameters import Parameter

@@ -6,7 +6,7 @@ import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, UnknownNameError
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import find_operating_point, jacobian_error, linearize, one_sided, point_at
 from hvdc_ident.linearize.system import system
 from hvdc_ident.model import Algebraic, Model, Output, Signal, State

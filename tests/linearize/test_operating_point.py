@@ -5,7 +5,7 @@ import pytest
 
 from hvdc_ident.errors import ModelError, SteadyStateError, UnknownNameError
 from hvdc_ident.expression import parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import continuation, find_operating_point, point_at
 from hvdc_ident.model import Model, Output, State
 from hvdc_ident.models import load_model

@@ -5,7 +5,7 @@ import pytest
 
 from hvdc_ident.errors import LinearizationError, UnknownNameError
 from hvdc_ident.expression import parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import find_operating_point
 from hvdc_ident.linearize.impedance import Port, port_admittance, port_impedance
 from hvdc_ident.linearize.open_loop import signal_value

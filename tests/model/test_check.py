@@ -13,7 +13,7 @@ import sympy as sp
 
 from hvdc_ident.errors import ExpressionError, InputError, ModelError, UnknownNameError
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Delay, Model, Output, Sampled, Signal, State, coerced, ordered_signals
 from hvdc_ident.parameters import Input, Parameter
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model import parse_card, write_card
 from hvdc_ident.models import load_model, shipped_models, summaries
 from hvdc_ident.simulate import simulate

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.models.vsc_hvdc_avm import RATINGS, VARIANTS, model
 from hvdc_ident.simulate import Tolerance, simulate

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hvdc_ident import find_operating_point, linearize, load_model, simulate
+from hvdc_ident.data import Experiment, InputSignal
 from hvdc_ident.errors import ModelError
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.models.vsc_mtdc import vsc_mtdc
 
 TIME = np.linspace(0.0, 0.5, 251)

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from hvdc_ident import Model
-from hvdc_ident.experiment import experiment
+from hvdc_ident.data import experiment, trajectory
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import trajectory
 
 OPTIMUM = 138.22199693517703
 

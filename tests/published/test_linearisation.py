@@ -9,7 +9,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.expression import parse
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, point_at
 from hvdc_ident.linearize.distance import gap, nu_gap
 from hvdc_ident.linearize.norms import h2_norm, hinf_norm

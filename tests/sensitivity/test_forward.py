@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model import parse_card
 from hvdc_ident.sensitivity.derivatives import steady_sensitivities, trajectory_sensitivities
 

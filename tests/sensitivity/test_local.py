@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import hvdc_ident
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.model import Model, Sampled, parse_card
 

@@ -8,8 +8,8 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
+from hvdc_ident.data import experiment
 from hvdc_ident.errors import InputError, StudyError
-from hvdc_ident.experiment import experiment
 from hvdc_ident.model import parse_card
 from hvdc_ident.sensitivity.global_screening import morris, sobol
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
 from hvdc_ident.models import load_model

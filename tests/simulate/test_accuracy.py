@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.simulate.reference import Reference, sided

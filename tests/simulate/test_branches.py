@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hvdc_ident import find_operating_point, simulate
+from hvdc_ident.data import experiment
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.experiment import experiment
 from hvdc_ident.linearize import linearize
 from hvdc_ident.model import parse_card, write_card
 from hvdc_ident.models import load_model

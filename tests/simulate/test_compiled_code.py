@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import kernel, simulate
 from hvdc_ident.simulate.kernel import _FILES

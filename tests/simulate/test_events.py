@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model import Delay, Model, Sampled, State
 from hvdc_ident.simulate import Tolerance, simulate
 

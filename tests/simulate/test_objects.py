@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from hvdc_ident.experiment import InputSignal, experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import Engine, Tolerance, entries, machine, objects, simulate
@@ -206,7 +206,7 @@ def test_a_process_that_finds_its_code_loads_no_compiler_of_kernels():
     code = (
         "import sys, numpy as np\n"
         "from hvdc_ident import load_model, simulate\n"
-        "from hvdc_ident.experiment import experiment\n"
+        "from hvdc_ident.data import experiment\n"
         "case = experiment('short', np.linspace(0.0, 0.01, 11))\n"
         "simulate(load_model('vsc-hvdc-link'), case, sensitivities=('KIP',))\n"
         "print(*sys.modules)"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.experiment import InputSignal, experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.errors import SimulationError, SteadyStateError
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.model import Algebraic, Model, State
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate

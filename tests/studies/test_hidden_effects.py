@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident import simulate as package
+from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import Options
 from hvdc_ident.discrepancy.refits.begin import added
 from hvdc_ident.discrepancy.refits.nominal import nominal
@@ -23,11 +24,9 @@ from hvdc_ident.discrepancy.trials.jobs import job
 from hvdc_ident.discrepancy.trials.refitted import PROMISING, refitted
 from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import EffectUse, Probe, effects
-from hvdc_ident.experiment import InputSignal, experiment
 from hvdc_ident.fit import Free, Problem
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Trajectory
 from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvdc_ident.data import trajectory
 from hvdc_ident.errors import InputError
 from hvdc_ident.formats import write_csv
 from hvdc_ident.study.study import load_study
-from hvdc_ident.trajectory import trajectory
 
 CARD = """schema = 1
 name = "source"

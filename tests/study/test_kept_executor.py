@@ -17,7 +17,7 @@ from hvdc_ident.fit import Free
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.profile import profiles
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.executors import LocalPool
 from hvdc_ident.study.executors.kept import KeptExecutor
 from hvdc_ident.study.packing import packed, unpacked

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvdc_ident.data import conversion, same_unit
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.study import recordings
 from hvdc_ident.study.study import Study, load_study
 from hvdc_ident.study.summary import summary, summary_text
-from hvdc_ident.units import conversion, same_unit
 
 TIME = np.arange(101) * 0.01
 

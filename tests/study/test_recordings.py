@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import curve_fit
 
 from hvdc_ident import load_study
+from hvdc_ident.data import noise_estimate
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.fit import FitResult, Problem, fit
 from hvdc_ident.report.page import write_report
@@ -18,7 +19,6 @@ from hvdc_ident.study.simulator import ModelSimulator
 from hvdc_ident.study.stage import Options
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.summary import summary, summary_text
-from hvdc_ident.waveform import noise_estimate
 
 CARD = """schema = 1
 name = "motor"

@@ -11,12 +11,11 @@ from typer.testing import CliRunner
 
 from hvdc_ident import Model, load_model
 from hvdc_ident.cli import app
-from hvdc_ident.experiment import Experiment, InputSignal, experiment
+from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.conversions import conversions
 from hvdc_ident.study.rest_levels import RestLevels, compare_rest
-from hvdc_ident.trajectory import Array, trajectory
 
 CARD = """schema = 1
 name = "lag"

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.fit.bootstrap import _refit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.per_experiment import _alone
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 BOUND = {
     "refit": _refit,  # partial(_refit, ...)

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.findings.explain import advice
 from hvdc_ident.discrepancy.findings.result import Rival
 from hvdc_ident.discrepancy.options import Options
@@ -15,8 +16,7 @@ from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Trial, at_edge, behinds, best_gain, best_of
 from hvdc_ident.discrepancy.trials.state import Round
 from hvdc_ident.effects import each_its_own, effects
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 NEEDED = 4.0
 """Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""

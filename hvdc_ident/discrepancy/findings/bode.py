@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.errors import InputError
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.linearize.frequency import frequency_response
 from hvdc_ident.model import AnyModel
-from hvdc_ident.trajectory import Array
 
 POINTS = 60
 MOST = 12

@@ -8,8 +8,8 @@ from hvdc_ident.discrepancy.findings.result import Found, Size
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.effects import effects
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.words import listed, quantity
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed, quantity
 
 MOST_PLACES = 4
 """Signals at most that are asked for."""

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.findings.result import Gap, Table
 from hvdc_ident.discrepancy.refits.refit import Refit, held_out, unseen
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 
 def gap(given: Refit, refitted: Refit, augmented: Refit) -> Gap:

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+from hvdc_ident.display import Shown, data_frame
+from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fit.result import plain
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import Shown, data_frame
-from hvdc_ident.notebook import Table as TextTable
+from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,14 +6,14 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import ComputationError, SteadyStateError
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.words import quantity
+from hvdc_ident.text import quantity
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 """Of the way from the neutral size to the one that was found; 0 is the model without the effect, gains as found with it."""

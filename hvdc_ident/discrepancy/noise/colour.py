@@ -13,8 +13,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.whitening import whitened
-from hvdc_ident.trajectory import Array
 
 TANH = np.linspace(-0.55, 3.0, 72)
 """artanh of the coefficients that are tried: from -0.5 to 0.995."""

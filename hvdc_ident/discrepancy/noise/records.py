@@ -11,17 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, event_time, noise_floor
 from hvdc_ident.discrepancy.noise.colour import TANH, Colour, Likelihood, likelihood, together, without_common
 from hvdc_ident.errors import StudyError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.noise import scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.rounding import Rounding
 from hvdc_ident.fit.whitening import AR, autoregression, segments
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
-from hvdc_ident.waveform import event_time, noise_floor
+from hvdc_ident.immutable import FrozenMap
 
 FEWEST = 8
 """Rows before an event from which anything is told of the noise."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.outside.filtered import shape, transfer_function
 from hvdc_ident.discrepancy.outside.hidden import Regression, over_signal, over_time, regression
 from hvdc_ident.discrepancy.outside.law import STABLE, law
@@ -18,9 +19,8 @@ from hvdc_ident.discrepancy.trials.formula import Law, filled, labelled
 from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.effects import effects
 from hvdc_ident.fit.result import plain
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
-from hvdc_ident.words import listed
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed
 
 PLACES = 6
 """Places, the best over time, at which what is missing is sought over signals too."""

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.outside.law import standing
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.refits.refit import Refit
@@ -21,8 +22,7 @@ from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.refitted import refitted
 from hvdc_ident.discrepancy.trials.select import Trial, best_of
 from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 BESIDES = ("low", "high")
 """Parameters of the filter below and above its band."""

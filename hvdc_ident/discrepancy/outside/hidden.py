@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.scores.scored import Path, Whitening
-from hvdc_ident.trajectory import Array
 
 KNOTS = 24
 INDEPENDENT = 1e-8

@@ -13,6 +13,7 @@ from functools import cache
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.noise.records import draws
 from hvdc_ident.discrepancy.outside.hidden import Regression, regression
 from hvdc_ident.discrepancy.refits.adequacy import adequacy
@@ -27,7 +28,6 @@ from hvdc_ident.discrepancy.trials.select import Ruler
 from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.executor import mapped
-from hvdc_ident.trajectory import Array
 
 MOST = 3
 """Terms of one formula."""

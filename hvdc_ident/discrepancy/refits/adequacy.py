@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.noise.records import draws
 from hvdc_ident.discrepancy.refits.nominal import Nominal
-from hvdc_ident.trajectory import Array
 
 BINS = 8
 AFTER = 10

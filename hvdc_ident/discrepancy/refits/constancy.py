@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtrc
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.nominal import Nominal, unit_columns
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.effects import effects
-from hvdc_ident.trajectory import Array
 
 TOLD = 1e-4
 """Share of a slope that has to be left by all the parameters for the data to tell of a size in one experiment alone."""

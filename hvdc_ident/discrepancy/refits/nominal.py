@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.noise.records import Noise, noise_of
 from hvdc_ident.errors import StudyError
 from hvdc_ident.executor import Executor
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Free, Problem, Simulator
 from hvdc_ident.fit.residual import Block
-from hvdc_ident.frozen import FrozenMap
 from hvdc_ident.identifiability.gate import gate, gated
 from hvdc_ident.identifiability.pilot import Optimum, pilot
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.fisher import independent, null_directions
-from hvdc_ident.trajectory import Array
 
 NEAR = 0.05
 """Share of the rows' interval: a row this near to a jump of an input lies on it."""

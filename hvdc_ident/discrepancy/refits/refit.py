@@ -8,21 +8,20 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.noise.records import Noise
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.nominal import Nominal, orthonormal
 from hvdc_ident.effects import clearance, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import Block
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.trajectory import Array
 
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import Probe, SlotSignal, effects, scanned
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.trajectory import Array
+from hvdc_ident.immutable import FrozenMap
 
 BENT = 50
 """Sizes of an effect that has not to be met."""

@@ -20,10 +20,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.scores.scored import SEEN, Whitening
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.trajectory import Array
 
 KNOTS = 600
 """Of all records together, at most: where there are more rows, several are taken together."""

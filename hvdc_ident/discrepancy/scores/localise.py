@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.scores.reach import Reach
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit.nuisance import observe
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, insertion_point
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Array
 
 MOST_OF = 0.8
 """Share of the gap that a time window, a band or a region has to hold."""

@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.scores.inversion import KNOTS, Inversion
 from hvdc_ident.discrepancy.scores.scored import Path
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.executor import Executor, mapped
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 SHARE = 0.7
 """Of what the best slot could make good, up to which another one is too little. Of 222 hidden effects of at least ten times

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.noise.records import draws
 from hvdc_ident.discrepancy.refits.begin import added
 from hvdc_ident.discrepancy.refits.nominal import Nominal
@@ -30,7 +31,6 @@ from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.simulate.engine import Tolerance
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Array
 
 SPOTS = 10
 """Sizes of an effect, the best at any place, at which the model is run."""

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.noise.records import draws
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
@@ -22,10 +23,8 @@ from hvdc_ident.discrepancy.signatures.finite import LOOSE, Column, Task, column
 from hvdc_ident.discrepancy.signatures.response import Along, along
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import Executor, mapped
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.fit.residual import Block, Treatment
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.trajectory import Array
 
 Path = Along | Ends
 """A run with its answers: of equations, or of something closed."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import Nominal
-from hvdc_ident.trajectory import Array
 
 MOST = 4
 FULL = 0.9

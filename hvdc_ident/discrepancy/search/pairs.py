@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.refit import Job, Refit
 from hvdc_ident.discrepancy.scores.scored import signature_rows
 from hvdc_ident.discrepancy.search.rounds import against, gained
@@ -18,7 +19,6 @@ from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial, best_of
 from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.trajectory import Array
 
 LOOKED_AT = 60
 TRIED = 3

@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.signatures.march import hold, march
 from hvdc_ident.effects import Effect, EffectUse, alone
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.expression import FUNCTIONS, symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, ordered_signals
 from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.machine import Code, Function
-from hvdc_ident.trajectory import Array
 
 FINE = 2.5e-4
 """s: an effect with corners in its derivative is stepped no more coarsely than this, in so many parts of a grid interval as it may take."""

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.effects import (
     Effect,
     EffectUse,
@@ -22,9 +23,8 @@ from hvdc_ident.effects import (
     sources,
 )
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, insertion_point
-from hvdc_ident.trajectory import Array
 
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""

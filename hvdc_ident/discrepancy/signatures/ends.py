@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.signatures.grid import instants
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.experiment import Experiment, InputSignal
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import External
 from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.trajectory import Array
 
 MOVED = Tolerance(rtol=1e-6)
 """Error control of a run with something added to its inputs, and of the run that it is told against: the inputs are lines

@@ -14,13 +14,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.signatures.block import block, parameter
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.signatures.ends import Ends
 from hvdc_ident.discrepancy.signatures.kernel import replaced
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import effects
-from hvdc_ident.trajectory import Array
 
 PASSES = 4
 CLOSED = 0.05

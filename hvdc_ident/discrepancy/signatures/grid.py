@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.experiment import Experiment
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array, Experiment
 
 FEWEST = 600
 """Fewer instants over a record are filled up."""

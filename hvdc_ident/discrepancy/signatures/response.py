@@ -13,16 +13,15 @@ import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.signatures.grid import instants
 from hvdc_ident.discrepancy.signatures.kernel import propagate
 from hvdc_ident.discrepancy.signatures.tangent import Partials, Tangent, tangent
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import symbol
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.recording import with_recording
-from hvdc_ident.trajectory import Array
 
 CHUNK = 128
 

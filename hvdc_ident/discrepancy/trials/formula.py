@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.refit import Job, Refit
 from hvdc_ident.discrepancy.scores.scored import Path
@@ -14,9 +15,8 @@ from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.trials.library import Term, along
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Array
 
 WIDE = 20.0
 """Times its start value: how large a coefficient may become."""

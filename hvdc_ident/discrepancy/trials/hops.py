@@ -16,6 +16,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import orthonormal
 from hvdc_ident.discrepancy.refits.refit import Found, Job, Refit, found_by, judged, of_held_out, run, signal
 from hvdc_ident.discrepancy.scores.dense import BETWEEN, by_level, sized
@@ -30,7 +31,6 @@ from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Array
 
 K = TypeVar("K", bound=Hashable)
 Data = Literal["fitted", "held out", "all"]

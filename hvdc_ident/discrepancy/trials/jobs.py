@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.begin import PATIENCE, Placed, added, moved
 from hvdc_ident.discrepancy.refits.refit import Job, Refit
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
@@ -14,10 +15,9 @@ from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Pick
 from hvdc_ident.effects import effects
 from hvdc_ident.fit import Free
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Array
 
 BIASED = 0.4
 """Share of its given value by which a gain has moved when it may have taken an effect's place."""

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hvdc_ident.trajectory import Array
+from hvdc_ident.data import Array
 
 MOST = 7
 """Signals the terms are made of."""

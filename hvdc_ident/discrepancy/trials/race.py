@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import orthonormal
 from hvdc_ident.discrepancy.refits.refit import Job, Refit, find
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit.problem import stacked
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy.trials.state import Search

@@ -8,13 +8,13 @@ from itertools import zip_longest
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.discrepancy.scores.scored import SEEN, Scores
 from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import effects
-from hvdc_ident.trajectory import Array
 
 SAME = 1.0
 """Difference of scores, in units of chi2, up to which two signatures of one effect are one: its places cannot be told apart."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.refit import Refit
@@ -15,9 +16,8 @@ from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True)

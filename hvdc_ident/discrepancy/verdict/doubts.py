@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.options import Options
 from hvdc_ident.discrepancy.refits.adequacy import loud_after_breaks
 from hvdc_ident.discrepancy.refits.constancy import constancy
@@ -18,7 +19,6 @@ from hvdc_ident.discrepancy.trials.select import Trial
 from hvdc_ident.discrepancy.trials.state import Round
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.trajectory import Array
 
 TRIFLE = 0.005
 """Share of what is explained of which nothing is made: of real records no model leaves noise alone."""

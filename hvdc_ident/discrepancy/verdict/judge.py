@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array, event_time
 from hvdc_ident.discrepancy.findings.ambiguity import formula_rivals, rivals
 from hvdc_ident.discrepancy.findings.result import Rival, Verdict
 from hvdc_ident.discrepancy.noise.records import FEWEST
@@ -25,8 +26,6 @@ from hvdc_ident.discrepancy.verdict.beyond import beyond
 from hvdc_ident.discrepancy.verdict.doubts import TRIFLE, Doubt, doubt, remains
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.trajectory import Array
-from hvdc_ident.waveform import event_time
 
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""

@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.signatures.candidates import Candidate
 from hvdc_ident.discrepancy.trials.select import Trial
 from hvdc_ident.discrepancy.trials.state import Round
 from hvdc_ident.effects import clearance, effects
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 
 ABSORBED = 0.99
 

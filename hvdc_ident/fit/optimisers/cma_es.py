@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.search import BudgetSpentError, Search, generator, missing
-from hvdc_ident.trajectory import Array
 
 NAME = "cma-es"
 SUMMARY = "evolution strategy with covariance adaptation (package cma, an extra), without derivatives"

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.search import BudgetSpentError, Search, generator
-from hvdc_ident.trajectory import Array
 
 NAME = "differential-evolution"
 SUMMARY = "a population of differences over the whole range (SciPy), without derivatives"

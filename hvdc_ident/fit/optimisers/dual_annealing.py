@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.objective import promised
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.search import BudgetSpentError, Search, generator
-from hvdc_ident.trajectory import Array
 
 NAME = "dual-annealing"
 SUMMARY = "simulated annealing with local descents over the whole range (SciPy)"

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.search import BudgetSpentError, Search, generator, missing
-from hvdc_ident.trajectory import Array
 
 NAME = "particle-swarm"
 SUMMARY = "a swarm of particles (package pyswarms, an extra), without derivatives"

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.optimiser import OptimiserResult, Outcome
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.rough import RUNS, roughness
 from hvdc_ident.fit.simulator import approximate
 from hvdc_ident.fit.unknown import Coordinates
-from hvdc_ident.trajectory import Array
 
 NAME = "trust-region"
 SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"

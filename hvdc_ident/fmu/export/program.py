@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fmu.export import text
 from hvdc_ident.model import Model
@@ -15,7 +16,6 @@ from hvdc_ident.simulate import tableaus
 from hvdc_ident.simulate.elimination import Elimination
 from hvdc_ident.simulate.engine import engine
 from hvdc_ident.simulate.structure import Structure
-from hvdc_ident.trajectory import Array
 
 TOLERANCE = 1e-8
 """Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import json_text, write_text
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.linear_model import LinearModel
 
 SCHEMA = 1

@@ -10,7 +10,7 @@ import numpy as np
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg
 from hvdc_ident.report.html import number, share, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.words import form_of, span
+from hvdc_ident.text import form_of, span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from hvdc_ident.axes import draw_intervals, draw_profile
 from hvdc_ident.report.drawing import figure, svg
 from hvdc_ident.report.html import number, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.words import listed
+from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

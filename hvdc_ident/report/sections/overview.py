@@ -6,7 +6,7 @@ from typing import Any
 
 from hvdc_ident.report.html import number, share, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.words import listed
+from hvdc_ident.text import listed
 
 
 def _render(results: Results) -> str:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg
 from hvdc_ident.report.html import number, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.trajectory import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.study.stage import Options, Outcome, Stage
-from hvdc_ident.words import form_of
+from hvdc_ident.text import form_of
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis

@@ -68,7 +68,7 @@ def _first_answer(study: Study, options: Options, starts: int) -> None:
     from hvdc_ident.fit.frequency_data import with_responses
     from hvdc_ident.identifiability.first_look import first_look
     from hvdc_ident.study.tables import candidate_lines
-    from hvdc_ident.words import duration
+    from hvdc_ident.text import duration
 
     simulator, experiments = with_responses(study.model, study.experiments, study.responses)
     options.progress(0, 1, "first answer: the model and its derivatives at the given values")

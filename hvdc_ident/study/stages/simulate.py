@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hvdc_ident.study.stage import Options, Outcome, Stage
 
 if TYPE_CHECKING:
-    from hvdc_ident.experiment import Experiment
+    from hvdc_ident.data import Experiment
     from hvdc_ident.study.study import Study
 
 
@@ -56,8 +56,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
 
 def _until(experiment: Experiment, rows: int) -> Experiment:
     """Return the experiment's first rows, which a run that an FMU ended came to."""
-    from hvdc_ident.frozen import FrozenMap
-    from hvdc_ident.trajectory import Trajectory
+    from hvdc_ident.data import Trajectory
+    from hvdc_ident.immutable import FrozenMap
 
     m = experiment.measured
     assert m is not None  # a study's experiments have outputs

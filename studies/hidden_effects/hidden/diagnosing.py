@@ -15,15 +15,14 @@ from hidden.noise import whitened
 from hidden.plants import PLANTS
 from hidden.sizes import UNIT, WIDTH, on_jumps
 from hvdc_ident import simulate
+from hvdc_ident.data import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.experiment import Experiment, InputSignal
 from hvdc_ident.fit import Free, Problem, fit
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, read_card
 from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.trajectory import Trajectory
 
 CARDS = Path(__file__).resolve().parents[1] / "cards"
 NAMES = ("fit-1", "fit-2", "holdout")

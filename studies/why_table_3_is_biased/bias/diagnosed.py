@@ -8,12 +8,12 @@ from typing import Any
 
 from common import diagnosing, paper
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy import Options, diagnose
 from hvdc_ident.effects import effects as catalogue
-from hvdc_ident.experiment import Experiment
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import Free, Problem, fit
-from hvdc_ident.frozen import FrozenMap
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.models import load_model
 from hvdc_ident.study.simulator import ModelSimulator

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from common import paper
 
-from hvdc_ident.experiment import Experiment
+from hvdc_ident.data import Experiment
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.models import load_model, vsc_hvdc_avm

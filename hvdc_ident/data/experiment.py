@@ -9,12 +9,12 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hvdc_ident.data.noise import input_signal
+from hvdc_ident.data.signals import InputSignal
+from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
+from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import WaveformError, unknown_name
-from hvdc_ident.frozen import FrozenMap
-from hvdc_ident.notebook import Shown, Table
-from hvdc_ident.signals import InputSignal
-from hvdc_ident.trajectory import Array, Origin, Trajectory, trajectory
-from hvdc_ident.waveform import input_signal
+from hvdc_ident.immutable import FrozenMap
 
 __all__ = ["Experiment", "InputSignal", "SignalLike", "experiment", "recording_lines"]
 

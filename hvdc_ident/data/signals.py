@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.data.trajectory import Array
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.trajectory import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.display import axes_of, data_frame, library, table_html
 from hvdc_ident.errors import WaveformError, unknown_name
-from hvdc_ident.notebook import axes_of, data_frame, library, table_html
 
 Array = NDArray[np.float64]
 

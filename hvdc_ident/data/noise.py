@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hvdc_ident.data.signals import InputSignal
+from hvdc_ident.data.trajectory import Array
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.signals import InputSignal
-from hvdc_ident.trajectory import Array
 
 __all__ = [
     "Interpolation",

@@ -20,8 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data.trajectory import Array, Trajectory
 from hvdc_ident.errors import WaveformError, unknown_name
-from hvdc_ident.trajectory import Array, Trajectory
 
 __all__ = ["QUANTITIES", "PhaseFilter", "quantities", "space_vector"]
 

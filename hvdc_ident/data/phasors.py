@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.data.phases import product_unit
+from hvdc_ident.data.trajectory import Array, Trajectory
+from hvdc_ident.data.units import conversion
 from hvdc_ident.errors import WaveformError, unknown_name
-from hvdc_ident.phases import product_unit
-from hvdc_ident.trajectory import Array, Trajectory
-from hvdc_ident.units import conversion
 
 QUANTITIES = {
     "v": "magnitude of the voltage",
