@@ -14,9 +14,8 @@ from collections.abc import Callable
 import control
 import numpy as np
 
-from hvdc_ident.linearize import find_operating_point, linearize
-from hvdc_ident.linearize.locus import root_locus
-from hvdc_ident.linearize.matrices import eliminate
+from hvdc_ident.linearize import find_operating_point, linearize, root_locus
+from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.system import CompiledSystem, system
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.structure import torn

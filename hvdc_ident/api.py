@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from hvdc_ident.executor import Executor, Progress
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.identifiability import IdentifiabilityReport
-    from hvdc_ident.linearize import LinearModel, OperatingPoint
-    from hvdc_ident.linearize.frequency import FrequencyResponse
-    from hvdc_ident.linearize.jacobian import Side
+    from hvdc_ident.linearize import FrequencyResponse, LinearModel, OperatingPoint, Side
     from hvdc_ident.sensitivity.derivatives import Ranges
     from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
     from hvdc_ident.sensitivity.sweep_result import SweepResult
@@ -128,7 +126,7 @@ def find_operating_point(
     >>> round(point.outputs["P2"], 9)
     0.5
     """
-    from hvdc_ident.linearize.operating_point import find_operating_point as find
+    from hvdc_ident.linearize import find_operating_point as find
     from hvdc_ident.study.assemble import model_of, names_of, values_of
 
     plant = model_of(model)
@@ -163,8 +161,8 @@ def linearize(
     >>> linear.A.shape, linear.D.shape
     ((6, 6), (1, 1))
     """
-    from hvdc_ident.linearize.jacobian import linearize as linear_model
-    from hvdc_ident.linearize.operating_point import find_operating_point as find
+    from hvdc_ident.linearize import find_operating_point as find
+    from hvdc_ident.linearize import linearize as linear_model
     from hvdc_ident.study.assemble import names_of, subject_of, values_of
     from hvdc_ident.study.linear_analysis import operating_point
     from hvdc_ident.study.study import Study

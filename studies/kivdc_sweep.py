@@ -16,9 +16,7 @@ from hvdc_ident.files import json_text, write_text
 from hvdc_ident.fit import Free
 from hvdc_ident.fit.uncertainty import autocorrelation
 from hvdc_ident.identifiability import identifiability
-from hvdc_ident.linearize import find_operating_point
-from hvdc_ident.linearize.open_loop import loop
-from hvdc_ident.linearize.stability_margins import margins
+from hvdc_ident.linearize import find_operating_point, loop, margins
 from hvdc_ident.models import load_model
 from hvdc_ident.sensitivity.derivatives import trajectory_sensitivities
 from hvdc_ident.sensitivity.sweep_result import SweepResult

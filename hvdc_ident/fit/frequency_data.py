@@ -11,7 +11,7 @@ from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import LinearizationError, SimulationError, SteadyStateError
 from hvdc_ident.fit.simulator import Simulation, Simulator
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.impedance import MeasuredResponse
+from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, State
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.model_simulator import ModelSimulator

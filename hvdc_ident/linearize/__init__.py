@@ -16,17 +16,22 @@ if TYPE_CHECKING:
         response_from_record,
         simulated_response,
     )
-    from hvdc_ident.linearize.jacobian import jacobian_error, linearize, one_sided
+    from hvdc_ident.linearize.jacobian import Side, jacobian_error, linearize, one_sided
     from hvdc_ident.linearize.linear_model import LinearModel
-    from hvdc_ident.linearize.locus import RootLocus, root_locus
-    from hvdc_ident.linearize.modal import Mode, TransferFunction
-    from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
-    from hvdc_ident.linearize.open_loop import Loop, loop, plant_and_controller
+    from hvdc_ident.linearize.loops import (
+        Loop,
+        LoopMargins,
+        Margins,
+        loop,
+        loop_margins,
+        margins,
+        plant_and_controller,
+    )
+    from hvdc_ident.linearize.modal import Mode, RootLocus, named, named_modes, parts_of, root_locus
     from hvdc_ident.linearize.operating_point import OperatingPoint, continuation, find_operating_point, point_at
-    from hvdc_ident.linearize.reduce import Reduction, balanced
+    from hvdc_ident.linearize.reduction import Reduction, balanced, h2_norm, hinf_norm, linf_norm
     from hvdc_ident.linearize.response_file import ResponseFile, read_response
-    from hvdc_ident.linearize.stability_margins import LoopMargins, Margins, loop_margins, margins
-    from hvdc_ident.linearize.symbolic import symbolic_transfer
+    from hvdc_ident.linearize.transfer_function import TransferFunction, symbolic_transfer
 else:
     __getattr__ = offered(
         __name__,
@@ -35,17 +40,14 @@ else:
             "frequency": "FrequencyResponse frequency_response",
             "impedance": "MeasuredResponse Port port_admittance port_impedance response_at_tones response_from_record "
             "simulated_response",
-            "jacobian": "jacobian_error linearize one_sided",
+            "jacobian": "Side jacobian_error linearize one_sided",
             "linear_model": "LinearModel",
-            "locus": "RootLocus root_locus",
-            "modal": "Mode TransferFunction",
-            "norms": "h2_norm hinf_norm linf_norm",
-            "open_loop": "Loop loop plant_and_controller",
+            "loops": "Loop LoopMargins Margins loop loop_margins margins plant_and_controller",
+            "modal": "Mode RootLocus named named_modes parts_of root_locus",
             "operating_point": "OperatingPoint continuation find_operating_point point_at",
-            "reduce": "Reduction balanced",
+            "reduction": "Reduction balanced h2_norm hinf_norm linf_norm",
             "response_file": "ResponseFile read_response",
-            "stability_margins": "LoopMargins Margins loop_margins margins",
-            "symbolic": "symbolic_transfer",
+            "transfer_function": "TransferFunction symbolic_transfer",
         },
     )
 
@@ -64,6 +66,7 @@ __all__ = [
     "Reduction",
     "ResponseFile",
     "RootLocus",
+    "Side",
     "TransferFunction",
     "balanced",
     "compare",
@@ -79,9 +82,12 @@ __all__ = [
     "loop",
     "loop_margins",
     "margins",
+    "named",
+    "named_modes",
     "ncf_margin",
     "nu_gap",
     "one_sided",
+    "parts_of",
     "plant_and_controller",
     "point_at",
     "port_admittance",

@@ -1,4 +1,4 @@
-"""Delays and sampled blocks of a linear model: Pade approximants, exact responses, and the matrix it is reduced from.
+"""Elimination of algebraic unknowns, and delays and sampled blocks of a linear model: Pade approximants and exact responses.
 
 `DelayFree` is a linear model before its delays are approximated, from which the exact frequency response is computed;
 `Blocks` is the matrix over states, inputs and unknowns in which Pade states stand for the delays.
@@ -12,9 +12,46 @@ from math import factorial
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.matrices import Array, eliminate
-from hvdc_ident.linearize.system import CompiledSystem, Layout
+from hvdc_ident.linearize.system import Array, CompiledSystem, Layout
 from hvdc_ident.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """result = a - b d^-1 c. condition: of d, its rows and columns scaled; left = b d^-1, right = d^-1 c."""
+
+    result: Array
+    condition: float
+    left: Array
+    right: Array
+
+    def derivative(self, da: Array, db: Array, dc: Array, dd: Array) -> Array:
+        """Return the derivative of the result for derivatives of the blocks; blocks may have leading axes."""
+        return np.asarray(da - db @ self.right - self.left @ dc + self.left @ dd @ self.right)
+
+
+def eliminate(matrix: Array, rows: int, columns: int) -> Eliminated:
+    """Return the Schur complement that removes the rows and columns after the given counts.
+
+    A singular block gives the condition infinity and a result that must not be used.
+    """
+    a, b, c, d = matrix[:rows, :columns], matrix[:rows, columns:], matrix[rows:, :columns], matrix[rows:, columns:]
+    if d.shape[0] == 0:
+        return Eliminated(a, 1.0, b, c)
+    size_r = np.abs(d).max(axis=1)
+    if not (size_r > 0).all() or not np.isfinite(matrix).all():
+        return Eliminated(a, np.inf, b, c)
+    scaled = d / size_r[:, None]
+    size_c = np.abs(scaled).max(axis=0)
+    if not (size_c > 0).all():
+        return Eliminated(a, np.inf, b, c)
+    condition = float(np.linalg.cond(scaled / size_c))
+    if not np.isfinite(condition) or condition > 1e15:
+        return Eliminated(a, np.inf, b, c)
+    inverse = np.linalg.inv(scaled / size_c) / size_c[:, None] / size_r[None, :]
+    right = np.linalg.solve(d, c)
+    return Eliminated(a - b @ right, condition, b @ inverse, right)
+
 
 MAX_ORDER = 12
 

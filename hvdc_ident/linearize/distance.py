@@ -15,9 +15,8 @@ from hvdc_ident.errors import LinearizationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.linearize.norms import Peak, linf_norm, refined
-from hvdc_ident.linearize.reduce import hankel, on_axis, visible, without_sliding_means
+from hvdc_ident.linearize.reduction import Peak, hankel, linf_norm, on_axis, refined, visible, without_sliding_means
+from hvdc_ident.linearize.system import Array
 
 Complex = NDArray[np.complex128]
 StateSpace = tuple[Array, Array, Array, Array]

@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
-from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.linearize.system import CompiledSystem, system
+from hvdc_ident.linearize.system import Array, CompiledSystem, system
 from hvdc_ident.model import Model
 
 Equations = Callable[[Array], tuple[Array, Array]]

@@ -15,8 +15,8 @@ from hvdc_ident.fmu.point import FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, newton
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import Bounds, OperatingPoint
+from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import External
 
 ACCURACY = 1e-9

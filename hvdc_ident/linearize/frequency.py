@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.display import data_frame
 from hvdc_ident.errors import LinearizationError, unknown_name
-from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
     import xarray

@@ -20,8 +20,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, sensitivity
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
+from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model, Output, fresh, rewritten
 from hvdc_ident.parameters import Input
 

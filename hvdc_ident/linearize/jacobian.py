@@ -9,12 +9,11 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import Blocks, DelayFree, channels
+from hvdc_ident.linearize.delays import Blocks, DelayFree, Eliminated, channels, eliminate
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.matrices import Array, Eliminated, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
-from hvdc_ident.linearize.system import CompiledSystem, system
+from hvdc_ident.linearize.system import Array, CompiledSystem, system
 from hvdc_ident.model import AnyModel, Model
 
 Side = Literal["refuse", "below", "above"]

@@ -11,7 +11,6 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from hvdc_ident.expression import symbol, to_text
-from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.simulate.structure import Structure
 
 
@@ -156,7 +155,7 @@ def _definitions(structure: Structure) -> dict[str, sp.Basic]:
     return found
 
 
-def limits(structure: Structure, known: tuple[Condition, ...], values: Array) -> tuple[Limit, ...]:
+def limits(structure: Structure, known: tuple[Condition, ...], values: NDArray[np.float64]) -> tuple[Limit, ...]:
     """Return every limiter that matters at a point, with its margin, from the switches' values.
 
     A limiter inside a branch that another condition has switched off does not matter and is left out; conditions that

@@ -12,17 +12,18 @@ import numpy as np
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import DelayFree
-from hvdc_ident.linearize.matrices import Array, eliminate
+from hvdc_ident.linearize.delays import DelayFree, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint
+from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
     import control
 
     from hvdc_ident.linearize.frequency import FrequencyResponse
-    from hvdc_ident.linearize.modal import Mode, TransferFunction
-    from hvdc_ident.linearize.reduce import Reduction
-    from hvdc_ident.linearize.stability_margins import LoopMargins, Margins
+    from hvdc_ident.linearize.loops import LoopMargins, Margins
+    from hvdc_ident.linearize.modal import Mode
+    from hvdc_ident.linearize.reduction import Reduction
+    from hvdc_ident.linearize.transfer_function import TransferFunction
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +248,7 @@ class LinearModel(Shown):
 
     def zeros(self) -> Array:
         """Complex invariant zeros of the whole system, rad/s."""
-        from hvdc_ident.linearize.modal import zeros
+        from hvdc_ident.linearize.transfer_function import zeros
 
         return zeros(*self.standard())
 
@@ -259,7 +260,7 @@ class LinearModel(Shown):
 
     def transfer_function(self, input: str | None = None, output: str | None = None) -> TransferFunction:
         """Zeros, poles and gain from an input to an output; the names may be left out where there is only one."""
-        from hvdc_ident.linearize.modal import transfer_function
+        from hvdc_ident.linearize.transfer_function import transfer_function
 
         return transfer_function(self, input or self._only("input"), output or self._only("output"))
 
@@ -307,8 +308,7 @@ class LinearModel(Shown):
         break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
         is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
         """
-        from hvdc_ident.linearize.open_loop import loop
-        from hvdc_ident.linearize.stability_margins import loop_margins, margins
+        from hvdc_ident.linearize.loops import loop, loop_margins, margins
         from hvdc_ident.model import Model
 
         if break_at is None:
@@ -324,16 +324,16 @@ class LinearModel(Shown):
 
     def norms(self) -> dict[str, Any]:
         """Return the H2, H-infinity and L-infinity norms, None with the reason where one does not exist."""
-        from hvdc_ident.linearize.norms import norms
+        from hvdc_ident.linearize.reduction import norms
 
         return norms(self)
 
     def reduce(self, order: int | None = None, tolerance: float | None = None, *, match_dc: bool = False) -> Reduction:
         """Return a balanced model of fewer states: so many, or as few as keep the error within the tolerance.
 
-        See `hvdc_ident.linearize.reduce.balanced`.
+        See `hvdc_ident.linearize.reduction.balanced`.
         """
-        from hvdc_ident.linearize.reduce import balanced
+        from hvdc_ident.linearize.reduction import balanced
 
         return balanced(self, order, tolerance, match_dc=match_dc)
 

@@ -1,28 +1,29 @@
-"""Modes, zeros and transfer functions of a linear model.
+"""Modes of a linear model, and root loci.
 
-Eigenvalues with damping and frequency, participation, shapes and derivatives by parameters; zeros from the system matrix,
-never from polynomials; transfer functions as zeros, poles and gain.
+Eigenvalues with damping and frequency, participation, shapes, names and derivatives by parameters; eigenvalues along a
+parameter, followed by their eigenvectors, and the values at which stability changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
+from scipy.optimize import linear_sum_assignment
 
-from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch
+from hvdc_ident.linearize.jacobian import state_matrix
+from hvdc_ident.linearize.operating_point import ZERO, steady
+from hvdc_ident.linearize.system import Array
+from hvdc_ident.model import Model
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-    from hvdc_ident.model import Model
-
-ZERO = 1e-8
-"""An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,199 +250,162 @@ def named(mode: Mode, parts: Mapping[str, str]) -> NamedMode:
     return NamedMode(mode, name, FrozenMap(ranked))
 
 
-RANK = 1e-11
-"""Singular values below this share of the largest count as 0 when ranks are decided."""
+# --- root loci ---
 
 
-def zeros(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Return the finite invariant zeros, complex, rad/s: infinite ones are deflated by orthogonal steps beforehand.
+@dataclass(frozen=True)
+class StabilityLimit:
+    """A parameter value at which an eigenvalue crosses the imaginary axis, and that eigenvalue, rad/s."""
 
-    Emami-Naeini and Van Dooren 1982 (doi 10.1016/0005-1098(82)90070-X): rank decisions on a balanced system, then a
-    generalised eigenproblem. A system without any path from input to output has none by this definition.
-    """
-    if a.shape[0] == 0 or b.shape[1] == 0 or c.shape[0] == 0:
-        return np.zeros(0, dtype=complex)
-    a, b, c, d = _balanced(a, b, c, d)
-    a, b, c, d = _deflate(a, b, c, d)
-    a, b, c, d = _deflate(a.T, c.T, b.T, d.T)
-    n, m = a.shape[0], d.shape[1]
-    if n == 0 or m == 0 or d.shape[0] != m:
-        return np.zeros(0, dtype=complex)
-    # Compress the columns of [C D]: what remains is a square pencil of the zeros alone.
-    q = scipy.linalg.qr(np.concatenate([d, c], axis=1).T[::-1], mode="full")[0]
-    stacked = np.concatenate([b, a], axis=1)
-    basis = q[::-1][:, m:]
-    left = stacked @ basis
-    right = np.concatenate([np.zeros((n, m)), np.eye(n)], axis=1) @ basis
-    alpha, beta = scipy.linalg.eig(left, right, right=False, homogeneous_eigvals=True)
-    keep = np.abs(beta) > 1e-13 * np.maximum(np.abs(alpha), 1.0)
-    return np.asarray(alpha[keep] / beta[keep], dtype=complex)
-
-
-def _balanced(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the system with states, inputs and outputs scaled so that rows and columns are alike in size."""
-    n, m, o = a.shape[0], b.shape[1], c.shape[0]
-    whole = np.block([[a, b], [c, d]])
-    t, rows, columns = np.ones(n), np.ones(o), np.ones(m)
-    for _ in range(8):
-        for k in range(n):
-            row = np.abs(np.delete(whole[k], k)).sum()
-            column = np.abs(np.delete(whole[:, k], k)).sum()
-            if row > 0 and column > 0:
-                factor = 2.0 ** round(np.log2(np.sqrt(column / row)))
-                whole[k] *= factor
-                whole[:, k] /= factor
-                t[k] /= factor
-        for k in range(m):
-            size = np.abs(whole[:, n + k]).max()
-            if size > 0:
-                factor = 2.0 ** round(np.log2(size))
-                whole[:, n + k] /= factor
-                columns[k] *= factor
-        for k in range(o):
-            size = np.abs(whole[n + k]).max()
-            if size > 0:
-                factor = 2.0 ** round(np.log2(size))
-                whole[n + k] /= factor
-                rows[k] *= factor
-    return whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:]
-
-
-def _rank(values: Array, scale: float) -> int:
-    return int((values > RANK * scale).sum())
-
-
-def _deflate(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-    """The system with D of full row rank and the same zeros."""
-    while True:
-        n, o = a.shape[0], c.shape[0]
-        scale = max(float(np.abs(np.block([[b], [d]])).max(initial=0.0)), 1e-300) if d.size else 1.0
-        if o == 0 or n == 0:
-            return a, b, c, d
-        u, values, _ = np.linalg.svd(d) if d.shape[1] else (np.eye(o), np.zeros(0), None)
-        r = _rank(values, scale)
-        if r == o:
-            return a, b, c, d
-        c, d = u.T @ c, u.T @ d
-        c_low = c[r:]
-        v = np.linalg.svd(c_low)
-        k = _rank(v[1], max(float(np.abs(c).max(initial=0.0)), float(np.abs(a).max(initial=0.0)) * 1e-3, 1e-300))
-        if k == 0:
-            return a, b, c[:r], d[:r]
-        # The first n - k columns span the null space of the low part of C.
-        basis = np.concatenate([v[2].T[:, k:], v[2].T[:, :k]], axis=1)
-        at, bt, ct = basis.T @ a @ basis, basis.T @ b, c @ basis
-        keep = n - k
-        a = at[:keep, :keep]
-        c = np.concatenate([ct[:r, :keep], at[keep:, :keep]])
-        b, d = bt[:keep], np.concatenate([d[:r], bt[keep:]])
+    value: float
+    eigenvalue: complex
+    direction: str
 
 
 @dataclass(frozen=True, eq=False)
-class TransferFunction:
-    """gain * prod(s - zeros) / prod(s - poles), s in rad/s; cancelled: (pole, zero) pairs that were left out."""
+class RootLocus:
+    """Eigenvalues (points, modes) in rad/s along values of a parameter; column k is one mode throughout.
 
-    input: str
-    output: str
-    zeros: Array
-    poles: Array
-    gain: float
-    cancelled: tuple[tuple[complex, complex], ...] = ()
+    limits: where stability is lost or won between the values.
+    """
 
-    def __call__(self, s: complex | Array) -> Array:
-        """The value at complex frequencies s."""
-        s = np.asarray(s, dtype=complex)
-        top = np.prod(s[..., None] - self.zeros, axis=-1)
-        return np.asarray(self.gain * top / np.prod(s[..., None] - self.poles, axis=-1))
+    parameter: str
+    unit: str
+    values: Array
+    eigenvalues: Array
+    limits: tuple[StabilityLimit, ...]
 
     @property
-    def dc_gain(self) -> float:
-        """The value at s = 0; infinite with a pole there."""
-        if (self.poles == 0).any():
-            return float("inf")
-        return float(self(0.0).real)
+    def stable(self) -> Array:
+        """(points,) True where every eigenvalue lies left of the imaginary axis, those that stay at 0 apart."""
+        return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
+
+    def plot(self, ax: Any = None) -> Any:
+        """The axes with the locus."""
+        from hvdc_ident.linearize.plot import locus
+
+        return locus(self, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
-        """The transfer function as plain numbers, complex ones as [re, im]."""
-
-        def pairs(values: Array) -> list[list[float]]:
-            return [[float(v.real), float(v.imag)] for v in values]
-
+        """The locus as plain lists, complex numbers as [re, im]."""
+        pairs = np.stack([self.eigenvalues.real, self.eigenvalues.imag], axis=-1).tolist()
+        limits = [
+            {"value": x.value, "eigenvalue": [x.eigenvalue.real, x.eigenvalue.imag], "direction": x.direction}
+            for x in self.limits
+        ]
         return {
-            "input": self.input,
-            "output": self.output,
-            "zeros": pairs(self.zeros),
-            "poles": pairs(self.poles),
-            "gain": self.gain,
-            "cancelled": [[[p.real, p.imag], [z.real, z.imag]] for p, z in self.cancelled],
+            "parameter": self.parameter,
+            "unit": self.unit,
+            "values": self.values.tolist(),
+            "eigenvalues": pairs,
+            "limits": limits,
         }
 
 
-def transfer_function(model: LinearModel, input: str, output: str) -> TransferFunction:
-    """Return zeros, poles and gain of one channel; stable pole-zero pairs that cancel are left out and listed.
+def root_locus(
+    model: Model, parameter: str, values: Sequence[float] | Array, fixed: dict[str, float] | None = None
+) -> RootLocus:
+    """Return the eigenvalues of the model along values of a parameter (or input), each at its own operating point.
 
-    An unstable pair is never cancelled. A channel without a path is 0: no zeros, no poles, gain 0.
+    Raises UnknownNameError, SteadyStateError with the value at which there is no operating point, and
+    LinearizationError on a kink.
     """
-    from hvdc_ident.linearize.reduce import uncontrollable_unobservable
+    if parameter not in model.parameters and parameter not in model.inputs:
+        raise unknown_name(
+            "parameter or input", parameter, [*model.parameters, *model.inputs], where=f"model '{model.name}'"
+        )
+    along = np.asarray(values, dtype=float)
+    if along.ndim != 1 or along.size == 0 or not np.isfinite(along).all():
+        raise LinearizationError(
+            "a locus needs finite values", where=f"locus of '{parameter}'", expected="at least one"
+        )
+    at = _Along(model, parameter, fixed or {})
+    found: list[Array] = []
+    left: Array | None = None
+    for value in along:
+        eigenvalues, right, left_new = eigen(at.matrix(float(value)))
+        if left is not None:
+            order = match(found[-1], left, eigenvalues, right)
+            eigenvalues, left_new = eigenvalues[order], left_new[order]
+        found.append(eigenvalues)
+        left = left_new
+    table = np.array(found)
+    unit = (model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]).unit
+    return RootLocus(parameter, unit, along, table, _limits(at, along, table))
 
-    part = model.channel(input, output)
-    a, b, c, d = part.standard()
-    if not _connected(a, b, c, d):
-        none = np.zeros(0, dtype=complex)
-        return TransferFunction(input, output, none, none, 0.0)
-    all_poles, all_zeros = np.linalg.eigvals(a).astype(complex), zeros(a, b, c, d)
-    hidden = uncontrollable_unobservable(a, b, c)
-    kept_poles, kept_zeros, cancelled = _cancel(all_poles, all_zeros, hidden)
-    gain = _gain(a, b, c, d, kept_zeros, kept_poles)
-    return TransferFunction(input, output, _paired(kept_zeros), _paired(kept_poles), gain, tuple(cancelled))
+
+class _Along:
+    """The state matrix at a value of the parameter."""
+
+    def __init__(self, model: Model, parameter: str, fixed: dict[str, float]) -> None:
+        self.model, self.parameter = model, parameter
+        own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
+        start = {parameter: own.value}
+        self._search = EquilibriumSearch.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
+        self._place = names.index(parameter)
+
+    def _at(self, value: float) -> EquilibriumSearch:
+        """The search at a value: nothing else in it changes but the guesses that stand on parameters."""
+        key = "p" if self.parameter in self.model.parameters else "u"
+        values = getattr(self._search, key).copy()
+        values[self._place] = value
+        return replace(self._search, **{key: values})
+
+    def matrix(self, value: float) -> Array:
+        """A alone at the value's own operating point: the steady state that a simulation starts from there."""
+        search = self._at(value)
+        try:
+            root, _ = steady(self.model, search)
+        except SteadyStateError as e:
+            raise e.at(f"{self.parameter} = {value:g}") from None
+        return state_matrix(self.model, search.system, *search.vectors(root.v))
 
 
-def _connected(a: Array, b: Array, c: Array, d: Array) -> bool:
-    if np.any(d):
-        return True
-    reached = np.any(b != 0, axis=1)
-    for _ in range(a.shape[0]):
-        reached = reached | (np.abs(a) @ reached > 0)
-    return bool((np.abs(c) @ reached > 0).any())
+def at_zero(table: Array) -> Array:
+    """Which eigenvalues (points, modes) are 0 but for rounding."""
+    return np.asarray(np.abs(table) <= ZERO * np.maximum(1.0, np.abs(table).max(axis=1, keepdims=True)))
 
 
-def _cancel(poles: Array, zeros_: Array, hidden: Array) -> tuple[Array, Array, list[tuple[complex, complex]]]:
-    """Poles and zeros without the pairs that stand for a hidden, stable mode."""
-    left, pairs = list(zeros_), []
-    kept = []
-    candidates = list(hidden)
-    for p in poles:
-        match = min(candidates, key=lambda h: abs(h - p), default=None)
-        near = min(range(len(left)), key=lambda k: abs(left[k] - p), default=None)
-        close = 1e-6 * max(1.0, abs(p))
-        if (
-            match is not None
-            and abs(match - p) < close
-            and near is not None
-            and abs(left[near] - p) < close
-            and p.real < 0
-        ):
-            candidates.remove(match)
-            pairs.append((complex(p), complex(left.pop(near))))
+def match(before: Array, left: Array, after: Array, right: Array) -> Array:
+    """The order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding between alike."""
+    likeness = np.abs(left @ right)
+    likeness = likeness / np.maximum(likeness.max(axis=1, keepdims=True), 1e-300)
+    distance = np.abs(before[:, None] - after[None, :])
+    scale = np.maximum(np.abs(before)[:, None], 1e-6 * np.abs(before).max(initial=1.0))
+    cost = (1.0 - likeness) + np.minimum(distance / np.maximum(scale, 1e-300), 10.0)
+    order = np.argmax(-cost, axis=1)
+    return order if np.unique(order).size == order.size else np.asarray(linear_sum_assignment(cost)[1])
+
+
+def _limits(at: _Along, values: Array, table: Array) -> tuple[StabilityLimit, ...]:
+    """Return the values at which a mode's real part changes sign, to the last digits, by bisection."""
+    found = []
+    resting = at_zero(table)
+    for k in range(values.size - 1):
+        a, b = table[k].real, table[k + 1].real
+        for j in np.flatnonzero(((a < 0) != (b < 0)) & ~(resting[k] & resting[k + 1])):
+            if table[k, j].imag < 0:
+                continue
+            value, eigenvalue = _crossing(
+                at, float(values[k]), float(values[k + 1]), complex(table[k, j]), bool(a[j] < 0)
+            )
+            found.append(StabilityLimit(value, eigenvalue, "lost" if a[j] < 0 else "won"))
+    return tuple(found)
+
+
+def _crossing(at: _Along, low: float, high: float, start: complex, stable_below: bool) -> tuple[float, complex]:
+    current = start
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            break
+        eigenvalues = np.linalg.eigvals(at.matrix(middle))
+        current = complex(eigenvalues[np.argmin(np.abs(eigenvalues - current))])
+        if (current.real < 0) == stable_below:
+            low = middle
         else:
-            kept.append(p)
-    return np.array(kept, dtype=complex), np.array(left, dtype=complex), pairs
-
-
-def _paired(values: Array) -> Array:
-    """Sorted by size; rounding's imaginary parts removed."""
-    values = np.where(np.abs(values.imag) < 1e-13 * np.abs(values), values.real, values)
-    return np.asarray(values[np.lexsort((-values.imag, values.real, np.abs(values).round(12)))], dtype=complex)
-
-
-def _gain(a: Array, b: Array, c: Array, d: Array, zeros_: Array, poles: Array) -> float:
-    """The leading coefficient, from values of the transfer function at points away from every pole and zero."""
-    sizes = np.abs(np.concatenate([poles, zeros_, [1.0 + 0j]]))
-    typical = float(np.exp(np.log(np.maximum(sizes, 1e-3)).mean()))
-    found, eye = [], np.eye(a.shape[0])
-    for angle in (0.31, 0.77, 1.23):
-        s = 1.7 * typical * np.exp(1j * angle)
-        value = (c @ np.linalg.solve(s * eye - a, b) + d)[0, 0]
-        log = np.log(value) + np.log(s - poles).sum() - np.log(s - zeros_).sum() if value != 0 else -np.inf
-        found.append(float(np.exp(log).real))
-    return float(np.median(found))
+            high = middle
+        if abs(high - low) <= 1e-13 * max(abs(high), abs(low)):
+            break
+    return 0.5 * (low + high), current

@@ -18,7 +18,7 @@ from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.modal import Mode
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize.locus import RootLocus
+    from hvdc_ident.linearize.modal import RootLocus
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")

@@ -14,7 +14,7 @@ import numpy as np
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.system import Array
 
 LARGEST = 50_000_000  # bytes
 _HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}

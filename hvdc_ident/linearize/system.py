@@ -12,16 +12,18 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.linearize.limits import Condition, conditions
-from hvdc_ident.linearize.matrices import Array
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.kept import by_structure
 from hvdc_ident.simulate.machine import Code, Function
 from hvdc_ident.simulate.structure import Structure
+
+Array = NDArray[Any]
 
 
 def evaluate(graph: Graph, roots: Iterable[int], leaves: Mapping[int, Any], size: int) -> list[Any]:

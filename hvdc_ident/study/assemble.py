@@ -13,7 +13,7 @@ from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.fit import FitResult, Free
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.impedance import MeasuredResponse
+from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter

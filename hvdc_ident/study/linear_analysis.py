@@ -11,8 +11,7 @@ from hvdc_ident.model import Model
 from hvdc_ident.study import schema
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize import LinearModel, OperatingPoint
-    from hvdc_ident.linearize.impedance import Port
+    from hvdc_ident.linearize import LinearModel, OperatingPoint, Port
     from hvdc_ident.study.study import Study
 
 MOST_NORMS = 12
@@ -117,7 +116,7 @@ def operating_point(study: Study, values: Mapping[str, float] | None = None) -> 
 
 def modes_of(study: Study, linear: LinearModel) -> list[dict[str, Any]]:
     """Return every mode as plain numbers, with a name from the parts of the plant that take part in it where these are known."""
-    from hvdc_ident.linearize.modal import named, parts_of
+    from hvdc_ident.linearize import named, parts_of
 
     if not isinstance(study.model, Model):
         return [m.to_dict() for m in linear.modes()]
@@ -173,9 +172,7 @@ def _trimmed(trim: schema.TrimTable, linear: LinearModel) -> dict[str, Any]:
 
 
 def _margins(asked: schema.LinearizeTable, linear: LinearModel) -> dict[str, Any]:
-    from hvdc_ident.linearize.distance import ncf_margin
-    from hvdc_ident.linearize.open_loop import loop, plant_and_controller
-    from hvdc_ident.linearize.stability_margins import loop_margins
+    from hvdc_ident.linearize import loop, loop_margins, ncf_margin, plant_and_controller
 
     point = linear.point
     assert point is not None and isinstance(point.model, Model)
@@ -201,8 +198,7 @@ def _reduced(asked: schema.ReduceTable, linear: LinearModel) -> dict[str, Any]:
 
 def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:
     """The other model's linear model at the same inputs and, by name, parameters, against this one's."""
-    from hvdc_ident.linearize import find_operating_point, linearize
-    from hvdc_ident.linearize.distance import compare
+    from hvdc_ident.linearize import compare, find_operating_point, linearize
 
     point, other = linear.point, study.compared
     assert point is not None and other is not None
@@ -216,7 +212,7 @@ def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:
 def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[dict[str, Any]]:
     """Each transfer function with some parameters as symbols; where there is none, the reason."""
     from hvdc_ident.errors import LinearizationError
-    from hvdc_ident.linearize.symbolic import symbolic_transfer
+    from hvdc_ident.linearize import symbolic_transfer
 
     model = study.model
     assert isinstance(model, Model)
@@ -237,7 +233,7 @@ def _locus(asked: schema.LocusTable, linear: LinearModel) -> dict[str, Any]:
     """The eigenvalues along the parameter, all else as at the operating point."""
     import numpy as np
 
-    from hvdc_ident.linearize.locus import root_locus
+    from hvdc_ident.linearize import root_locus
 
     point = linear.point
     assert point is not None and isinstance(point.model, Model)
@@ -249,7 +245,7 @@ def _locus(asked: schema.LocusTable, linear: LinearModel) -> dict[str, Any]:
 
 def port_of(table: schema.PortTable) -> Port:
     """Return the port that a table of the study describes."""
-    from hvdc_ident.linearize.impedance import Port
+    from hvdc_ident.linearize import Port
 
     source, voltage, current = (
         (v[0], v[1]) if len(v) == 2 else (v[0],) for v in (table.source, table.voltage, table.current)
@@ -261,8 +257,8 @@ def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[di
     """The impedance of each port, and a file of each."""
     import numpy as np
 
+    from hvdc_ident.linearize import port_impedance
     from hvdc_ident.linearize.export.csv_response import text
-    from hvdc_ident.linearize.impedance import port_impedance
 
     point = linear.point
     assert point is not None and isinstance(point.model, Model)

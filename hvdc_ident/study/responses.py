@@ -15,9 +15,15 @@ from hvdc_ident.errors import InputError, LinearizationError, SteadyStateError, 
 from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.frequency import FrequencyResponse
-from hvdc_ident.linearize.impedance import MeasuredResponse, Port, response_at_tones, response_from_record
-from hvdc_ident.linearize.response_file import ResponseFile, read_response
+from hvdc_ident.linearize import (
+    FrequencyResponse,
+    MeasuredResponse,
+    Port,
+    ResponseFile,
+    read_response,
+    response_at_tones,
+    response_from_record,
+)
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
 from hvdc_ident.study.linear_analysis import port_of

@@ -15,7 +15,7 @@ from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.impedance import MeasuredResponse
+from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema

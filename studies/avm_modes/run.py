@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.linearize import LinearModel, linearize
-from hvdc_ident.linearize.modal import named_modes, parts_of
+from hvdc_ident.linearize import LinearModel, linearize, named_modes, parts_of
 from hvdc_ident.models import load_model
 
 CASES = ("vsc-hvdc-avm", "vsc-hvdc-avm-unfiltered", "vsc-hvdc-avm-authors")

@@ -14,7 +14,7 @@ WITH_EXAMPLES = (
     "hvdc_ident.data.signals",
     "hvdc_ident.linearize.distance",
     "hvdc_ident.linearize.jacobian",
-    "hvdc_ident.linearize.open_loop",
+    "hvdc_ident.linearize.loops",
     "hvdc_ident.linearize.operating_point",
     "hvdc_ident.models",
     "hvdc_ident.sensitivity.sweep_run",

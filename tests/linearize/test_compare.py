@@ -6,10 +6,9 @@ import pytest
 from helpers import linear, stable
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize import linearize
-from hvdc_ident.linearize.distance import difference, nu_gap
-from hvdc_ident.linearize.norms import h2_norm, hinf_norm
-from hvdc_ident.linearize.reduce import balanced, minimal
+from hvdc_ident.linearize import balanced, h2_norm, hinf_norm, linearize, nu_gap
+from hvdc_ident.linearize.distance import difference
+from hvdc_ident.linearize.reduction import minimal
 from hvdc_ident.models import load_model
 
 

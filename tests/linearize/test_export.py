@@ -6,10 +6,9 @@ import pytest
 from helpers import linear
 
 from hvdc_ident.errors import InputError, UnknownNameError
-from hvdc_ident.linearize import LinearModel, find_operating_point, linearize
+from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, root_locus
 from hvdc_ident.linearize.export import formats, read, write
 from hvdc_ident.linearize.export.sections import sections
-from hvdc_ident.linearize.locus import root_locus
 from hvdc_ident.models import load_model
 
 NAMES = [f"{k}_{w}" for k in ("state", "input", "output") for w in ("names", "units")]

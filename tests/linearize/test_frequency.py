@@ -8,25 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hvdc_ident.errors import LinearizationError, UnknownNameError, WaveformError
-from hvdc_ident.linearize import find_operating_point, linearize
-from hvdc_ident.linearize.delays import pade, response
-from hvdc_ident.linearize.frequency import (
-    bands,
-    frequency_response,
-    sensitivity,
-    sigma,
-)
-from hvdc_ident.linearize.impedance import (
+from hvdc_ident.linearize import (
     Port,
+    find_operating_point,
+    frequency_response,
+    linearize,
+    loop,
+    margins,
     port_admittance,
     port_impedance,
     response_from_record,
     simulated_response,
+    symbolic_transfer,
 )
-from hvdc_ident.linearize.modal import zeros
-from hvdc_ident.linearize.open_loop import loop
-from hvdc_ident.linearize.stability_margins import margins
-from hvdc_ident.linearize.symbolic import symbolic_transfer
+from hvdc_ident.linearize.delays import pade, response
+from hvdc_ident.linearize.frequency import bands, sensitivity, sigma
+from hvdc_ident.linearize.transfer_function import zeros
 from hvdc_ident.models import load_model
 
 DELAY = [{"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}}]

@@ -5,8 +5,7 @@ import pytest
 import scipy.signal
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.linearize.impedance import response_at_tones
-from hvdc_ident.linearize.response_file import read_response
+from hvdc_ident.linearize import read_response, response_at_tones
 
 W = np.array([1.0, 2.0, 5.0]) * 2 * np.pi
 Z = np.array([1.2 - 0.3j, 0.5 + 2.0j, -1.0 + 0.1j])

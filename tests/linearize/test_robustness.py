@@ -6,12 +6,23 @@ import pytest
 from helpers import linear, stable
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize import find_operating_point
-from hvdc_ident.linearize.distance import compare, difference, gap, ncf_margin, nu_gap
-from hvdc_ident.linearize.norms import hinf_norm, linf_norm, norms
-from hvdc_ident.linearize.open_loop import loop, plant_and_controller
-from hvdc_ident.linearize.reduce import balanced
-from hvdc_ident.linearize.stability_margins import loop_margins, margins, structured_singular_value
+from hvdc_ident.linearize import (
+    balanced,
+    compare,
+    find_operating_point,
+    gap,
+    hinf_norm,
+    linf_norm,
+    loop,
+    loop_margins,
+    margins,
+    ncf_margin,
+    nu_gap,
+    plant_and_controller,
+)
+from hvdc_ident.linearize.distance import difference
+from hvdc_ident.linearize.loops import structured_singular_value
+from hvdc_ident.linearize.reduction import norms
 from hvdc_ident.models import load_model
 
 

@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from hvdc_ident.linearize import linearize
-from hvdc_ident.linearize.distance import difference, nu_gap
-from hvdc_ident.linearize.locus import root_locus
-from hvdc_ident.linearize.norms import hinf_norm
-from hvdc_ident.linearize.open_loop import loop
-from hvdc_ident.linearize.reduce import without_sliding_means
-from hvdc_ident.linearize.stability_margins import margins
+from hvdc_ident.linearize import hinf_norm, linearize, loop, margins, nu_gap, root_locus
+from hvdc_ident.linearize.distance import difference
+from hvdc_ident.linearize.reduction import without_sliding_means
 from hvdc_ident.models import load_model
 
 W = np.logspace(-1, 2.5, 9)

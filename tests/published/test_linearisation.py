@@ -10,10 +10,17 @@ import sympy as sp
 
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, point_at
-from hvdc_ident.linearize.distance import gap, nu_gap
-from hvdc_ident.linearize.norms import h2_norm, hinf_norm
-from hvdc_ident.linearize.stability_margins import margins
+from hvdc_ident.linearize import (
+    LinearModel,
+    find_operating_point,
+    gap,
+    h2_norm,
+    hinf_norm,
+    linearize,
+    margins,
+    nu_gap,
+    point_at,
+)
 from hvdc_ident.model import Model, Output, Signal, State
 from hvdc_ident.parameters import Input, Parameter
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from hvdc_ident.cli import app
 from hvdc_ident.fit.frequency_data import WithResponses, frequency_experiment
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.impedance import MeasuredResponse, Port
+from hvdc_ident.linearize import MeasuredResponse, Port
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 

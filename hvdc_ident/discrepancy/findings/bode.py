@@ -10,8 +10,7 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.errors import InputError
-from hvdc_ident.linearize import find_operating_point, linearize
-from hvdc_ident.linearize.frequency import frequency_response
+from hvdc_ident.linearize import find_operating_point, frequency_response, linearize
 from hvdc_ident.model import AnyModel
 
 POINTS = 60

@@ -8,8 +8,8 @@ import numpy as np
 
 from hvdc_ident.files import write_text
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.linearize.modal import TransferFunction
+from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.transfer_function import TransferFunction
 
 SUFFIX = ".tex"
 SUMMARY = "the transfer functions in LaTeX, zeros and poles with six digits"

@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_text
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.system import Array
 
 SUFFIX = ".m"
 SUMMARY = "a MATLAB or Octave script that builds the state space, with names and operating point"

@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.errors import LinearizationError, ModelError
 from hvdc_ident.files import write_text
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.matrices import Array
+from hvdc_ident.linearize.system import Array
 
 SUFFIX = ".mo"
 SUMMARY = "Modelica text of the state space: inputs and outputs in the plant's own values"

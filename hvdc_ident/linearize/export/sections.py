@@ -10,8 +10,8 @@ import numpy as np
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import json_text, write_text
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.matrices import Array
-from hvdc_ident.linearize.modal import TransferFunction
+from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.transfer_function import TransferFunction
 
 SUFFIX = ".zpk"
 SUMMARY = "zeros, poles, gain and continuous second-order sections of every channel, as JSON"
