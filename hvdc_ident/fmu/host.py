@@ -6,39 +6,28 @@ This contains crashes, hangs and leaks. It does not contain malice: load only FM
 from __future__ import annotations
 
 import contextlib
-import math
 import multiprocessing
 import os
-import pickle
-import socket
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from hashlib import sha256
 from itertools import islice
-from multiprocessing import reduction
-from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
 from pathlib import Path
 from threading import Lock
-from typing import IO, Any
+from typing import Any
 
-import hvdc_ident
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, unknown_name
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
+from hvdc_ident.fmu.endings import call_of, crash, more_memory, overdue
 from hvdc_ident.fmu.folder import Folder, joined
 from hvdc_ident.fmu.folder import unpacked as new_folder
-from hvdc_ident.fmu.messages import BEGAN, NOW, PROCESS, START, STOP, packed, progress_file, progress_in, unpacked
-
-Answer = tuple[dict[str, Any], dict[str, Array]]
-PATIENCE = 5.0  # s for the supervisor to tell how a worker ended, of which it needs a few milliseconds
-LOOKS = 20  # looks at the progress within a deadline: what has not moved over the last two of them stands still
-STALL = 0.5  # s that a run at least stands still for: a busy computer lets a process wait for less
+from hvdc_ident.fmu.worker import Setup
+from hvdc_ident.processes import MIB, ChildProcess, Ending, Message, Supervisor, Watch, packed, unpacked
+from hvdc_ident.processes.server import is_worker
+from hvdc_ident.processes.supervisor import last_line
 
 
 @dataclass(frozen=True)
@@ -76,13 +65,9 @@ class Limits:
 
 @dataclass(eq=False)
 class _Worker:
-    """A process with the FMU in it. said: what it prints goes there. progress: how far it is."""
+    """A process with the FMU in it. resident, space: its bytes of memory and of address space after its last answer."""
 
-    number: int
-    connection: Connection
-    said: IO[bytes]
-    progress: memoryview[float]
-    budget: Budget
+    process: ChildProcess
     runs: int = 0
     known: int = 0  # how much of what workers found out it was told
     resident: int = 0
@@ -91,81 +76,7 @@ class _Worker:
     @property
     def pid(self) -> int:
         """Its process, 0 before it began."""
-        return int(self.progress[PROCESS])
-
-    def close(self) -> None:
-        for end in (self.connection, self.said):
-            with contextlib.suppress(OSError):
-                end.close()
-
-
-class _Supervisor:
-    """The process that starts workers and knows how they ended. See `hvdc_ident.fmu.supervisor`."""
-
-    def __init__(self, description: Description, limits: Limits, folder: Folder) -> None:
-        self.owner, self.memory = os.getpid(), limits.memory
-        here, there = socket.socketpair()
-        root = str(Path(hvdc_ident.__file__).resolve().parents[1])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        self.said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "hvdc_ident.fmu.supervisor", str(there.fileno()), str(folder.lock)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=self.said,
-            pass_fds=(there.fileno(), folder.lock),
-            env={**os.environ, **one, "PYTHONPATH": path},
-            start_new_session=True,  # what a terminal sends to all its processes is for the host
-        )
-        there.close()
-        self.connection = Connection(here.detach())
-        self.last = ""  # line that it wrote
-        self.ended: dict[int, Ending] = {}
-        self.started = 0
-        heading = {"parent": os.getpid(), "memory": limits.memory, "folder": str(folder.path)}
-        self.connection.send_bytes(packed(heading))
-        self.connection.send_bytes(pickle.dumps(description))
-
-    def start(self, heading: Mapping[str, Any]) -> _Worker:
-        """A worker that loads the FMU now. Raises OSError where the supervisor is gone."""
-        self.started += 1
-        here, there = socket.socketpair()
-        progress, said = progress_file(), tempfile.TemporaryFile()  # noqa: SIM115 - they live as long as the worker
-        with there, progress, socket.socket(fileno=os.dup(self.connection.fileno())) as passing:
-            worker = _Worker(
-                self.started, Connection(here.detach()), said, progress_in(progress.fileno()), Budget(self.memory)
-            )
-            worker.progress[BEGAN], worker.progress[NOW] = time.monotonic(), math.nan
-            self.connection.send_bytes(packed({**heading, "start": worker.number}))
-            reduction.sendfds(passing, [there.fileno(), progress.fileno(), said.fileno()])
-        return worker
-
-    def end(self, worker: _Worker) -> Ending | None:
-        """Return how a worker ended, which it is made to do where it has not; None where the supervisor is gone."""
-        with contextlib.suppress(OSError, EOFError):
-            self.connection.send_bytes(packed({"end": worker.number}))
-            while worker.number not in self.ended and self.connection.poll(PATIENCE):
-                heading, _ = unpacked(self.connection.recv_bytes())
-                self.ended[heading["ended"]] = Ending.heard(heading)
-        found = self.ended.pop(worker.number, None)
-        if found is None:
-            self.close()  # the system ends its workers with it
-        return found
-
-    def close(self) -> None:
-        """End it and every worker; in a process that was forked from its owner, only let go of it."""
-        self.connection.close()
-        self.last = _last_line(self.said)
-        self.said.close()
-        if self.owner == os.getpid() and self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-
-    @property
-    def gone(self) -> bool:
-        """True once it has ended."""
-        return self.process.poll() is not None
+        return self.process.pid
 
 
 @dataclass(eq=False)
@@ -174,13 +85,13 @@ class _Processes:
 
     owner: int
     folder: Folder
-    supervisor: _Supervisor | None = None
+    supervisor: Supervisor | None = None
     workers: dict[int, _Worker] = field(default_factory=dict)
 
     def close(self) -> None:
         """End all processes; remove the folder where no other process uses it."""
         for worker in self.workers.values():
-            worker.close()
+            worker.process.close()
         self.workers.clear()
         if self.supervisor is not None:
             self.supervisor.close()
@@ -228,7 +139,7 @@ class Host:
         self.__dict__.update(state)
         self.__post_init__()
 
-    def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """A worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker.
 
         An answer {"again": 1} says that a new process may do what this one, which was used before, cannot: the process
@@ -291,11 +202,11 @@ class Host:
             self._single, self._useless = True, None
         return not self._single
 
-    def _together(self, headings: Sequence[Mapping[str, Any]], arrays: Mapping[str, Array]) -> list[Answer]:
+    def _together(self, headings: Sequence[Mapping[str, Any]], arrays: Mapping[str, Array]) -> list[Message]:
         """The answers of as many workers as headings, all asked at once. Raises the first failure among them."""
         sent = [self._sent(self._ready(number), h, arrays) for number, h in enumerate(headings)]
         self._busy = len(sent)
-        answers: list[Answer] = []
+        answers: list[Message] = []
         failures: list[SimulationError] = []
         for number, (worker, h) in enumerate(zip(sent, headings, strict=True)):
             try:
@@ -306,7 +217,7 @@ class Host:
             raise failures[0]
         return answers
 
-    def _answer(self, number: int, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def _answer(self, number: int, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """The answer of a worker that was asked, or of the one that replaces it."""
         fresh = worker.runs == 1
         answer, out = self._heard(worker, "run")
@@ -330,31 +241,28 @@ class Host:
     def _sent(self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _Worker:
         """The worker, once it is asked, with what others have found out meanwhile."""
         worker.runs += 1
-        worker.progress[BEGAN] = time.monotonic()
+        worker.process.begin()
         news = dict(islice(self._found.items(), worker.known, None))
         worker.known = len(self._found)
         with contextlib.suppress(OSError):  # it is gone: noticed when it is heard
-            worker.connection.send_bytes(packed({**heading, "found": news}, arrays))
+            worker.process.connection.send_bytes(packed({**heading, "found": news}, arrays))
         return worker
 
-    def _heard(self, worker: _Worker, what: str) -> Answer:
+    def _heard(self, worker: _Worker, what: str) -> Message:
         """The answer of a worker. Raises SimulationError where it ends or hangs."""
         deadline = self.limits.load if what == "loading" else self.limits.deadline
-        watch = _Watch(worker.progress, deadline)
+        watch = Watch(worker.process.progress, deadline)
         while True:
             try:
-                if not worker.connection.poll(watch.pause()):
+                if not worker.process.connection.poll(watch.pause()):
                     if watch.over():
                         raise self._hung(worker, what, watch)
                     continue
-                heading, arrays = unpacked(worker.connection.recv_bytes())
+                heading, arrays = unpacked(worker.process.connection.recv_bytes())
             except (EOFError, OSError):
                 return self._lost(worker, f"in the {what}")
             worker.resident = int(heading.get("memory", worker.resident))
             worker.space = int(heading.get("space", worker.space))
-            if "more" in heading:
-                worker.budget = Budget(self.limits.memory, int(heading["resident"]), int(heading["space"]))
-                continue
             if heading.get("fatal"):
                 self._end(worker)
             return heading, arrays
@@ -364,9 +272,10 @@ class Host:
         t = heading.get("time")
         said = heading.get("said", "")
         what, hint = heading["failed"], heading.get("hint", "")
-        taken = worker.budget.taken(worker.resident, max(worker.space, int(heading.get("needed", 0))))
-        if worker.budget.exhausted(taken):
-            what, hint = f"{what}; {worker.budget.told(taken)}", worker.budget.hint
+        budget = worker.process.budget
+        taken = budget.taken(worker.resident, worker.space)
+        if budget.exhausted(taken):
+            what, hint = f"{what}; {budget.told(taken)}", more_memory(budget)
         return self._error(
             what, where="" if t is None else f"t = {t:.6g} s", got=f"the FMU said: {said}" if said else "", hint=hint
         )
@@ -375,21 +284,21 @@ class Host:
         name = self.description.path.name
         return SimulationError(what, where=f"{name}, {where}" if where else name, got=got, hint=hint)
 
-    def _hung(self, worker: _Worker, what: str, watch: _Watch) -> SimulationError:
+    def _hung(self, worker: _Worker, what: str, watch: Watch) -> SimulationError:
         """A worker that is past its deadline, which is ended."""
         instants, still = watch.instants(), watch.still()
-        said = _last_line(worker.said)
+        said = worker.process.last_line
         end = self._end(worker) or Ending(-9)
         limit = "load" if what == "loading" else "deadline"
-        text, hint = overdue(end, worker.budget, what, (limit, watch.deadline), instants, still)
+        text, hint = overdue(end, worker.process.budget, what, (limit, watch.deadline), instants, still)
         return self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
 
-    def _lost(self, worker: _Worker, when: str) -> Answer:
+    def _lost(self, worker: _Worker, when: str) -> Message:
         """The answer of a worker that is gone. Raises SimulationError where a new one cannot be expected to do better."""
         supervisor = self._supervisor()
-        said = _last_line(worker.said)
+        said = worker.process.last_line
         end = self._end(worker)
-        if end is not None and worker.runs > 1 and "Instantiate" in end.call:
+        if end is not None and worker.runs > 1 and "Instantiate" in call_of(end):
             return {"again": 1}, {}  # some FMUs give one instance a process, and crash at the second
         if end is None:
             said = supervisor.last
@@ -398,7 +307,7 @@ class Host:
                 f"the process that watches the FMU's workers ended {when}, exit code {code}",
                 got=f"it said: {said}" if said else "",
             )
-        text, hint = crash(end, worker.budget, when)
+        text, hint = crash(end, worker.process.budget, when)
         raise self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
 
     # --- processes ---
@@ -416,7 +325,8 @@ class Host:
 
     def _leaks(self, worker: _Worker) -> bool:
         """Return whether the worker kept so much memory that the next run may find too little."""
-        return worker.budget.exhausted(worker.budget.taken(worker.resident, worker.space))
+        budget = worker.process.budget
+        return budget.exhausted(budget.taken(worker.resident, worker.space))
 
     def _mine(self) -> _Processes:
         """The processes of this one; those of a process that this was forked from are left to it."""
@@ -429,10 +339,15 @@ class Host:
             self._finalizer = Finalize(self, self._processes.close, exitpriority=20)
         return self._processes
 
-    def _supervisor(self) -> _Supervisor:
+    def _supervisor(self) -> Supervisor:
         processes = self._mine()
         if processes.supervisor is None:
-            processes.supervisor = _Supervisor(self.description, self.limits, processes.folder)
+            processes.supervisor = Supervisor(
+                "hvdc_ident.fmu.worker",
+                Setup(self.description, processes.folder),
+                memory=self.limits.memory,
+                keeps=[processes.folder.lock],
+            )
         return processes.supervisor
 
     def _start(self, number: int) -> _Worker:
@@ -443,7 +358,7 @@ class Host:
         self.started += 1
         worker: _Worker | None = None
         try:
-            worker = supervisor.start({"learned": self.learned})
+            worker = _Worker(supervisor.start(self.learned))
             self._mine().workers[number] = worker
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
@@ -451,7 +366,7 @@ class Host:
         except OSError:
             self._useless = self._error(
                 "the process that watches the FMU's workers ended before one began",
-                got=_last_line(supervisor.said),
+                got=last_line(supervisor.printed),
             )
             self._closed()
             raise self._useless from None
@@ -470,8 +385,7 @@ class Host:
         if at is None or processes.supervisor is None:  # ended before
             return None
         del processes.workers[at]
-        end = processes.supervisor.end(worker)
-        worker.close()
+        end = processes.supervisor.end(worker.process)
         if processes.supervisor.gone:
             processes.supervisor = None
         return end
@@ -483,46 +397,13 @@ class Host:
             self._processes = None
 
 
-class _Watch:
-    """The deadline of one run, and whether the run moves. progress: shared with the worker."""
-
-    def __init__(self, progress: memoryview[float], deadline: float) -> None:
-        self.progress, self.deadline = progress, deadline
-        self.began = self.moved = time.monotonic()
-        self.at = (math.nan, math.nan)
-
-    def pause(self) -> float:
-        """For how long to wait before the next look, s."""
-        self._look()
-        return max(0.0, min(self.progress[BEGAN] + self.deadline - time.monotonic(), self.deadline / LOOKS))
-
-    def over(self) -> bool:
-        """Return whether the run is past its deadline."""
-        self._look()
-        return time.monotonic() >= self.progress[BEGAN] + self.deadline
-
-    def instants(self) -> tuple[float, float, float]:
-        """First, last and present instant of the run, s, nan where not known."""
-        return self.progress[START], self.progress[STOP], self.progress[NOW]
-
-    def still(self) -> float | None:
-        """For how long the run has stood still, s; None where it moves, or was not watched for long enough."""
-        stood = time.monotonic() - self.moved
-        return stood if stood > max(2 * self.deadline / LOOKS, STALL) else None
-
-    def _look(self) -> None:
-        at = (self.progress[BEGAN], self.progress[NOW])
-        if at != self.at and not (math.isnan(at[1]) and at[0] == self.at[0]):
-            self.at, self.moved = at, time.monotonic()
-
-
 def _run_of(heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
     """Return a digest of everything that decides the outputs of a run."""
     own = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
     return sha256(packed(own, arrays)).digest()
 
 
-def _joined(parameters: list[str], shares: list[list[str]], parts: list[Answer]) -> Answer:
+def _joined(parameters: list[str], shares: list[list[str]], parts: list[Message]) -> Message:
     """One answer with the columns that several workers have made."""
     (first, out), notes = parts[0], dict(parts[0][0]["notes"])
     gradients, errors = out["gradients"].copy(), out["errors"].copy()
@@ -543,7 +424,7 @@ def idle_cores(own: int) -> int:
     own: how many worked for the caller lately; they count as load. A process that a pool has started is one of several
     that share the cores already.
     """
-    if multiprocessing.parent_process() is not None:
+    if is_worker() or multiprocessing.parent_process() is not None:
         return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
@@ -551,16 +432,3 @@ def idle_cores(own: int) -> int:
     except OSError:
         others = 0.0
     return max(1, round(cores - others))
-
-
-def _last_line(said: IO[bytes]) -> str:
-    """The last line that a process wrote."""
-    with contextlib.suppress(ValueError, OSError):
-        said.seek(0, os.SEEK_END)
-        said.seek(max(0, said.tell() - 2000))
-        lines = said.read().decode("utf-8", "replace").strip().splitlines()
-        return " ".join(lines[-1].split())[:300] if lines else ""
-    return ""
-
-
-__all__ = ["Answer", "Host", "Limits", "idle_cores"]

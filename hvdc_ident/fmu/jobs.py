@@ -15,14 +15,14 @@ from hvdc_ident.fmu import co_simulation, exchange
 from hvdc_ident.fmu.binding import Block, Failure
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.differences import ENOUGH, SHORT, Step, derivative, first, noise_of, pair, rms
-from hvdc_ident.fmu.isolation import result
 from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed, failure
 from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moving
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.fmu.tangent import Point, Tangent
+from hvdc_ident.processes.messages import Message
+from hvdc_ident.processes.server import die_like, in_new_process
 
 KEPT_STEPS = 1000
-Answer = tuple[dict[str, Any], dict[str, Array]]
 LOST = 0.5  # relative error from which a derivative is not told from noise
 START_STEP = 1e-3  # of differences of the start by a parameter, in its sizes
 STIRRED = 0.1  # step of an input that shows whether a run is repeated, in sizes of the input
@@ -66,11 +66,11 @@ class Jobs:
         """True where the FMU is kept out of this process: each of its runs has one, or how it restarts is not known yet."""
         return self.learned.get("restart", "process") == "process"
 
-    def load(self) -> Answer:
+    def load(self) -> Message:
         """Make an instance, or a first one in a process of its own, so that what cannot be loaded says so."""
-        return result(self._loaded) if self.isolated else self._loaded()
+        return isolated_result(self._loaded) if self.isolated else self._loaded()
 
-    def _loaded(self) -> Answer:
+    def _loaded(self) -> Message:
         self.plant.instantiate()
         return {}, {}
 
@@ -81,14 +81,14 @@ class Jobs:
             self.made.abandon()
         return found
 
-    def do(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def do(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Return the answer to a request, with what was learned."""
         self.runs = 0
         self._take_over(heading.get("found", {}))
         known = len(self.steps), len(self.noise)
         work = {"simulate": self._simulate, "point": self._point, "starts": self._starts}[heading["do"]]
         if heading["do"] != "simulate" and self.isolated:
-            found, out = result(lambda: work(heading, arrays))
+            found, out = isolated_result(lambda: work(heading, arrays))
         else:
             found, out = work(heading, arrays)
         news = {f"step {k.hex()}": astuple(s) for k, s in islice(self.steps.items(), known[0], None)}
@@ -104,10 +104,10 @@ class Jobs:
             else:
                 self.noise.setdefault(bytes.fromhex(key), np.array(value))
 
-    def _simulate(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def _simulate(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         return _Simulation(self, heading, arrays).answer()
 
-    def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         point = Point(
             self.plant, heading["values"], arrays.get("x"), arrays["u"], heading["time"], tuple(heading["outputs"])
         )
@@ -120,7 +120,7 @@ class Jobs:
             **found, "jacobian": d.matrix, "directional": d.directional.astype(float), "nominals": self.plant.nominals()
         }  # fmt: skip
 
-    def _starts(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Answer:
+    def _starts(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Return what the parameters stand at where nobody sets them."""
         d = self.description
         u = np.array([v.start or 0.0 for v in d.inputs.values()])
@@ -160,7 +160,7 @@ class _Simulation:
         if "base" in arrays:
             self.jobs.last = (self._key_of(self.values, self.signals), arrays["base"])
 
-    def answer(self) -> Answer:
+    def answer(self) -> Message:
         if "restart" not in self.learned:
             self._find_restart()
         if REPEATED[self.learned["restart"]]:
@@ -294,12 +294,12 @@ class _Simulation:
     def _in_its_own_process(self, run: Callable[[Plant], Array], counts: exchange.Counts) -> Array:
         """(n, outputs) of a run in a process made for it; what it finds out of the FMU is kept."""
 
-        def work() -> Answer:
+        def work() -> Message:
             plant = self.jobs.make({k: v for k, v in self.learned.items() if k != "restart"})
             rows = run(plant)
             return {"learned": plant.learned, "counts": asdict(counts), "end": self.ended}, {"rows": rows}
 
-        heading, arrays = result(work)
+        heading, arrays = isolated_result(work)
         self.jobs.runs += 1
         self.learned |= heading["learned"]
         vars(counts).update(heading["counts"])
@@ -473,3 +473,13 @@ class _Simulation:
             at, (low, high) = self._now(name), self.bounds[name]
             moved[name] = at + (steps if high - at >= at - low else -steps) * SHORT * self.sizes[name]
         return self._run(*self._with(moved))
+
+
+def isolated_result(work: Callable[[], Message]) -> Message:
+    """Return what the work returns, done in a new process. Raises its failure; ends this process as that one ended."""
+    parts, end = in_new_process(lambda hand: hand(work()), lambda e: failure(e).told())
+    if isinstance(end, dict):
+        raise RunFailed.heard(end)
+    if isinstance(end, int):
+        die_like(end)
+    return parts[0]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu.isolation import die_like, in_new_process
-from hvdc_ident.fmu.plant import Plant, RunFailed
+from hvdc_ident.fmu.plant import Plant, RunFailed, failure
+from hvdc_ident.processes.server import die_like, in_new_process
 
 Way = Literal["reset", "instance", "process"]
 Make = Callable[[dict[str, Any]], Plant]
@@ -55,14 +55,13 @@ def _twice(make: Make, run: Callable[[Plant], Array], way: Way) -> tuple[Array, 
             if plant.learned["restart"] == way:
                 hand(({}, {"rows": rows}))
 
-    parts, end = in_new_process(work)
+    parts, end = in_new_process(work, lambda e: failure(e).told())
     runs = [arrays["rows"] for _, arrays in parts]
-    if runs:
-        return runs[0], (runs[1] if len(runs) > 1 else None)
-    if isinstance(end, RunFailed):
-        raise end
-    die_like(end or 0)
-    raise AssertionError("unreachable: the process has ended")
+    if not runs:
+        if isinstance(end, dict):
+            raise RunFailed.heard(end)
+        die_like(end or 0)
+    return runs[0], (runs[1] if len(runs) > 1 else None)
 
 
 def apart(run: Array, other: Array) -> Array:

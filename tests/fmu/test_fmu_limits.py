@@ -21,10 +21,11 @@ from fmu_limits import PATIENT
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError, ModelError, SimulationError
-from hvdc_ident.fmu.endings import MIB, Budget, Ending, crash, overdue
+from hvdc_ident.fmu.endings import crash, overdue
 from hvdc_ident.fmu.folder import LOCK, joined, sweep, unpacked
 from hvdc_ident.fmu.host import Limits, idle_cores
 from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.processes import MIB, Budget, Ending
 
 pytestmark = needs_compiler
 

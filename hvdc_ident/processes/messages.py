@@ -1,5 +1,5 @@
 """Messages between a process and its worker: a JSON heading and arrays of doubles, which cannot run code; and
-memory that both see, in which the worker notes how far it is."""
+shared memory in which the worker notes its progress."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from math import prod
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.data import Array
-
-PROCESS, BEGAN, START, STOP, NOW = range(5)
-"""Places in `progress`: the process that has the FMU, when its run began (s of the monotonic clock), and of the run the
-first, last and present instant, s."""
+Array = NDArray[np.float64]
+Message = tuple[dict[str, Any], dict[str, Array]]
+"""A heading and arrays."""
+PROCESS, RESIDENT, SPACE, BEGAN, ITEM, START, STOP, NOW = range(8)
+"""Places in the progress: the process at work; its bytes of memory and of address space before its work; when the present
+piece of work began (s of the monotonic clock) and its number; of a run its first, last and present instant, s."""
 
 
 def packed(heading: Mapping[str, Any], arrays: Mapping[str, Array] | None = None) -> bytes:
@@ -27,7 +29,7 @@ def packed(heading: Mapping[str, Any], arrays: Mapping[str, Array] | None = None
     return b"".join([len(text).to_bytes(8, "little"), text, *(a.tobytes() for a in parts.values())])
 
 
-def unpacked(message: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
+def unpacked(message: bytes) -> Message:
     """Return the heading and the arrays of a message. Raises ValueError where it is none."""
     size = int.from_bytes(message[:8], "little")
     outer = json.loads(message[8 : 8 + size])
@@ -55,6 +57,6 @@ def progress_in(file: int) -> memoryview[float]:
 
 def no_progress() -> memoryview[float]:
     """Return a progress that nobody watches."""
-    view = memoryview(bytearray(8 * 5)).cast("d")
+    view = memoryview(bytearray(8 * 8)).cast("d")
     view[NOW] = math.nan
     return view

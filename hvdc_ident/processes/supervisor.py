@@ -1,0 +1,249 @@
+"""The supervisor of this process's workers: a process that starts them, watches them and tells how they ended.
+
+See `hvdc_ident.processes.server` for its other side. It contains crashes, hangs and leaks, not malice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import pickle
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing import reduction
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import IO
+
+from hvdc_ident.processes.endings import Budget, Ending
+from hvdc_ident.processes.messages import (
+    BEGAN,
+    NOW,
+    PROCESS,
+    RESIDENT,
+    SPACE,
+    START,
+    STOP,
+    Message,
+    progress_file,
+    progress_in,
+    unpacked,
+)
+
+PATIENCE = 5.0  # s for the supervisor to tell how a worker ended, of which it needs a few milliseconds
+LOOKS = 20  # looks at the progress within a deadline: what has not moved over the last two of them stands still
+STALL = 0.5  # s that a run at least stands still for: a busy computer lets a process wait for less
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(eq=False)
+class ChildProcess:
+    """A worker, seen from the process that gives it work. printed: what it prints, where that is kept."""
+
+    number: int
+    connection: Connection
+    progress: memoryview[float]
+    memory: int | None
+    printed: IO[bytes] | None
+
+    @property
+    def pid(self) -> int:
+        """Its process, 0 before it began."""
+        return int(self.progress[PROCESS])
+
+    @property
+    def budget(self) -> Budget:
+        """The memory that it may take."""
+        return Budget(self.memory, int(self.progress[RESIDENT]), int(self.progress[SPACE]))
+
+    @property
+    def last_line(self) -> str:
+        """The last line that it printed."""
+        return last_line(self.printed)
+
+    def begin(self) -> None:
+        """Note that a piece of work begins: deadlines count from now on."""
+        self.progress[BEGAN] = time.monotonic()
+
+    def close(self) -> None:
+        """Close what joins it to this process."""
+        for end in (self.connection, self.printed):
+            with contextlib.suppress(OSError):
+                if end is not None:
+                    end.close()
+
+
+class Supervisor:
+    """A process that starts workers by forking, in a hundredth of the time that a new interpreter takes.
+
+    entry: name of the module that the workers run, see `hvdc_ident.processes.server`. setup: for its functions, pickled.
+    memory: bytes that a worker may take more than it begins with; None: no limit. keeps: descriptors that it inherits.
+    prints: whether workers print where this process does; else the last line of each is kept.
+    """
+
+    def __init__(
+        self,
+        entry: str,
+        setup: object = None,
+        *,
+        memory: int | None = None,
+        keeps: Sequence[int] = (),
+        prints: bool = False,
+    ) -> None:
+        self.owner, self.memory, self.prints = os.getpid(), memory, prints
+        here, there = socket.socketpair()
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        # There is a worker for every core: further threads of linear algebra would wait for each other.
+        one = {} if any(n in os.environ for n in THREADS) else dict.fromkeys(THREADS, "1")
+        self.printed: IO[bytes] | None = None if prints else tempfile.TemporaryFile()  # noqa: SIM115
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "hvdc_ident.processes.server", str(there.fileno())],
+            stdin=subprocess.DEVNULL,
+            stdout=None if prints else subprocess.DEVNULL,
+            stderr=self.printed,
+            pass_fds=(there.fileno(), *keeps),
+            env={**os.environ, **one, "PYTHONPATH": path},
+            start_new_session=True,  # what a terminal sends to all its processes is for this one
+        )
+        there.close()
+        self.connection = Connection(here.detach())
+        self.last = ""  # line that it wrote
+        self._lock = threading.Lock()
+        self._ended: dict[int, Ending] = {}
+        self._started = 0
+        self.connection.send((os.getpid(), memory, prints, entry))
+        self.connection.send(setup)
+
+    def start(self, begun: object = None) -> ChildProcess:
+        """Return a worker that begins now. begun: what it begins with. Raises OSError where the supervisor is gone."""
+        here, there = socket.socketpair()
+        progress = progress_file()
+        printed = None if self.prints else tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the worker
+        with there, progress, self._lock, socket.socket(fileno=os.dup(self.connection.fileno())) as passing:
+            self._started += 1
+            view = progress_in(progress.fileno())
+            child = ChildProcess(self._started, Connection(here.detach()), view, self.memory, printed)
+            child.begin()
+            view[NOW] = math.nan
+            self.connection.send_bytes(pickle.dumps(("start", child.number, begun)))
+            reduction.sendfds(passing, [f.fileno() for f in (there, progress, printed) if f is not None])
+        return child
+
+    def end(self, child: ChildProcess, *, trace: bool = True) -> Ending | None:
+        """Return how a worker ended, which it is made to do where it has not; None where the supervisor is gone.
+
+        trace: whether it tells its frames before; that takes a fifth of a second.
+        """
+        with self._lock:
+            with contextlib.suppress(OSError, EOFError):
+                self.connection.send_bytes(pickle.dumps(("end", child.number, trace)))
+                while child.number not in self._ended and self.connection.poll(PATIENCE):
+                    heading, _ = unpacked(self.connection.recv_bytes())
+                    number = heading.pop("ended")
+                    self._ended[number] = Ending(**heading)
+            found = self._ended.pop(child.number, None)
+        child.close()
+        if found is None:
+            self.close()  # the system ends its workers with it
+        return found
+
+    def close(self) -> None:
+        """End it and every worker; in a process that was forked from its owner, only let go of it."""
+        self.connection.close()
+        if self.printed is not None:
+            self.last = last_line(self.printed)
+            self.printed.close()
+        if self.owner == os.getpid() and self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+    @property
+    def gone(self) -> bool:
+        """True once it has ended, or belongs to the process that this one was forked from."""
+        return self.owner != os.getpid() or self.process.poll() is not None
+
+
+class Watch:
+    """The deadline of one piece of work, s, and whether a run moves. progress: shared with the worker."""
+
+    def __init__(self, progress: memoryview[float], deadline: float) -> None:
+        self.progress, self.deadline = progress, deadline
+        self.moved = time.monotonic()
+        self.at = (math.nan, math.nan)
+
+    def pause(self) -> float:
+        """For how long to wait before the next look, s."""
+        self._look()
+        return max(0.0, min(self.progress[BEGAN] + self.deadline - time.monotonic(), self.deadline / LOOKS))
+
+    def over(self) -> bool:
+        """Return whether the work is past its deadline."""
+        self._look()
+        return time.monotonic() >= self.progress[BEGAN] + self.deadline
+
+    def instants(self) -> tuple[float, float, float]:
+        """First, last and present instant of the run, s, nan where not known."""
+        return self.progress[START], self.progress[STOP], self.progress[NOW]
+
+    def still(self) -> float | None:
+        """For how long the run has stood still, s; None where it moves, or was not watched for long enough."""
+        stood = time.monotonic() - self.moved
+        return stood if stood > max(2 * self.deadline / LOOKS, STALL) else None
+
+    def _look(self) -> None:
+        at = (self.progress[BEGAN], self.progress[NOW])
+        if at != self.at and not (math.isnan(at[1]) and at[0] == self.at[0]):
+            self.at, self.moved = at, time.monotonic()
+
+
+class Overdue(Exception):
+    """A piece of work that was not done by its deadline."""
+
+
+class Lost(Exception):
+    """A worker that ended at its work. said: the last line that it printed."""
+
+    def __init__(self, end: Ending | None, said: str) -> None:
+        super().__init__(said)
+        self.end, self.said = end, said
+
+
+def done_apart(entry: str, setup: object, deadline: float) -> Message:
+    """Return the message that a worker sends, started for this one piece of work.
+
+    deadline: s, the start of the interpreter included. Raises Overdue, or Lost where the process ends without a word.
+    """
+    supervisor = Supervisor(entry, setup)
+    try:
+        child = supervisor.start()
+        try:
+            if not child.connection.poll(deadline):
+                raise Overdue
+            return unpacked(child.connection.recv_bytes())
+        except (EOFError, OSError):
+            said = child.last_line
+            end = supervisor.end(child, trace=False)
+            raise Lost(end, said or supervisor.last) from None
+        finally:
+            child.close()
+    finally:
+        supervisor.close()
+
+
+def last_line(printed: IO[bytes] | None) -> str:
+    """Return the last line that a process wrote."""
+    with contextlib.suppress(ValueError, OSError):
+        if printed is not None:
+            printed.seek(0, os.SEEK_END)
+            printed.seek(max(0, printed.tell() - 2000))
+            lines = printed.read().decode("utf-8", "replace").strip().splitlines()
+            return " ".join(lines[-1].split())[:300] if lines else ""
+    return ""
