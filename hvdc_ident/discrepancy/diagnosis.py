@@ -10,18 +10,18 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.findings.ambiguity import separating
 from hvdc_ident.discrepancy.findings.bode import responses
+from hvdc_ident.discrepancy.findings.conclusion import Diagnosis, FoundEffect
 from hvdc_ident.discrepancy.findings.explain import found_of
 from hvdc_ident.discrepancy.findings.gap import at_given, gap
-from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
-from hvdc_ident.discrepancy.refits.adequacy import Binned
 from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.refits.refit import Refit, judged
+from hvdc_ident.discrepancy.refits.residual_tests import Binned
 from hvdc_ident.discrepancy.scores.localise import localise
-from hvdc_ident.discrepancy.search.forward import Outcome, from_either_side
+from hvdc_ident.discrepancy.search.forward import SearchOutcome, from_either_side
 from hvdc_ident.discrepancy.signatures.candidates import entries
-from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
 from hvdc_ident.discrepancy.verdict.lines import detectable, lines
 from hvdc_ident.errors import StudyError, unknown_name
@@ -52,7 +52,7 @@ def diagnose(
     material: Mapping[str, float] | None = None,
     held: Mapping[str, float] | None = None,
     report: Mapping[str, Any] | None = None,
-    options: Options | None = None,
+    options: DiagnosisOptions | None = None,
     seed: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -72,12 +72,12 @@ def diagnose(
     Raises StudyError or UnknownNameError where there is nothing to diagnose, SimulationError where the nominal model
     cannot be run.
     """
-    chosen = options or Options()
+    chosen = options or DiagnosisOptions()
     given, free = tuple(experiments), tuple(parameters)
     model = recording(_model_of(subject), (o for e in given for o in e.outputs))
     names: Any = "all" if effects == "all" else tuple(e.name for e in entries(effects))
     _check_material(material or {}, given)
-    search = Search(
+    search = SearchContext(
         names, None if places is None else tuple(places), FrozenMap(material or {}), chosen, seed, executor, progress
     )
     search.tell(0, 1, "the nominal model, refitted")
@@ -126,10 +126,10 @@ def _check_material(material: Mapping[str, float], experiments: tuple[Experiment
 
 
 def _assembled(
-    search: Search,
+    search: SearchContext,
     model: AnyModel,
     first: Refit,
-    outcome: Outcome,
+    outcome: SearchOutcome,
     judgement: Judgement,
     other: Fallback | None,
     free: tuple[Free, ...],
@@ -138,7 +138,7 @@ def _assembled(
     search.tell(0, 1, "before and after")
     in_place = judgement.verdict in ("named", "ambiguous")
     tests = judgement.tests
-    effects: tuple[Found, ...] = ()
+    effects: tuple[FoundEffect, ...] = ()
     last = first
     if in_place:
         last = outcome.refit
@@ -181,7 +181,7 @@ def _own(refit: Refit) -> dict[str, float]:
     return {n: float(np.clip(v, known[n].min, known[n].max)) for n, v in refit.values.items() if n in known}
 
 
-def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: Search) -> dict[str, Any]:
+def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: SearchContext) -> dict[str, Any]:
     """What is left: whether it looks like noise, the share that was explained, and where it lies."""
     rest: Nominal = last.nominal()
     excess, left = first.chi2 - first.rows, max(last.chi2 - last.rows, 0.0)

@@ -8,7 +8,7 @@ from hvdc_ident.errors import StudyError
 
 
 @dataclass(frozen=True)
-class Options:
+class DiagnosisOptions:
     """Thresholds and budgets of a diagnosis.
 
     significance: largest max-T p of a named effect. bootstraps: noise records drawn for it (p is at least 1/(n + 1)).

@@ -25,7 +25,7 @@ from common.work import processes  # noqa: E402
 
 from hvdc_ident import load_study, simulate  # noqa: E402
 from hvdc_ident.data import Experiment, Trajectory  # noqa: E402
-from hvdc_ident.discrepancy import Options, diagnose  # noqa: E402
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.study.simulator import ModelSimulator  # noqa: E402
@@ -92,7 +92,12 @@ def named(executor: Any = None) -> dict[str, Any]:
     """What the diagnosis says, told nothing: the whole catalogue at every place."""
     model, e, free = setup()
     found = diagnose(
-        model, [e], free, options=Options(fallback=False), executor=executor, progress=diagnosing.on_stderr("Dymola")
+        model,
+        [e],
+        free,
+        options=DiagnosisOptions(fallback=False),
+        executor=executor,
+        progress=diagnosing.on_stderr("Dymola"),
     )
     lines = sorted((c for c in found.candidates if c.delta_bic is not None), key=lambda c: -(c.delta_bic or 0.0))
     told = diagnosing.told(found)

@@ -24,7 +24,7 @@ from common.ending import markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory, experiment  # noqa: E402  # noqa: E402
-from hvdc_ident.discrepancy import Options, diagnose  # noqa: E402
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.formats import read_waveforms  # noqa: E402
 from hvdc_ident.immutable import FrozenMap  # noqa: E402
@@ -65,7 +65,7 @@ ROLES = {  # part left out: windows fitted, windows held out; the droop does nex
     "droop of the ac voltage controls": (("voltage steps",), ("P ramp",)),
 }
 COARSE = 1e-2  # s: sampling of what is diagnosed
-OPTIONS = Options(fallback=False, refits=8, shortlist=4)  # no form outside the catalogue is looked for
+OPTIONS = DiagnosisOptions(fallback=False, refits=8, shortlist=4)  # no form outside the catalogue is looked for
 FAULT = ("fault", (7.95, 10.0))  # compared between the tools only
 BANDS = {"Ip1": 1e-3, "Ip2": 1e-3, "Q1": 1e-3, "Q2": 1e-3, "U1": 2e-4, "V1": 2e-4}
 """What is compared, and what each weighs, pu: not noise, the records have none; a tenth of a per cent of the ratings."""

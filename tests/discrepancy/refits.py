@@ -11,8 +11,8 @@ from cases import FREE, SIGMA, TRUE, model
 from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.refits.begin import added
 from hvdc_ident.discrepancy.refits.nominal import nominal
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, judged
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, judged
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
@@ -41,10 +41,10 @@ def beside(
     values: Mapping[str, float],
     bounds: Mapping[str, tuple[float, float]],
     source: str = "",
-) -> Job:
+) -> RefitJob:
     """The refit of a model with one more effect, from a size; what has no bounds stays."""
     probe = Probe(effect, FrozenMap(values), FrozenMap(bounds))
-    candidate = Candidate(effect, (at,), (probe,), source=source)
+    candidate = CandidateEffect(effect, (at,), (probe,), source=source)
     larger, problem, placed, start = added(before.model, before.problem, candidate, 0, 1.0)
     begin = np.concatenate([before.theta, start])
-    return Job(larger, (*before.placed, placed), problem, (begin,), before.noise)
+    return RefitJob(larger, (*before.placed, placed), problem, (begin,), before.noise)

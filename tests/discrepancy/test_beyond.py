@@ -13,17 +13,17 @@ from cases import FREE, TRUE, experiments, model
 from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, Model
-from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.findings.ambiguity import formula_rivals
 from hvdc_ident.discrepancy.refits.refit import run
+from hvdc_ident.discrepancy.trials.context import Round
 from hvdc_ident.discrepancy.trials.formula import formula_job
 from hvdc_ident.discrepancy.trials.library import Term
-from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
-from hvdc_ident.discrepancy.trials.state import Round
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler
 from hvdc_ident.immutable import FrozenMap
 
 
-def bent(third: float, level: float, options: Options | None = None) -> Diagnosis:
+def bent(third: float, level: float, options: DiagnosisOptions | None = None) -> Diagnosis:
     """The drive whose drag bends: by a third order, or towards a level; looked for are the bends of the catalogue."""
 
     def drag(w: float) -> float:
@@ -62,7 +62,7 @@ def test_a_formula_that_explains_more_is_told_instead() -> None:
 
 
 def test_no_formula_is_tried_where_none_is_asked_for() -> None:
-    found = bent(-0.25, math.inf, Options(fallback=False))
+    found = bent(-0.25, math.inf, DiagnosisOptions(fallback=False))
     assert found.verdict == "named"
     assert found.effects[0].effect == "saturation"
 
@@ -82,13 +82,13 @@ def test_a_formula_with_a_parameter_more_is_a_rival_where_it_needs_all_of_them()
     terms = [Term("load*w", ("load", "w"), "xy"), Term("w", ("w",), "x")]
     refit = run(formula_job(before, "outputs.w", terms, np.array([0.01, 0.01])))
     coupling = beside(before, "coupling", "outputs.w", {"k": 0.01}, {"k": (-1.0, 1.0)}, source="load")
-    winner = Trial(Pick(0, 0, 1.0, 1.0), run(coupling), 100.0)
+    winner = CandidateFit(Pick(0, 0, 1.0, 1.0), run(coupling), 100.0)
     found = cast(Round, SimpleNamespace(winner=winner, ruler=Ruler(1800, 1800.0, 1.0)))
     for std, gain, members in ((1e-3, 93.0, 2), (10.0, 93.0, 1), (1e-3, 80.0, 1)):
         last = refit.placed[-1]
         spread = FrozenMap({last.names[n]: std * abs(v) for n, v in refit.sizes(last).items()})
-        formula = Trial(winner.pick, replace(refit, std=spread), gain)
-        assert len(formula_rivals(found, [formula], Options())) == members
+        formula = CandidateFit(winner.pick, replace(refit, std=spread), gain)
+        assert len(formula_rivals(found, [formula], DiagnosisOptions())) == members
 
 
 def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> None:

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.noise.colour import RHO, TANH, likelihood, together, without_common
-from hvdc_ident.discrepancy.noise.records import Noise, draws, noise_of
+from hvdc_ident.discrepancy.noise.records import OutputNoise, draws, noise_of
 from hvdc_ident.fit import Problem
 from hvdc_ident.immutable import FrozenMap
 
@@ -115,7 +115,7 @@ def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
     problem = Problem(ModelSimulator(model()), experiments(), FREE, rho=FrozenMap({"w": 0.9, "torque": 0.9}))
     blocks = problem.blocks(problem.start, derivatives=False)
     level = [b.misfit for b in blocks]
-    own = Noise(1.0, (0.9,), 0.4, 0.0, "the records before the event", 150)
+    own = OutputNoise(1.0, (0.9,), 0.4, 0.0, "the records before the event", 150)
     steps = []
     for n in (own, replace(own, source="given")):
         drawn = draws(problem, blocks, FrozenMap({"w": n, "torque": n}), level, 100, 0)

@@ -12,7 +12,7 @@ from cases import FREE, TRUE, experiments, model
 import hvdc_ident
 from hvdc_ident import Experiment, InputSignal, Trajectory, load_model, simulate
 from hvdc_ident.data import experiment
-from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
@@ -158,7 +158,12 @@ def only(e: Experiment, *names: str) -> Experiment:
 
 def test_a_limit_that_is_never_reached_is_not_excited() -> None:
     found = diagnose(
-        model(), experiments(), FREE, effects=["rate-limit"], places=["outputs.w"], options=Options(fallback=False)
+        model(),
+        experiments(),
+        FREE,
+        effects=["rate-limit"],
+        places=["outputs.w"],
+        options=DiagnosisOptions(fallback=False),
     )
     assert found.verdict in ("no-evidence", "not-excited")
     assert not found.effects
@@ -173,7 +178,11 @@ def test_nothing_moves_nothing_is_excited() -> None:
         measured=Trajectory(time, noisy, ("w", "torque"), ("", "")), noise=FrozenMap({"w": 1e-3, "torque": 1e-3})
     )
     found = diagnose(
-        model(), [still], [Free("b", 0.3, 0.1, 1.0)], effects=["lag", "delay", "limit"], options=Options(fallback=False)
+        model(),
+        [still],
+        [Free("b", 0.3, 0.1, 1.0)],
+        effects=["lag", "delay", "limit"],
+        options=DiagnosisOptions(fallback=False),
     )
     assert found.verdict == "not-excited"
     assert found.separating_experiment["text"]

@@ -12,13 +12,13 @@ from refits import answered, beside, plain
 from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
-from hvdc_ident.discrepancy import Options
+from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.constancy import constancy
 from hvdc_ident.discrepancy.refits.refit import Refit, run
-from hvdc_ident.discrepancy.search.forward import Outcome
+from hvdc_ident.discrepancy.search.forward import SearchOutcome
 from hvdc_ident.discrepancy.search.rounds import one_round
-from hvdc_ident.discrepancy.trials.select import Pick, Trial
-from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.trials.context import SearchContext
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick
 from hvdc_ident.discrepancy.verdict.doubts import Doubt, _turned, doubt
 from hvdc_ident.immutable import FrozenMap
 
@@ -58,12 +58,14 @@ def test_what_is_told_by_one_experiment_alone_or_jumps_with_its_size_is_not_aske
     assert chance(lagged(alone)) == 1.0
 
 
-def doubted(refit: Refit, explained: float = 1.0, told: float = 1.0, beside: Sequence[Trial] = ()) -> Doubt | None:
+def doubted(
+    refit: Refit, explained: float = 1.0, told: float = 1.0, beside: Sequence[CandidateFit] = ()
+) -> Doubt | None:
     """What tells against the refit's effect. beside: refits of another effect with it, too small to matter."""
-    last = one_round(Search(("gain",), ("wm",), FrozenMap(), Options(), seed=0), refit, 2)
+    last = one_round(SearchContext(("gain",), ("wm",), FrozenMap(), DiagnosisOptions(), seed=0), refit, 2)
     assert last.winner is None
     last = replace(last, trials=tuple(beside))
-    return doubt(Outcome(refit, (last,), (last,)), refit.nominal(), explained, told, 1.0, Options())
+    return doubt(SearchOutcome(refit, (last,), (last,)), refit.nominal(), explained, told, 1.0, DiagnosisOptions())
 
 
 def test_a_name_is_in_doubt_where_experiments_ask_for_different_sizes() -> None:
@@ -93,7 +95,7 @@ def test_a_name_is_in_doubt_where_held_out_records_are_explained_in_part(
 def test_a_name_is_in_doubt_where_something_beside_it_is_no_noise(gain: float, score: float, doubtful: bool) -> None:
     refit = lagged(plain(experiments(lag=0.03)))
     more = replace(run(beside(refit, "gain", "torque", {"k": 1.01}, {"k": (0.5, 2.0)})), chi2=refit.chi2 - 50.0)
-    against = doubted(refit, beside=[Trial(Pick(0, 0, 1.0, score), more, gain, evidence=gain)])
+    against = doubted(refit, beside=[CandidateFit(Pick(0, 0, 1.0, score), more, gain, evidence=gain)])
     assert (against is not None and "gain at torque beside it" in against.why) == doubtful
 
 

@@ -7,7 +7,7 @@ import pytest
 from cases import FREE, TIME, TRUE, experiments, model
 from meters import filtered
 
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.model import Model, parse_card, write_card
 
 
@@ -54,5 +54,5 @@ def test_a_lag_is_named_though_a_wide_filter_comes_near_it() -> None:
 def test_what_only_delays_is_no_filter(late: float) -> None:
     """The delay itself is not among those tried: what a filter makes of it has the zeros of a delay."""
     records = experiments(meter=lambda torque: np.interp(TIME - late, TIME, torque))
-    found = diagnose(model(), records, FREE, effects=["gain", "offset"], options=Options(bootstraps=100))
+    found = diagnose(model(), records, FREE, effects=["gain", "offset"], options=DiagnosisOptions(bootstraps=100))
     assert (found.fallback or {}).get("kind") != "filter"

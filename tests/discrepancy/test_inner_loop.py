@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.signatures.candidates import entries
 
 WN, ZETA = 60.0, 0.6
@@ -46,7 +46,7 @@ def looped(inputs: dict[str, InputSignal]) -> Array:
 
 def test_a_loop_is_named() -> None:
     """At the torque, or at the error behind which a linear controller passes it on."""
-    found = diagnose(model(), records(looped), FREE, options=Options(bootstraps=100))
+    found = diagnose(model(), records(looped), FREE, options=DiagnosisOptions(bootstraps=100))
     assert found.verdict == "ambiguous" and found.remaining["adequate"]
     (alike,) = found.ambiguity
     assert {(r.effect, r.at) for r in alike} == {("inner-loop", ("torque",)), ("inner-loop", ("err",))}
@@ -58,7 +58,7 @@ def test_a_loop_is_named() -> None:
 def test_a_lag_is_no_loop() -> None:
     """A heavily damped loop is nearly one: its damping ends before that."""
     found = diagnose(
-        model(), experiments(lag=0.03), FREE, effects=["lag", "inner-loop"], options=Options(bootstraps=100)
+        model(), experiments(lag=0.03), FREE, effects=["lag", "inner-loop"], options=DiagnosisOptions(bootstraps=100)
     )
     told = {e.effect for e in found.effects} | {r.effect for group in found.ambiguity for r in group}
     assert found.verdict in ("named", "ambiguous") and told == {"lag"}

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.scores.inversion import Inversion
 from hvdc_ident.discrepancy.scores.scan import _looked
 from hvdc_ident.discrepancy.scores.scored import Whitening, runs
@@ -131,7 +131,7 @@ def test_the_records_know_a_slot_better_than_gains_that_are_biased(
 def test_a_step_is_met_among_hundreds(levels: tuple[tuple[Experiment, ...], dict[str, Array]]) -> None:
     found = diagnose(
         model(), levels[0], FREE, effects=["quantisation", "deadband", "backlash", "lag", "gain"], seed=0,
-        options=Options(fallback=False),
+        options=DiagnosisOptions(fallback=False),
     )  # fmt: skip
     assert found.verdict == "named", found.text
     assert (found.effects[0].effect, found.effects[0].at) == ("quantisation", ("torque",))

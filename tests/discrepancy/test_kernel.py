@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hvdc_ident.discrepancy.signatures.kernel import replaced
+from hvdc_ident.discrepancy.signatures.propagation import replaced
 
 
 def test_answers_are_put_in_place_and_their_change_is_measured():

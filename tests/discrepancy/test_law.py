@@ -13,12 +13,12 @@ from refits import plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import Diagnosis, Options, diagnose
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.outside.hidden import Regression
 from hvdc_ident.discrepancy.outside.law import _levels, law
 from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.library import hats
-from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, parse_card, write_card
@@ -152,7 +152,7 @@ def test_levels_lie_where_the_signal_travels_and_a_signal_that_steps_gives_none(
 
 def test_a_law_is_near_only_where_it_beats_what_the_catalogue_has() -> None:
     first = plain(metered("w", drifting))
-    search = Search(("lag", "gain"), None, FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("lag", "gain"), None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = one_round(search, first, 1)
     alone = law(search, found)
     assert alone is not None and alone.near
@@ -169,7 +169,7 @@ def test_more_is_refitted_where_a_thorough_search_is_asked_for() -> None:
     looks: dict[bool, list[str]] = {False: [], True: []}
     for thorough in (False, True):
         done[thorough] = diagnose(
-            model(), records, FREE, effects=names, options=Options(bootstraps=100, thorough=thorough),
+            model(), records, FREE, effects=names, options=DiagnosisOptions(bootstraps=100, thorough=thorough),
             progress=lambda _done, _total, text, told=looks[thorough]: told.append(text),
         )  # fmt: skip
     assert any(text.startswith("round 1: from every size") for text in looks[False])

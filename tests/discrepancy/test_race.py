@@ -9,14 +9,14 @@ import pytest
 from cases import experiments
 from refits import beside, plain
 
-from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
+from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.race import Race
-from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
-SEARCH = Search("all", None, FrozenMap(), Options(), 0)
+SEARCH = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), 0)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def before() -> Refit:
     return plain(experiments(lag=0.03))
 
 
-def job(before: Refit, effect: str, at: str, size: float, begins: int = 1) -> Job:
+def job(before: Refit, effect: str, at: str, size: float, begins: int = 1) -> RefitJob:
     one = beside(before, effect, at, {"T": size}, {"T": (1e-4, 1.0)})
     return replace(one, begins=one.begins * begins)
 
@@ -68,7 +68,7 @@ def test_those_that_promise_most_are_admitted_whoever_shares_their_model(before:
     one, other = job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)
     at = len(before.theta)
 
-    def sized(j: Job, size: float) -> Job:
+    def sized(j: RefitJob, size: float) -> RefitJob:
         begin = j.begins[0].copy()
         begin[at] = size
         return replace(j, begins=(begin,))

@@ -11,7 +11,7 @@ from refits import plain
 from scipy.linalg import block_diag
 
 from hvdc_ident import Experiment
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.scores.inversion import Inversion
 from hvdc_ident.discrepancy.scores.reach import SHARE, reach
 from hvdc_ident.discrepancy.scores.scored import Whitening, runs
@@ -75,7 +75,7 @@ def test_nothing_is_told_where_it_cannot_be() -> None:
 
 
 def test_what_is_refitted_first_sits_within_reach_and_the_diagnosis_tells_of_it() -> None:
-    found = diagnose(model(), clipped(0.6), FREE, options=Options(fallback=False))
+    found = diagnose(model(), clipped(0.6), FREE, options=DiagnosisOptions(fallback=False))
     slots = found.location["slots"]
     least = 0.9 * SHARE * max(slots.values())
     refitted = [c for c in found.candidates if c.delta_bic is not None and c.round == 1]

@@ -9,8 +9,7 @@ from scipy.signal import StateSpace, lsim
 
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.discrepancy.signatures.block import block
-from hvdc_ident.discrepancy.signatures.grid import instants
-from hvdc_ident.discrepancy.signatures.response import along
+from hvdc_ident.discrepancy.signatures.response import along, instants
 from hvdc_ident.immutable import FrozenMap
 
 

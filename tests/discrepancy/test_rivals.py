@@ -11,17 +11,17 @@ from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, simulate
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.findings.ambiguity import _as_loss
-from hvdc_ident.discrepancy.findings.result import Rival
-from hvdc_ident.discrepancy.refits.adequacy import Binned
+from hvdc_ident.discrepancy.findings.conclusion import Rival
 from hvdc_ident.discrepancy.refits.refit import Refit, run
+from hvdc_ident.discrepancy.refits.residual_tests import Binned
 from hvdc_ident.discrepancy.search.rounds import against, one_round
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.objections import as_recorded, objections
 from hvdc_ident.discrepancy.trials.refitted import excess, like_noise, misses
-from hvdc_ident.discrepancy.trials.select import Pick, Trial, behinds, shortlist
-from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, behinds, shortlist
 from hvdc_ident.discrepancy.verdict.judge import _half_told, _named
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
@@ -32,10 +32,10 @@ def before() -> Refit:
     return plain(experiments())
 
 
-def of_size(effect: str, at: str, **values: float) -> Candidate:
+def of_size(effect: str, at: str, **values: float) -> CandidateEffect:
     """A candidate with one probe, all of whose values are free."""
     bounds = FrozenMap({n: (0.1 * v, 10.0 * v) for n, v in values.items()})
-    return Candidate(effect, (at,), (Probe(effect, FrozenMap(values), bounds),))
+    return CandidateEffect(effect, (at,), (Probe(effect, FrozenMap(values), bounds),))
 
 
 @pytest.mark.parametrize(
@@ -48,17 +48,19 @@ def of_size(effect: str, at: str, **values: float) -> Candidate:
         (of_size("lag", "wm", T=0.02), of_size("delay", "wm", T=0.02), 2),
     ],
 )
-def test_one_trace_is_one_effect_where_it_is_one_at_every_size(one: Candidate, other: Candidate, refitted: int) -> None:
+def test_one_trace_is_one_effect_where_it_is_one_at_every_size(
+    one: CandidateEffect, other: CandidateEffect, refitted: int
+) -> None:
     trace = np.random.default_rng(0).standard_normal(50)
     picks = [Pick(0, 0, 1.0, 400.0), Pick(1, 0, 1.0, 399.0)]
-    chosen, same = shortlist(picks, [one, other], np.vstack([trace, -trace]), Options())
+    chosen, same = shortlist(picks, [one, other], np.vstack([trace, -trace]), DiagnosisOptions())
     assert len(chosen) == refitted
     assert {k: [p.candidate for p in twins] for k, twins in same.items()} == ({} if refitted == 2 else {0: [1]})
 
 
 def test_what_held_out_data_refute_sets_no_mark_for_the_others(before: Refit) -> None:
-    def trial(gain: float, told: float) -> Trial:
-        return Trial(Pick(0, 0, 1.0, 1.0), before, gain, told)
+    def trial(gain: float, told: float) -> CandidateFit:
+        return CandidateFit(Pick(0, 0, 1.0, 1.0), before, gain, told)
 
     # Best on all data; a little ahead on the fitted ones; far ahead there and refuted by the others.
     assert behinds([trial(100.0, 200.0), trial(104.0, 190.0), trial(150.0, 20.0)]) == [0.0, 0.0, 180.0]
@@ -110,7 +112,9 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
     assert before.holdout is not None
     worse = {by: replace(refit, holdout=before.holdout + by) for by in (0.002, 0.05)}
     told = {
-        by: objections(before, Trial(Pick(0, 0, 1.0, 500.0), r, 500.0), 0.005, Options(), {}, first=True)
+        by: objections(
+            before, CandidateFit(Pick(0, 0, 1.0, 500.0), r, 500.0), 0.005, DiagnosisOptions(), {}, first=True
+        )
         for by, r in worse.items()
     }
     assert told[0.002] == ""
@@ -131,11 +135,13 @@ def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
     before = plain(experiments(offset=0.008, noise="ar"))
     refit = run(beside(before, "offset", "drag", {"c": -0.008}, {"c": (-0.1, 0.1)}))
     assert before.holdout is not None and refit.holdout is not None
-    assert 0.0 < before.holdout - refit.holdout < Options().holdout_share, "whitened there is hardly anything to see"
+    assert 0.0 < before.holdout - refit.holdout < DiagnosisOptions().holdout_share, (
+        "whitened there is hardly anything to see"
+    )
     recorded = [as_recorded(r)[role] for role in ("fit", "holdout") for r in (before, refit)]
     assert recorded[0] > 1.5 * recorded[1] and recorded[2] > 1.5 * recorded[3]
-    trial = Trial(Pick(0, 0, 1.0, 500.0), refit, before.chi2 - refit.chi2)
-    assert objections(before, trial, 0.005, Options(), {}, first=True) == ""
+    trial = CandidateFit(Pick(0, 0, 1.0, 500.0), refit, before.chi2 - refit.chi2)
+    assert objections(before, trial, 0.005, DiagnosisOptions(), {}, first=True) == ""
 
 
 def test_where_the_model_does_not_run_at_a_size_it_begins_at_a_spare_one(before: Refit) -> None:
@@ -155,7 +161,7 @@ def test_a_parameter_more_is_no_refutation_where_several_explain_the_data() -> N
     (group,) = found.ambiguity
     behind = {r.effect: r.delta_bic for r in group}
     assert {"lag", "delay", "second-order"} == set(behind)
-    assert Options().set_bic < behind["second-order"] < Options().set_bic + np.log(1800)
+    assert DiagnosisOptions().set_bic < behind["second-order"] < DiagnosisOptions().set_bic + np.log(1800)
     alone = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm"])
     assert alone.verdict == "named" and not alone.ambiguity
 
@@ -180,7 +186,7 @@ def test_another_kind_of_delay_is_not_refuted_by_the_price_of_a_parameter() -> N
     found = diagnose(model(), recorded, FREE, effects=["window-mean", "second-order"], places=["wm"])
     (group,) = found.ambiguity
     assert [r.effect for r in group] == ["window-mean", "second-order"]
-    assert Options().set_bic < group[1].delta_bic < np.log(1800) + 1.0
+    assert DiagnosisOptions().set_bic < group[1].delta_bic < np.log(1800) + 1.0
 
 
 def test_delays_that_explain_most_of_a_held_out_gap_are_told_as_something_like_them() -> None:
@@ -214,7 +220,7 @@ def test_effects_that_leave_structure_are_not_named(
 ) -> None:
     """What is in no catalogue is told as what looks like it: a relay as a quantiser, or as a coupling with a backlash."""
     sets = tuple((Rival(e, ("wm",), 0.0, FrozenMap({"k": 0.01})),) for e in effects)
-    told = _named(" and ".join(effects), sets, (Binned("time", statistic, 40.0, p),), 1000.0, Options())
+    told = _named(" and ".join(effects), sets, (Binned("time", statistic, 40.0, p),), 1000.0, DiagnosisOptions())
     assert told.verdict == verdict
     assert bool(told.experiment) == bool(told.doubt) == (verdict == "ambiguous")
 
@@ -222,7 +228,7 @@ def test_effects_that_leave_structure_are_not_named(
 def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
     """b |w| is b w as long as the drive does not turn; the load's sign changes."""
     found = one_round(
-        Search(("conductance", "loss"), ("torque",), FrozenMap(), Options(bootstraps=100), seed=0),
+        SearchContext(("conductance", "loss"), ("torque",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0),
         plain(experiments()),
         1,
     )
@@ -233,7 +239,7 @@ def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
 
 
 def test_a_refit_that_began_at_a_poor_size_is_judged_by_its_candidates_best_score() -> None:
-    search = Search(("lag",), ("wm",), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("lag",), ("wm",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = one_round(search, plain(experiments(lag=0.03)), 1)
     assert found.winner is not None
     poor = replace(found.winner, pick=replace(found.winner.pick, score=1e-3))
@@ -243,7 +249,7 @@ def test_a_refit_that_began_at_a_poor_size_is_judged_by_its_candidates_best_scor
 
 def test_a_refit_that_brings_many_times_what_scores_do_is_judged_by_that() -> None:
     """The sizes tried of a moving mean may all lie near zeros that the records know nothing of."""
-    search = Search(("lag",), ("wm",), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("lag",), ("wm",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = one_round(search, plain(experiments(lag=0.03)), 1)
     assert found.winner is not None
     deaf = replace(found, scores=replace(found.scores, raw=1e-3 * found.scores.raw))

@@ -9,16 +9,16 @@ import pytest
 from cases import experiments
 from refits import beside, plain
 
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.refit import Refit, run
 from hvdc_ident.discrepancy.scores.scored import runs
 from hvdc_ident.discrepancy.search import settle
 from hvdc_ident.discrepancy.search.forward import forward
 from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.search.settle import _last, settled
-from hvdc_ident.discrepancy.trials.jobs import job_of
-from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial, clear
-from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
+from hvdc_ident.discrepancy.trials.refit_jobs import job_of
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler, clear
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of
@@ -59,9 +59,9 @@ def test_what_is_not_there_is_not_clear_and_what_is_told_last_takes_its_evidence
 def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit) -> None:
     one = run(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
     both = run(beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     begun = one_round(search, first, 1)
-    rounds = tuple(replace(begun, winner=Trial(begun.trials[0].pick, r, 100.0), trials=()) for r in (one, both))
+    rounds = tuple(replace(begun, winner=CandidateFit(begun.trials[0].pick, r, 100.0), trials=()) for r in (one, both))
     here, kept, notes = settled(search, first, both, rounds, 2)
     assert notes == ()
     assert [p.candidate.label for p in here.placed] == ["lag at wm"]
@@ -70,9 +70,9 @@ def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit
 
 def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
     lagged = run(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     begun = one_round(search, first, 1)
-    lost = Trial(begun.trials[-1].pick, replace(begun.trials[-1].refit, failure="it does not run"), -np.inf)
+    lost = CandidateFit(begun.trials[-1].pick, replace(begun.trials[-1].refit, failure="it does not run"), -np.inf)
     monkeypatch.setattr(settle, "one_round", lambda *_: replace(begun, trials=begun.trials[:-1], failed=(lost,)))
     _, kept, _ = settled(search, first, lagged, [replace(begun, winner=begun.trials[0], trials=())], 1)
     assert kept[0].failed == (lost,)
@@ -80,9 +80,9 @@ def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest
 
 def test_what_could_not_be_looked_for_again_stays_and_is_told(first: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
     lagged = run(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = Search(("gain", "lag"), ("ref", "wm"), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     begun = replace(one_round(search, first, 1), trials=())
-    begun = replace(begun, winner=Trial(Pick(0, 0, 1.0, 0.0), lagged, 100.0), ruler=Ruler.of(lagged))
+    begun = replace(begun, winner=CandidateFit(Pick(0, 0, 1.0, 0.0), lagged, 100.0), ruler=Ruler.of(lagged))
 
     def stopped(*_: object) -> Round:
         raise SimulationError("the simulation stopped", got="step-limit")
@@ -116,7 +116,7 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
     inner = [s for s in two.model.slots if any(p.use.made(s) for p in two.placed)]
     assert {"second_order_wm_y", "second_order_wm_v"} <= set(inner) and len(inner) > 40
     assert "wm" not in inner and "wm_before_second_order" not in inner
-    search = Search(("gain", "coupling"), None, FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("gain", "coupling"), None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = one_round(search, two, 2)
     assert {c.at[0] for c in found.candidates} >= {"wm", "wm_before_second_order", "torque"}
     assert not {*inner} & {p for c in found.candidates for p in (*c.at, c.source)}
@@ -125,7 +125,7 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
 def test_rounds_that_are_over_let_go_of_the_answers_and_have_them_again() -> None:
     recorded = experiments(lag=0.03, offset=0.3)
     first = plain(recorded)
-    search = Search(("lag", "offset"), ("wm", "drag"), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("lag", "offset"), ("wm", "drag"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     outcome = forward(search, first)
     assert len(outcome.kept) == 2 and not any(r.paths for r in outcome.kept)
     again, anew = outcome.rounds[0].answers(), runs(first.model, first.nominal())

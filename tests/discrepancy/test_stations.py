@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.signatures.candidates import own_sources
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
@@ -105,7 +105,7 @@ def test_the_same_droop_of_both_stations_is_one_effect_with_one_size() -> None:
         records(),
         [Free("K", 20.0, 5.0, 120.0)],
         effects=["coupling", "droop", "gain", "lag"],
-        options=Options(fallback=False),
+        options=DiagnosisOptions(fallback=False),
     )
     (droop,) = told.effects
     assert (droop.effect, droop.source) == ("coupling", "q1, q2")

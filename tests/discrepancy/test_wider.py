@@ -15,18 +15,18 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import Options, diagnose
-from hvdc_ident.discrepancy.refits.adequacy import loud_after_breaks
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.refits.residual_tests import loud_after_breaks
 from hvdc_ident.discrepancy.search.akin import as_late, carried, with_begun
 from hvdc_ident.discrepancy.search.looks import Stand, _twins
 from hvdc_ident.discrepancy.search.rounds import one_round
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.hops import _polished, hopped
-from hvdc_ident.discrepancy.trials.jobs import as_given, job
+from hvdc_ident.discrepancy.trials.refit_jobs import as_given, job
 from hvdc_ident.discrepancy.trials.refitted import on_bound, once_more, refitted
-from hvdc_ident.discrepancy.trials.select import Pick, Trial, clear
-from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, clear
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -35,7 +35,7 @@ PERIOD = 0.033
 WINDOW = 0.05
 
 
-def beginning(before: Refit, effect: str, at: str, values: dict[str, float]) -> Job:
+def beginning(before: Refit, effect: str, at: str, values: dict[str, float]) -> RefitJob:
     """The refit of the drive with one effect, from a size."""
     return beside(before, effect, at, values, dict.fromkeys((n for n in values if n != "compute"), (1e-3, 0.3)))
 
@@ -68,7 +68,7 @@ def sampled(inputs: dict[str, InputSignal]) -> Array:
 def test_a_period_is_met_that_no_slope_leads_to() -> None:
     job = beginning(plain(records(sampled)), "sample-hold", "wm", {"Ts": 0.039, "compute": 0.0})
     name = job.placed[0].names["Ts"]
-    search = Search("all", None, FrozenMap(), Options(), seed=0)
+    search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), seed=0)
     stuck, (refit,) = run(job), hopped(search, [job], [""])
     assert abs(stuck.values[name] / PERIOD - 1.0) > 0.1
     assert refit.values[name] == pytest.approx(PERIOD, rel=2e-3)
@@ -85,7 +85,7 @@ def test_a_level_that_stands_right_may_be_another_number_of_steps_from_nothing()
         stepped = np.column_stack([0.01 * np.round(clean["w"] / 0.01), clean["torque"]])
         rounded.append(replace(e, measured=replace(e.measured, values=stepped + 0.3 * noise), noise=FrozenMap()))
     job = beside(plain(rounded), "quantisation", "outputs.w", {"step": 1.0 / 99.0}, {"step": (1e-3, 0.1)})
-    search = Search("all", None, FrozenMap(), Options(), seed=0)
+    search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), seed=0)
     (refit,) = hopped(search, [job], [""])
     assert refit.sizes(refit.placed[-1])["step"] == pytest.approx(0.01, rel=1e-4)
     assert refit.chi2 < 0.2 * run(job).chi2
@@ -95,7 +95,7 @@ def test_sizes_of_one_form_share_a_model() -> None:
     before = plain(experiments(lag=0.03))
     sizes = [Probe("lag", FrozenMap({"T": t}), FrozenMap({"T": (1e-3, 0.3)})) for t in (0.01, 0.05)]
     made: dict[Hashable, AnyModel] = {}
-    jobs = [job(before, [Candidate("lag", ("wm",), tuple(sizes))], [Pick(0, k, 1.0, 1.0)], made) for k in (0, 1)]
+    jobs = [job(before, [CandidateEffect("lag", ("wm",), tuple(sizes))], [Pick(0, k, 1.0, 1.0)], made) for k in (0, 1)]
     assert jobs[0].model is jobs[1].model and len(made) == 1
     ends = [run(j) for j in jobs]
     assert ends[0].chi2 == pytest.approx(ends[1].chi2, rel=1e-6)
@@ -165,7 +165,7 @@ def test_of_two_that_explain_the_fitted_steps_alike_the_held_out_one_decides() -
     short = few[0].with_(inputs=FrozenMap({"ref": InputSignal.step(EVENT, 1.0, 1.6)}))
     few = (short.with_(measured=noisy(ramped(dict(short.inputs)), np.random.default_rng(1))), few[1])
     found = diagnose(model(), few, FREE, effects=["rate-limit", "window-mean"], places=["ref"], seed=0,
-                     options=Options(fallback=False))  # fmt: skip
+                     options=DiagnosisOptions(fallback=False))  # fmt: skip
     assert found.verdict in ("named", "ambiguous")
     best = found.effects[0]
     assert best.effect == "window-mean"
@@ -176,11 +176,13 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     """A window, whose scores at the sizes probed lead nowhere near, beside a delay that is right to first order."""
     records_of = records(ramped)
     first = plain(records_of)
-    search = Search(("delay", "window-mean", "lag"), ("ref",), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(
+        ("delay", "window-mean", "lag"), ("ref",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
+    )
     opened = replace(one_round(search, first, 1), trials=())
     names = {c.effect: k for k, c in enumerate(opened.candidates)}
     late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
-    trial = Trial(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
+    trial = CandidateFit(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
     begun = [t for t in with_begun(search, opened, [trial], as_late(opened, [trial]), 1) if t is not trial]
     assert {opened.candidates[t.pick.candidate].effect for t in begun} == {"window-mean", "lag"}
     best = min(begun, key=lambda t: t.refit.chi2)
@@ -195,7 +197,7 @@ def test_what_looks_like_a_refit_that_ended_on_a_bound_is_refitted_too() -> None
         [{"effect": "coupling", "at": ["err"], "parameters": {"k": -0.9}, "from": "ref"}],
     )
     recorded = answered(deaf, experiments(), seed=0)
-    search = Search(("coupling",), ("wm", "err"), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(("coupling",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     first = plain(recorded)
     found = one_round(search, first, 1)
     places = {(c.at, c.source): k for k, c in enumerate(found.candidates)}
@@ -230,12 +232,14 @@ def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
     period = PERIOD * 1.0001  # no sample falls on a break of the inputs
     there = model().with_effects([{"effect": "sample-hold", "at": ["wm"], "parameters": {"Ts": period}}])
     first = plain(answered(there, experiments(), seed=0))
-    search = Search(("sample-hold",), ("wm", "err", "ref"), FrozenMap(), Options(bootstraps=100), seed=0)
+    search = SearchContext(
+        ("sample-hold",), ("wm", "err", "ref"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
+    )
     opened = replace(one_round(search, first, 1), trials=())
     at = {c.at: k for k, c in enumerate(opened.candidates)}
     near = run(beginning(first, "sample-hold", "err", {"Ts": period, "compute": 0.0}))
     near = replace(near, theta=np.array([TRUE["Kp"], TRUE["Ki"], period]))
-    moved = carried(search, opened, [Trial(Pick(at[("err",)], 0, 1.0, 0.0), near, 0.0)], 1)
+    moved = carried(search, opened, [CandidateFit(Pick(at[("err",)], 0, 1.0, 0.0), near, 0.0)], 1)
     best = {opened.candidates[t.pick.candidate].at: t.refit for t in moved}
     assert set(best) == {("wm",), ("ref",)}
     assert best[("wm",)].chi2 < 1.2 * best[("wm",)].rows < near.chi2
@@ -245,8 +249,8 @@ def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
 def test_of_one_effect_the_best_is_looked_for_again_first(least: float, places: list[str]) -> None:
     """And the others only where it comes to nothing: within its bounds is no period that fits."""
     looks: list[str] = []
-    search = Search(
-        ("sample-hold",), ("wm", "err"), FrozenMap(), Options(bootstraps=100), seed=0,
+    search = SearchContext(
+        ("sample-hold",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0,
         progress=lambda _done, _total, text: looks.append(text),
     )  # fmt: skip
     first = plain(records(sampled))
@@ -258,7 +262,7 @@ def test_of_one_effect_the_best_is_looked_for_again_first(least: float, places: 
     # Both are worth it, that at the speed more: what they came to is said here, for it is the order that is tested.
     fall = first.chi2 - first.rows
     said = [replace(r, chi2=first.chi2 - share * fall) for r, share in zip(begun, (0.8, 0.7), strict=True)]
-    trials = [Trial(Pick(at[r.placed[0].use.at[0]], 0, 1.0, 0.0), r, 0.0) for r in said]
+    trials = [CandidateFit(Pick(at[r.placed[0].use.at[0]], 0, 1.0, 0.0), r, 0.0) for r in said]
     looks.clear()
     again = once_more(search, opened, trials, "once more")[0].refit
     assert list(dict.fromkeys(text.partition(" at ")[2] for text in looks)) == places

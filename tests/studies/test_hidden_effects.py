@@ -12,17 +12,17 @@ import pytest
 
 from hvdc_ident import simulate as package
 from hvdc_ident.data import InputSignal, Trajectory, experiment
-from hvdc_ident.discrepancy import Options
+from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.begin import added
 from hvdc_ident.discrepancy.refits.nominal import nominal
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, judged, run
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, judged, run
 from hvdc_ident.discrepancy.search.akin import bends
 from hvdc_ident.discrepancy.search.rounds import one_round
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.hops import hopped
-from hvdc_ident.discrepancy.trials.jobs import job
+from hvdc_ident.discrepancy.trials.refit_jobs import job
 from hvdc_ident.discrepancy.trials.refitted import PROMISING, refitted
-from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.effects import EffectUse, Probe, effects
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.immutable import FrozenMap
@@ -400,10 +400,10 @@ def test_levels_are_met_that_a_loop_slides_between(large):
     model, before = model_of("station"), refitted_plain(case)
     probe = Probe("quantisation", FrozenMap({"step": 0.08}), FrozenMap({"step": (1e-3, 0.5)}))
     wider, problem, placed, begin = added(
-        model, before.problem, Candidate("quantisation", ("Iline",), (probe,)), 0, 1.0
+        model, before.problem, CandidateEffect("quantisation", ("Iline",), (probe,)), 0, 1.0
     )
-    job = Job(wider, (placed,), problem, (np.concatenate([before.theta, begin]),), before.noise)
-    found = hopped(Search("all", None, FrozenMap(), Options(), 0), [job], [""])[0]
+    job = RefitJob(wider, (placed,), problem, (np.concatenate([before.theta, begin]),), before.noise)
+    found = hopped(SearchContext("all", None, FrozenMap(), DiagnosisOptions(), 0), [job], [""])[0]
     assert found.sizes(placed)["step"] == pytest.approx(0.0638, rel=1e-3)
     assert found.chi2 < 0.05 * run(job).chi2
 
@@ -411,8 +411,8 @@ def test_levels_are_met_that_a_loop_slides_between(large):
 def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
     """A rate limit at an integrator in its loop: slower it bends all, faster it does nothing, and no slope leads back."""
     case = holding(large, Hidden("rate-limit", "xi", {"rate": 1.4}), "small", 3, 2e-3, "ar")
-    before, options = refitted_plain(case), Options()
-    search = Search(("rate-limit", "lag"), None, FrozenMap(), options, 0)
+    before, options = refitted_plain(case), DiagnosisOptions()
+    search = SearchContext(("rate-limit", "lag"), None, FrozenMap(), options, 0)
     found = one_round(search, before, 1)
     picks = [p for p in bends(found) if found.candidates[p.candidate].at == ("xi",)]
     probes = found.candidates[picks[0].candidate].probes

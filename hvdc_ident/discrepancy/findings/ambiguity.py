@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.findings.conclusion import Rival
 from hvdc_ident.discrepancy.findings.explain import advice
-from hvdc_ident.discrepancy.findings.result import Rival
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.refit import Refit
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
-from hvdc_ident.discrepancy.trials.select import Trial, at_edge, behinds, best_gain, best_of
-from hvdc_ident.discrepancy.trials.state import Round
+from hvdc_ident.discrepancy.trials.context import Round
+from hvdc_ident.discrepancy.trials.select import CandidateFit, at_edge, behinds, best_gain, best_of
 from hvdc_ident.effects import each_its_own, effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -26,7 +26,7 @@ MISSED = 0.15
 """Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
 
 
-def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, ...]:
+def rivals(found: Round, options: DiagnosisOptions, droop: bool = True) -> tuple[Rival, ...]:
     """The winner and every candidate within delta BIC of it, the best first; those with its very signature too.
 
     droop: whether a negative coupling is one, for they are the same.
@@ -61,7 +61,7 @@ def rivals(found: Round, options: Options, droop: bool = True) -> tuple[Rival, .
     return tuple(each.values())
 
 
-def _as_likely(found: Round, other: Candidate, options: Options) -> bool:
+def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
     """Whether a form with a parameter more is not refuted by its price though the winner is alone: at the same place, where
     the data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
     """
@@ -73,7 +73,7 @@ def _as_likely(found: Round, other: Candidate, options: Options) -> bool:
     return other.at == best.at and (weak or delays)
 
 
-def formula_rivals(found: Round, formulas: Sequence[Trial], options: Options) -> tuple[Rival, ...]:
+def formula_rivals(found: Round, formulas: Sequence[CandidateFit], options: DiagnosisOptions) -> tuple[Rival, ...]:
     """The winner with the formulas outside the catalogue that are near it in BIC; () where one is further ahead of it.
 
     formulas: refitted in the winner's stead. One that explains as much with a parameter more, and would not without any of
@@ -97,13 +97,13 @@ def _all_needed(refit: Refit) -> bool:
     return all(std is not None and abs(sizes[n]) > NEEDED * std for n, std in stds.items())
 
 
-def _rival(trial: Trial, behind: float) -> Rival:
+def _rival(trial: CandidateFit, behind: float) -> Rival:
     placed = trial.refit.placed[-1]
     c, sizes = placed.candidate, FrozenMap(trial.refit.sizes(placed))
     return Rival(c.effect, c.at, behind, sizes, c.source, expression=placed.use.expression)
 
 
-def _unfitted(found: Round, best: float, options: Options, droop: bool) -> list[Rival]:
+def _unfitted(found: Round, best: float, options: DiagnosisOptions, droop: bool) -> list[Rival]:
     """Candidates that were not refitted but, being linear in their size, gain what their score says."""
     assert found.ruler is not None
     done = {t.pick.candidate for t in (*found.trials, *found.failed)}

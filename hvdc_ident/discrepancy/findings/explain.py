@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from hvdc_ident.discrepancy.findings.result import Found, Size
+from hvdc_ident.discrepancy.findings.conclusion import EffectSize, FoundEffect
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.effects import effects
@@ -15,7 +15,7 @@ MOST_PLACES = 4
 """Signals at most that are asked for."""
 
 
-def found_of(refit: Refit, placed: Placed, chosen_from: int) -> Found:
+def found_of(refit: Refit, placed: Placed, chosen_from: int) -> FoundEffect:
     """An effect of the refitted model with its sizes, their 95 % intervals, and its sentence."""
     entry = effects()[placed.candidate.effect]
     sizes = refit.sizes(placed)
@@ -24,8 +24,8 @@ def found_of(refit: Refit, placed: Placed, chosen_from: int) -> Found:
         if n in sizes and not (q.optional and sizes[n] == q.neutral):
             std = refit.std.get(placed.names.get(n, ""))
             interval = None if std is None else _within(sizes[n] - 1.96 * std, sizes[n] + 1.96 * std, q.min, q.max)
-            shown[n] = Size(sizes[n], interval, q.unit)
-    return Found(
+            shown[n] = EffectSize(sizes[n], interval, q.unit)
+    return FoundEffect(
         placed.candidate.effect, placed.candidate.at, FrozenMap(shown), sentence(placed, sizes), chosen_from,
         placed.candidate.source,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.findings.result import Gap, Table
+from hvdc_ident.discrepancy.findings.conclusion import Gap, Table
 from hvdc_ident.discrepancy.refits.refit import Refit, held_out, unseen
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem

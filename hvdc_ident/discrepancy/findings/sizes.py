@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.discrepancy.findings.result import Diagnosis, Found
+from hvdc_ident.discrepancy.findings.conclusion import Diagnosis, FoundEffect
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
@@ -83,7 +83,7 @@ def _where_it_matters(found: Diagnosis) -> tuple[str, str] | None:
     return None
 
 
-def _neutral(effect: Found, neutral: float | str | None) -> float:
+def _neutral(effect: FoundEffect, neutral: float | str | None) -> float:
     """The size at which the effect is not there; for some that is the value of another of its parameters."""
     if isinstance(neutral, str):
         other = effect.parameters.get(neutral)
@@ -109,6 +109,6 @@ def _with(model: Model, found: Diagnosis, value: float | None) -> Model:
     return model
 
 
-def _use(effect: Found, other: Mapping[str, float]) -> EffectUse:
+def _use(effect: FoundEffect, other: Mapping[str, float]) -> EffectUse:
     sizes: dict[str, float | str] = {n: s.value for n, s in effect.parameters.items()}
     return EffectUse(effect.effect, effect.at, FrozenMap(sizes | dict(other)), source=effect.source)

@@ -45,7 +45,7 @@ SLOW = 0.5
 
 
 @dataclass(frozen=True)
-class Noise:
+class OutputNoise:
     """The noise of one output. std: in its unit, None where the data are deterministic (the misfit stands in).
 
     model: its AR coefficients from row to row, () where it is white; error: the standard error of artanh of a single
@@ -72,7 +72,7 @@ class Noise:
         return Rounding(self.step, max(self.below, FINEST * self.step)) if coarse else None
 
 
-def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[Noise]:
+def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[OutputNoise]:
     """The noise of every measured output, from all its records together; AR coefficients from all outputs together."""
     outputs = dict.fromkeys(o for e in experiments for o in e.outputs)
     quiet = {o: _quiet(o, [e for e in experiments if o in e.outputs]) for o in outputs}
@@ -165,27 +165,27 @@ def _lack(found: Likelihood, given: float) -> tuple[float, bool]:
     return 2.0 * float(found.values.max() - found.at(given).max()), bool(found.std[best[1]] > given)
 
 
-def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> Noise:
+def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNoise:
     given, rows, step = quiet.given, quiet.rows, quiet.step
     std = quiet.std if quiet.moves else 0.0
     if quiet.coarse and (given is None or given < quiet.rounded):
         # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked.
-        return Noise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+        return OutputNoise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
     if quiet.coarse:
-        return Noise(given, (), 0.0, step, GIVEN, rows)
+        return OutputNoise(given, (), 0.0, step, GIVEN, rows)
     if given is None and std <= quiet.floor:
         if step > 0.0:
-            return Noise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+            return OutputNoise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
         if rows == 0 and quiet.scatter is not None:
-            return Noise(
+            return OutputNoise(
                 quiet.scatter, (), 0.0, step, "the scatter from row to row, for no rows lie before an event", 0
             )
-        return Noise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
+        return OutputNoise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
     model = (colour.rho,) if colour.tanh else quiet.longer
     if colour.tanh and found is not None:
         std = found.best_std(colour.tanh)
     if given is None:
-        return Noise(std, model, colour.error, step, "the records before the event", rows)
+        return OutputNoise(std, model, colour.error, step, "the records before the event", rows)
     if colour.tanh and found is not None:
         lack, above = _lack(found, given)
         noisier = above and lack > SURE**2
@@ -194,8 +194,10 @@ def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> Noise:
         independent = max(rows * (1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0)
         noisier = std > given * (1.0 + SURE / np.sqrt(2.0 * independent))
     if noisier:
-        return Noise(std, model, colour.error, step, "the records before the event, noisier than what was given", rows)
-    return Noise(given, model, colour.error, step, GIVEN, rows)
+        return OutputNoise(
+            std, model, colour.error, step, "the records before the event, noisier than what was given", rows
+        )
+    return OutputNoise(given, model, colour.error, step, GIVEN, rows)
 
 
 def _even(experiments: Sequence[Experiment]) -> bool:
@@ -286,7 +288,12 @@ def _dither(records: Sequence[Array], step: float) -> float:
 
 
 def draws(
-    problem: Problem, blocks: Sequence[Block], noise: FrozenMap[Noise], fitted: Sequence[Array], count: int, seed: int
+    problem: Problem,
+    blocks: Sequence[Block],
+    noise: FrozenMap[OutputNoise],
+    fitted: Sequence[Array],
+    count: int,
+    seed: int,
 ) -> list[Array]:
     """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
 

@@ -15,8 +15,8 @@ from hvdc_ident.discrepancy.outside.law import STABLE, law
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.discrepancy.scores.scored import Path
 from hvdc_ident.discrepancy.signatures.candidates import kind_of, source_signals
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.formula import Law, filled, labelled
-from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.effects import effects
 from hvdc_ident.fit.result import plain
 from hvdc_ident.immutable import FrozenMap
@@ -51,7 +51,7 @@ class Fallback:
         return {n: plain(getattr(self, n)) for n in self.__dataclass_fields__ if n != "refit"}
 
 
-def fallback(search: Search, opened: Round) -> Fallback:
+def fallback(search: SearchContext, opened: Round) -> Fallback:
     """A law found from the data; where none stands, a disturbance or a curve. opened: the search's first round, which may have
     looked for a law already."""
     found = law(search, opened) if opened.laws is None else next(iter(opened.laws), None)
@@ -60,7 +60,7 @@ def fallback(search: Search, opened: Round) -> Fallback:
     return _curve(search, opened)
 
 
-def _places(search: Search, opened: Round) -> list[str]:
+def _places(search: SearchContext, opened: Round) -> list[str]:
     """Slots inside the model that are heard at the outputs."""
     paths = opened.answers()
     inner = [
@@ -151,7 +151,7 @@ class _Shape:
     found: Regression
 
 
-def _curve(search: Search, opened: Round) -> Fallback:
+def _curve(search: SearchContext, opened: Round) -> Fallback:
     """The hidden input over time or over a signal, whichever explains more for its number of knots."""
     paths, nominal = opened.answers(), opened.before.nominal()
     begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())

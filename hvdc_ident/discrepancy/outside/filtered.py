@@ -17,11 +17,11 @@ from hvdc_ident.discrepancy.outside.law import standing
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.discrepancy.scores.scored import scored
-from hvdc_ident.discrepancy.signatures.candidates import Candidate, candidates
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.refitted import refitted
-from hvdc_ident.discrepancy.trials.select import Trial, best_of
-from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
+from hvdc_ident.discrepancy.trials.select import CandidateFit, best_of
 from hvdc_ident.immutable import FrozenMap
 
 BESIDES = ("low", "high")
@@ -33,14 +33,14 @@ LATE = -0.5
 notch's or a resonance's."""
 
 
-def filtered(search: Search, found: Round, trials: Sequence[Trial], best: Refit) -> Law | None:
+def filtered(search: SearchContext, found: Round, trials: Sequence[CandidateFit], best: Refit) -> Law | None:
     """The filter that comes near the noise, clearly nearer than `best`, the best refit of the catalogue; None where there is
     none. trials: those of `filters`."""
     refits = [t.refit for t in trials]
     return standing(search, found, refits, [None] * len(refits), best)[1]
 
 
-def filters(search: Search, found: Round, nominal: Nominal) -> tuple[Trial, ...]:
+def filters(search: SearchContext, found: Round, nominal: Nominal) -> tuple[CandidateFit, ...]:
     """Filters refitted where they score best, those that no chain of the catalogue's effects is: first a band alone, then one
     that is off below and above it too. nominal: the model before the round, projected."""
     paths, before = found.answers(), found.before
@@ -55,7 +55,7 @@ def filters(search: Search, found: Round, nominal: Nominal) -> tuple[Trial, ...]
     return tuple(t for t in trials if not t.refit.failure and _rings(t.refit))
 
 
-def _band(candidate: Candidate) -> Candidate:
+def _band(candidate: CandidateEffect) -> CandidateEffect:
     """The filter that changes nothing but a band."""
     free = [FrozenMap({n: b for n, b in p.free.items() if n not in BESIDES}) for p in candidate.probes]
     return replace(candidate, probes=tuple(replace(p, free=f) for p, f in zip(candidate.probes, free, strict=True)))

@@ -16,16 +16,16 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.noise.records import draws
 from hvdc_ident.discrepancy.outside.hidden import Regression, regression
-from hvdc_ident.discrepancy.refits.adequacy import adequacy
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.refits.refit import Refit, unseen
+from hvdc_ident.discrepancy.refits.residual_tests import residual_tests
 from hvdc_ident.discrepancy.signatures.candidates import source_signals
 from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.formula import Law, at_run, formula_job
 from hvdc_ident.discrepancy.trials.library import Term, hats, terms
 from hvdc_ident.discrepancy.trials.refitted import RACE, is_far
 from hvdc_ident.discrepancy.trials.select import Ruler
-from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.executor import mapped
 
@@ -49,7 +49,7 @@ OVER = 6
 
 
 @dataclass(frozen=True, eq=False)
-class _Slot:
+class _SlotLibrary:
     """What is regressed at one slot: a library, and curves, each of hats over a signal's levels.
 
     noise: (N, B) records of it, projected; price: what a term has to bring.
@@ -95,7 +95,7 @@ class _Form:
         return [self, shorter] if len(self.terms) == MOST else [self]
 
 
-def law(search: Search, found: Round, best: Refit | None = None) -> Law | None:
+def law(search: SearchContext, found: Round, best: Refit | None = None) -> Law | None:
     """The formula that explains most of what the model before a round lacks; None where none stands every test.
 
     Looked for within reach, as the round has it. None, too, for a model that is closed inside. best: of the refits of the
@@ -113,7 +113,7 @@ def law(search: Search, found: Round, best: Refit | None = None) -> Law | None:
     return _best(search, found, [f for f in forms if f.stability is None][:CURVES], best) or told
 
 
-def _best(search: Search, found: Round, forms: Sequence[_Form], best: Refit | None) -> Law | None:
+def _best(search: SearchContext, found: Round, forms: Sequence[_Form], best: Refit | None) -> Law | None:
     """The form, refitted, that leaves least for the price of its terms; None where none stands every test."""
     before, jobs, of = found.before, [], []
     for form in forms:
@@ -127,7 +127,7 @@ def _best(search: Search, found: Round, forms: Sequence[_Form], best: Refit | No
 
 
 def standing(
-    search: Search, found: Round, refits: Sequence[Refit], stable: Sequence[float | None], best: Refit | None
+    search: SearchContext, found: Round, refits: Sequence[Refit], stable: Sequence[float | None], best: Refit | None
 ) -> tuple[int, Law | None]:
     """Of the forms that were refitted the one that leaves least for the price of its terms, of those that stand every test,
     and which it is; None where none does. stable: the share of noise records that each was chosen from."""
@@ -140,11 +140,11 @@ def standing(
     return -1, None
 
 
-def _price(search: Search, found: Round) -> float:
+def _price(search: SearchContext, found: Round) -> float:
     return search.options.named_bic + float(np.log(found.before.rows))
 
 
-def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Form]:
+def _forms(search: SearchContext, found: Round, paths: Mapping[str, Along]) -> list[_Form]:
     """Of every slot the terms that are chosen there; what brings most first."""
     before, nominal = found.before, found.before.nominal()
     signals = slot_signals(before.model, paths, before.placed)
@@ -167,7 +167,7 @@ def _forms(search: Search, found: Round, paths: Mapping[str, Along]) -> list[_Fo
                 n: replace(p.only(place), values={s: v for s, v in p.values.items() if s in used})
                 for n, p in paths.items()
             }
-            jobs.append(_Slot(nominal, slim, place, library, curves, noise, price))
+            jobs.append(_SlotLibrary(nominal, slim, place, library, curves, noise, price))
     forms = []
     for k, own_forms in enumerate(mapped(search.executor, _at_slot, jobs)):
         search.tell(k + 1, len(jobs), f"hidden input at {jobs[k].place}")
@@ -187,14 +187,14 @@ def _levels(signals: Sequence[Array]) -> Array:
     return np.interp(np.linspace(0.0, travelled[-1], KNOTS), travelled, edges)
 
 
-def _at_slot(slot: _Slot) -> list[_Form]:
+def _at_slot(slot: _SlotLibrary) -> list[_Form]:
     """What is chosen at a slot from its library, and its best curve; as far as they are worth their price."""
     curves = [f for c in slot.curves if len(c) > 2 and (f := _curve(slot, c)) is not None]
     best = max(curves, key=lambda f: f.worth(slot.price), default=None)
     return [f for f in (_formula(slot), best) if f is not None]
 
 
-def _curve(slot: _Slot, curve: tuple[Term, ...]) -> _Form | None:
+def _curve(slot: _SlotLibrary, curve: tuple[Term, ...]) -> _Form | None:
     """A curve at a slot; None where it is not worth its price, or its signal skips a level, as one that steps does."""
     found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in curve])
     if np.linalg.norm(found.columns, axis=0).min() < 1e-6 * np.linalg.norm(found.columns):
@@ -204,7 +204,7 @@ def _curve(slot: _Slot, curve: tuple[Term, ...]) -> _Form | None:
     return form if form.worth(slot.price) > 0 else None
 
 
-def _formula(slot: _Slot) -> _Form | None:
+def _formula(slot: _SlotLibrary) -> _Form | None:
     """What is chosen at a slot from its library; None where nothing is worth its price."""
     found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in slot.library])
     chosen = found.selected(MOST, slot.price)
@@ -215,14 +215,16 @@ def _formula(slot: _Slot) -> _Form | None:
     return _Form(slot.place, tuple(slot.library[j] for j in chosen), coefficients, gain, stability)
 
 
-def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, slot: _Slot) -> float:
+def _stability(found: Regression, chosen: Sequence[int], coefficients: Array, slot: _SlotLibrary) -> float:
     """The share of records, the terms' answer with other noise, from which the same terms are chosen."""
     explained = found.columns[:, list(chosen)] @ coefficients
     again = [found.selected(MOST, slot.price, explained + noise) for noise in slot.noise.T]
     return sum(set(a) == set(chosen) for a in again) / len(again)
 
 
-def _tested(search: Search, before: Refit, refit: Refit, stability: float | None, best: Refit | None) -> Law | None:
+def _tested(
+    search: SearchContext, before: Refit, refit: Refit, stability: float | None, best: Refit | None
+) -> Law | None:
     """The law; None where it does not stand the tests an effect of the catalogue has to."""
     ruler = Ruler.of(refit)
     gain = ruler.gain(before.chi2, refit.chi2, refit.count - before.count)
@@ -232,7 +234,7 @@ def _tested(search: Search, before: Refit, refit: Refit, stability: float | None
     if refit.chi2 / refit.rows > CLOSE or now > CLOSE:
         return None  # what it leaves has to be next to noise
     explained = before.chi2 - refit.chi2
-    tests = adequacy(refit.nominal(), {}, bootstraps=100, seed=search.seed)
+    tests = residual_tests(refit.nominal(), {}, bootstraps=100, seed=search.seed)
     if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):
         return None
     ahead = best is None or ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic

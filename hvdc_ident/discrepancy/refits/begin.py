@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.fit import Free, Problem
@@ -31,7 +31,7 @@ ROOM = 3.0
 class Placed:
     """An effect in a model: its candidate, its use, and by its own parameter names those of the model."""
 
-    candidate: Candidate
+    candidate: CandidateEffect
     use: EffectUse
     names: FrozenMap[str]
     bounds: FrozenMap[tuple[float, float]]
@@ -41,7 +41,7 @@ class Placed:
 def added(
     model: AnyModel,
     problem: Problem,
-    candidate: Candidate,
+    candidate: CandidateEffect,
     probe: int,
     factor: float,
     made: dict[Hashable, AnyModel] | None = None,
@@ -76,12 +76,12 @@ def added(
     return larger, more, placed, np.array([f.start for f in free])
 
 
-def _absent(candidate: Candidate, name: str, values: Mapping[str, float]) -> bool:
+def _absent(candidate: CandidateEffect, name: str, values: Mapping[str, float]) -> bool:
     q = effects()[candidate.effect].parameters[name]
     return q.optional and values[name] == q.neutral
 
 
-def reaching(candidate: Candidate, probe: int, factor: float) -> Candidate:
+def reaching(candidate: CandidateEffect, probe: int, factor: float) -> CandidateEffect:
     """The candidate with room in the probe's bounds for the size that a score asks for, where it is in proportion to that.
 
     What a slot carries by itself is no measure of what is added there: a friction that hardly moves may be kicked hard.
@@ -98,7 +98,7 @@ def reaching(candidate: Candidate, probe: int, factor: float) -> Candidate:
     return replace(candidate, probes=(*candidate.probes[:probe], wider, *candidate.probes[probe + 1 :]))
 
 
-def moved(candidate: Candidate, probe: int, factor: float) -> dict[str, float]:
+def moved(candidate: CandidateEffect, probe: int, factor: float) -> dict[str, float]:
     """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
     values, free = candidate.probes[probe].values, candidate.probes[probe].free
     entry, found = effects()[candidate.effect], dict(values)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.discrepancy.noise.records import Noise, noise_of
+from hvdc_ident.discrepancy.noise.records import OutputNoise, noise_of
 from hvdc_ident.errors import StudyError
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit import Free, Problem, Simulator
@@ -34,7 +34,7 @@ class Nominal:
 
     problem: Problem
     theta: Array
-    noise: FrozenMap[Noise]
+    noise: FrozenMap[OutputNoise]
     extra: Array | None = None
 
     @cached_property
@@ -174,7 +174,7 @@ def off_jumps(experiment: Experiment) -> Experiment:
     return experiment.with_(measured=replace(experiment.measured, values=values))
 
 
-def _stated(experiment: Experiment, output: str, noise: Noise) -> float | None:
+def _stated(experiment: Experiment, output: str, noise: OutputNoise) -> float | None:
     """The standard deviation of a record: its own where that was given and holds, else what was found of its noise."""
     return experiment.noise.get(output) if noise.source == "given" else noise.std
 

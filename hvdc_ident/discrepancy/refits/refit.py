@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.discrepancy.noise.records import Noise
+from hvdc_ident.discrepancy.noise.records import OutputNoise
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.nominal import Nominal, orthonormal
 from hvdc_ident.effects import clearance, effects
@@ -32,7 +32,7 @@ SCANNED = 15
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class RefitJob:
     """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
 
     evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
@@ -42,7 +42,7 @@ class Job:
     placed: tuple[Placed, ...]
     problem: Problem
     begins: tuple[Array, ...]
-    noise: FrozenMap[Noise]
+    noise: FrozenMap[OutputNoise]
     evaluations: int = METHOD.max_evaluations
     spare: tuple[Array, ...] = ()
 
@@ -61,7 +61,7 @@ class Refit:
     model: AnyModel
     placed: tuple[Placed, ...]
     problem: Problem
-    noise: FrozenMap[Noise]
+    noise: FrozenMap[OutputNoise]
     theta: Array
     chi2: float = np.inf
     rows: int = 0
@@ -114,7 +114,7 @@ class Refit:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class RefitResult:
     """What a job found, without what it was given: small enough to be sent and kept. Fields as in `Refit`."""
 
     theta: Array
@@ -128,23 +128,23 @@ class Found:
     failure: str
     ended: bool
 
-    def refit(self, job: Job) -> Refit:
+    def refit(self, job: RefitJob) -> Refit:
         """The refit of the job that found this."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         return Refit(job.model, job.placed, job.problem, job.noise, **own)
 
 
-def find(job: Job) -> Found:
+def find(job: RefitJob) -> RefitResult:
     """What `run` finds."""
     return found_by(run(job))
 
 
-def found_by(refit: Refit) -> Found:
+def found_by(refit: Refit) -> RefitResult:
     """What a refit came to, without what it was given."""
-    return Found(**{f.name: getattr(refit, f.name) for f in fields(Found)})
+    return RefitResult(**{f.name: getattr(refit, f.name) for f in fields(RefitResult)})
 
 
-def run(job: Job) -> Refit:
+def run(job: RefitJob) -> Refit:
     """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
     best: Refit | None = None
     why = ""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import Probe, SlotSignal, effects, scanned
 from hvdc_ident.immutable import FrozenMap
@@ -30,7 +30,7 @@ TOGETHER = 400
 class Dense:
     """A candidate with one size, and (C,) all those that it is looked at with, the least first."""
 
-    candidate: Candidate
+    candidate: CandidateEffect
     sizes: Array
 
     @property
@@ -38,7 +38,7 @@ class Dense:
         """The effect, and where."""
         return self.candidate.effect, self.candidate.at
 
-    def alone(self, k: int) -> Candidate:
+    def alone(self, k: int) -> CandidateEffect:
         """The candidate with one of the sizes."""
         return replace(
             self.candidate, probes=(_resized(self.candidate.probes[0], sized(self.candidate), float(self.sizes[k])),)
@@ -61,24 +61,24 @@ class Dense:
         return [replace(self, sizes=self.sizes[k : k + TOGETHER]) for k in range(0, self.sizes.size, TOGETHER)]
 
 
-def has_to_be_met(candidate: Candidate) -> bool:
+def has_to_be_met(candidate: CandidateEffect) -> bool:
     """Whether the size has to be met."""
     return effects()[candidate.effect].scanned
 
 
-def by_level(candidate: Candidate) -> bool:
+def by_level(candidate: CandidateEffect) -> bool:
     """Whether the size has to be met and is a level of the signal, not a time."""
     return has_to_be_met(candidate) and effects()[candidate.effect].late is None
 
 
-def bent(candidate: Candidate) -> bool:
+def bent(candidate: CandidateEffect) -> bool:
     """Whether the effect bends its signal at one slot by one parameter that need not be met, and is no kind of delay."""
     entry = effects()[candidate.effect]
     single = len(candidate.at) == 1 and not candidate.source and all(len(p.free) == 1 for p in candidate.probes)
     return single and entry.late is None and not entry.scanned and not is_linear(kind_of(candidate, 0))
 
 
-def widened(candidate: Candidate) -> Dense:
+def widened(candidate: CandidateEffect) -> Dense:
     """Many sizes of a candidate that bends its signal, evenly in the logarithm."""
     name = sized(candidate)
     low, high = candidate.probes[0].free[name]
@@ -86,13 +86,13 @@ def widened(candidate: Candidate) -> Dense:
     return Dense(candidate, np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT))
 
 
-def every_size(candidate: Candidate, signal: SlotSignal) -> Dense:
+def every_size(candidate: CandidateEffect, signal: SlotSignal) -> Dense:
     """Every size worth a look of a candidate whose size has to be met. signal: that of its slot."""
     probe, sizes = scanned(effects()[candidate.effect], signal)
     return Dense(replace(candidate, probes=(probe,)), np.sort(sizes))
 
 
-def sized(candidate: Candidate) -> str:
+def sized(candidate: CandidateEffect) -> str:
     """The parameter whose size is looked for: the one that has to be met, or the only one."""
     parameters = effects()[candidate.effect].parameters
     return next((n for n, q in parameters.items() if q.scan is not None), next(iter(parameters)))

@@ -39,7 +39,7 @@ class Reach:
 
 
 @dataclass(frozen=True, eq=False)
-class _Slot:
+class _SlotJob:
     """What is asked of one slot."""
 
     nominal: Nominal
@@ -60,7 +60,7 @@ def reach(nominal: Nominal, paths: Mapping[str, Path], slots: Sequence[str], exe
     gap = float(np.sum(left**2)) - rows
     if not gap > SURE * np.sqrt(2.0 * rows):
         return None
-    jobs = [_Slot(nominal, {n: p.only(s) for n, p in inner.items()}, s) for s in slots]
+    jobs = [_SlotJob(nominal, {n: p.only(s) for n, p in inner.items()}, s) for s in slots]
     found = np.array(list(mapped(executor, _at_slot, jobs)))
     brings, count = found[:, 0] - found[:, 1], found[:, 1]
     chance = SURE * np.sqrt(2.0 * count + 4.0 * np.maximum(brings, 0.0))
@@ -73,5 +73,5 @@ def reach(nominal: Nominal, paths: Mapping[str, Path], slots: Sequence[str], exe
     )
 
 
-def _at_slot(slot: _Slot) -> tuple[float, int]:
+def _at_slot(slot: _SlotJob) -> tuple[float, int]:
     return Inversion.of(slot.nominal, slot.paths, slot.place).reach

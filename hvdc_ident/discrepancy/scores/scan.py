@@ -25,7 +25,7 @@ from hvdc_ident.discrepancy.scores.dense import Dense, has_to_be_met, sized
 from hvdc_ident.discrepancy.scores.inversion import Inversion
 from hvdc_ident.discrepancy.scores.scored import Path, Scores, two_sided
 from hvdc_ident.discrepancy.signatures.block import block, parameter
-from hvdc_ident.discrepancy.signatures.finite import Column, kind_of
+from hvdc_ident.discrepancy.signatures.finite import SignatureColumn, kind_of
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
@@ -96,7 +96,7 @@ class Slot:
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class ScanJob:
     """One place: the model without the effect and what it leaves, what is looked at there, what traces are multiplied with,
     and how patiently the model is run."""
 
@@ -129,18 +129,18 @@ def scan(
     else:
         thin = [replace(d, sizes=d.sizes[:: max(d.sizes.size // THIN, 1)]) for d in dense]
         rough = _looked(
-            [Job(before, nominal.residual, d, right, QUICK) for d in thin], right, known, executor, progress, text
+            [ScanJob(before, nominal.residual, d, right, QUICK) for d in thin], right, known, executor, progress, text
         )
         spots, largest = _spots(thin, rough, before.theta), rough.largest
     best = _tops(spots)
-    jobs = [Job(replace(before, theta=s.theta), nominal.residual, s.dense, right, PATIENT) for s in best]
+    jobs = [ScanJob(replace(before, theta=s.theta), nominal.residual, s.dense, right, PATIENT) for s in best]
     fine = _looked(jobs, right, known, executor, progress, f"{text}, closer still")
     chosen = _best(best, fine)
     kept = [replace(best[c.candidate], dense=best[c.candidate].dense.only(c.probe)) for c in chosen]
     at = [fine.columns.index(c) for c in chosen]
     spots = [replace(s, score=float(fine.t[k]), fall=float(fine.falls[k])) for s, k in zip(kept, at, strict=True)]
     parts = {n: getattr(fine, n)[at] for n in ("raw", "size", "left", "noise", "sound", "two_sided")}
-    columns = tuple(Column(i, 0) for i in range(len(kept)))
+    columns = tuple(SignatureColumn(i, 0) for i in range(len(kept)))
     return Scan(tuple(spots), Scores(columns, **parts), np.maximum(largest, fine.largest))
 
 
@@ -267,9 +267,9 @@ def _tops(spots: Sequence[Spot]) -> list[Spot]:
     return chosen
 
 
-def _best(spots: Sequence[Spot], scores: Scores) -> list[Column]:
+def _best(spots: Sequence[Spot], scores: Scores) -> list[SignatureColumn]:
     """The best size of each of the best places of every effect, by what the model itself makes of it."""
-    kept: dict[str, dict[tuple[str, ...], Column]] = {}
+    kept: dict[str, dict[tuple[str, ...], SignatureColumn]] = {}
     worth = np.where(scores.falls > 0, scores.falls, 1e-6 * scores.t)
     least = WORTH * float(worth.max(initial=0.0))
     for k in np.argsort(-worth, kind="stable"):
@@ -282,7 +282,7 @@ def _best(spots: Sequence[Spot], scores: Scores) -> list[Column]:
 
 
 def _looked(
-    jobs: Sequence[Job], right: Array, known: int, executor: Executor | None, progress: Progress | None, text: str
+    jobs: Sequence[ScanJob], right: Array, known: int, executor: Executor | None, progress: Progress | None, text: str
 ) -> Scores:
     """The scores of every size of some candidates, by running the model; none where there is nothing to run.
 
@@ -298,12 +298,12 @@ def _looked(
     sound = np.isfinite(size)
     size, product = np.where(sound, size, 0.0), np.where(sound[:, None], product, 0.0)
     left = np.maximum(size - np.sum(product[:, 1 : 1 + known] ** 2, axis=1), 0.0)
-    columns = tuple(Column(i, n) for i, job in enumerate(jobs) for n in range(job.dense.sizes.size))
+    columns = tuple(SignatureColumn(i, n) for i, job in enumerate(jobs) for n in range(job.dense.sizes.size))
     either = np.array([two_sided(jobs[c.candidate].dense.candidate) for c in columns], dtype=bool)
     return Scores(columns, product[:, 0], size, left, product[:, 1 + known :], sound, either)
 
 
-def _traces(job: Job) -> tuple[Array, Array]:
+def _traces(job: ScanJob) -> tuple[Array, Array]:
     """(C, k) traces times the right-hand sides, (C,) their squares; not finite for a size that could not be run."""
     before, sizes = job.before, job.dense.sizes
     products, squares = np.full((sizes.size, job.right.shape[1]), np.nan), np.full(sizes.size, np.nan)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.noise.records import draws
 from hvdc_ident.discrepancy.refits.nominal import Nominal
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.signatures.ends import Ends, ends
-from hvdc_ident.discrepancy.signatures.finite import LOOSE, Column, Task, columns_of, signatures, tasks
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.closed import Ends, ends
+from hvdc_ident.discrepancy.signatures.finite import LOOSE, SignatureColumn, Task, columns_of, signatures, tasks
 from hvdc_ident.discrepancy.signatures.response import Along, along
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import Executor, mapped
@@ -41,7 +41,7 @@ class Scores:
     whether the loop closed. two_sided: (C,) whether the effect may be reversed. beside: (B,) the largest score in each
     record of noise of columns that were looked at too and are not here."""
 
-    columns: tuple[Column, ...]
+    columns: tuple[SignatureColumn, ...]
     raw: Array
     size: Array
     left: Array
@@ -116,7 +116,7 @@ def _largest(paths: Mapping[str, Path]) -> int:
     return max(len(a.outputs) * a.count + 3 * a.time.size for a in paths.values())
 
 
-def two_sided(candidate: Candidate) -> bool:
+def two_sided(candidate: CandidateEffect) -> bool:
     """Whether the effect may act either way: a parameter passes its neutral value, or a phase turns it round."""
     entry = effects()[candidate.effect]
     if "phase" in entry.parameters:
@@ -129,7 +129,7 @@ def two_sided(candidate: Candidate) -> bool:
 
 def scored(
     nominal: Nominal,
-    found: Sequence[Candidate],
+    found: Sequence[CandidateEffect],
     paths: Mapping[str, Path],
     *,
     bootstraps: int,
@@ -157,7 +157,7 @@ def scored(
         own = [b for b in blocks if b.experiment == e.name]
         width = sum(b.residual.size for b in own)
         jobs.append(
-            Job(
+            ScoreJob(
                 paths[e.name],
                 plan,
                 Whitening.of(own, e, nominal),
@@ -209,7 +209,7 @@ class Whitening:
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class ScoreJob:
     """One experiment's share of the work."""
 
     path: Path
@@ -220,7 +220,7 @@ class Job:
     exact: int
 
 
-def _products(job: Job) -> tuple[Array, Array, Array]:
+def _products(job: ScoreJob) -> tuple[Array, Array, Array]:
     """(C, k) signatures times the right-hand sides, (C,) their squares, (C,) how far the loop was from closed."""
     products, squares = np.zeros((job.columns, job.right.shape[1])), np.zeros(job.columns)
     change = np.full(job.columns, np.inf)
@@ -237,7 +237,7 @@ def _products(job: Job) -> tuple[Array, Array, Array]:
 
 
 def signature_rows(
-    nominal: Nominal, found: Sequence[Candidate], paths: Mapping[str, Path], chosen: Sequence[Column]
+    nominal: Nominal, found: Sequence[CandidateEffect], paths: Mapping[str, Path], chosen: Sequence[SignatureColumn]
 ) -> Array:
     """(n, N) whitened signatures of some columns over all blocks, without what parameters, and starts, make good."""
     plan = tasks(found, chosen, _largest(paths))

@@ -11,8 +11,9 @@ import numpy as np
 
 from hvdc_ident.discrepancy.scores.dense import bent, by_level
 from hvdc_ident.discrepancy.scores.scored import SEEN
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.trials.jobs import job_of
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
+from hvdc_ident.discrepancy.trials.refit_jobs import job_of
 from hvdc_ident.discrepancy.trials.refitted import (
     HEAT,
     SPRINT,
@@ -24,8 +25,7 @@ from hvdc_ident.discrepancy.trials.refitted import (
     once_more,
     refitted,
 )
-from hvdc_ident.discrepancy.trials.select import Pick, Trial
-from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 
@@ -46,8 +46,8 @@ LIKE = 0.15
 
 
 def elsewhere(
-    search: Search, opened: Round, picks: Sequence[Pick], trials: Sequence[Trial], number: int
-) -> list[Trial]:
+    search: SearchContext, opened: Round, picks: Sequence[Pick], trials: Sequence[CandidateFit], number: int
+) -> list[CandidateFit]:
     """Refits of the best effects at every other place where they score more than noise: the places that cannot be told from
     theirs are to be had by no other way, for a score is that of one size and of gains that are biased."""
     found = opened.candidates
@@ -70,7 +70,7 @@ def elsewhere(
     )
 
 
-def other_forms(opened: Round, trials: Sequence[Trial], was: float) -> list[Pick]:
+def other_forms(opened: Round, trials: Sequence[CandidateFit], was: float) -> list[Pick]:
     """The best candidates with other parts of the effect, where it is made of optional ones: a score is that of one of them.
 
     was: chi2 of the model before. A loss in proportion to a current is no better told from its square by the gains as they
@@ -92,7 +92,7 @@ def other_forms(opened: Round, trials: Sequence[Trial], was: float) -> list[Pick
     return picks[:FORMS]
 
 
-def as_late(opened: Round, trials: Sequence[Trial]) -> list[Pick]:
+def as_late(opened: Round, trials: Sequence[CandidateFit]) -> list[Pick]:
     """The other kinds of delay at the best places of one, to be begun where they delay a slow signal by as much.
 
     A score is had at few sizes, and from a wrong one no slope leads to the right one: a window to another of its zeros.
@@ -117,8 +117,8 @@ def as_late(opened: Round, trials: Sequence[Trial]) -> list[Pick]:
 
 
 def with_begun(
-    search: Search, opened: Round, trials: Sequence[Trial], picks: Sequence[Pick], number: int
-) -> list[Trial]:
+    search: SearchContext, opened: Round, trials: Sequence[CandidateFit], picks: Sequence[Pick], number: int
+) -> list[CandidateFit]:
     """The trials with those picks, of each candidate the best.
 
     A period that has to be met is looked for where there is something left for it to explain, in the first round: of
@@ -132,7 +132,7 @@ def with_begun(
     return best_each([*trials, *begun])
 
 
-def carried(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> list[Trial]:
+def carried(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> list[CandidateFit]:
     """The best, where its size has to be met, with that size and those gains at every other place within reach.
 
     The scores that put it where it is are of other sizes, and of gains that are biased.
@@ -151,7 +151,7 @@ def carried(search: Search, opened: Round, trials: Sequence[Trial], number: int)
                 picks.append(Pick(k, 0, 1.0, opened.score_p(k)[0]))
     texts = [f"round {number}: {best.effect} elsewhere: {found[p.candidate].label}" for p in picks]
     ends = SPRINT.run(search, opened.before.chi2, jobs, texts, refit.chi2)
-    return [Trial(p, r, -np.inf) for p, r in zip(picks, ends, strict=True)]
+    return [CandidateFit(p, r, -np.inf) for p, r in zip(picks, ends, strict=True)]
 
 
 def bends(opened: Round) -> list[Pick]:
@@ -170,12 +170,12 @@ def bends(opened: Round) -> list[Pick]:
     return [Pick(c.candidate, c.probe, 1.0, opened.score_p(c.candidate)[0]) for c in chosen]
 
 
-def leaders(opened: Round, trials: Sequence[Trial]) -> list[Candidate]:
+def leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateEffect]:
     """The candidates whose refits are the best, the best first."""
     return [opened.candidates[t.pick.candidate] for t in by_cost(trials)[:LEADERS]]
 
 
-def is_akin(candidate: Candidate, best: Sequence[Candidate]) -> bool:
+def is_akin(candidate: CandidateEffect, best: Sequence[CandidateEffect]) -> bool:
     """Whether a candidate is worth a closer look because of what is best so far: the same at any place, where its size has
     to be met; a bend at any place, where something bends its signal; a sampler where something delays it."""
     if effects()[candidate.effect].scanned and best and best[0].effect == candidate.effect:
@@ -190,7 +190,7 @@ def _apart(a: float, b: float) -> float:
     return abs(math.log(a / b))
 
 
-def _late(trial: Trial) -> float | None:
+def _late(trial: CandidateFit) -> float | None:
     """By how long the effect that a trial added delays a slow signal, s; None for what is no kind of delay."""
     placed = trial.refit.placed[-1]
     return effects()[placed.candidate.effect].late_by(trial.refit.sizes(placed))

@@ -12,12 +12,12 @@ from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.discrepancy.scores.dense import bent, every_size, widened
 from hvdc_ident.discrepancy.scores.scan import View, scan
 from hvdc_ident.discrepancy.scores.scored import Path, runs
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.signatures.finite import Column
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.finite import SignatureColumn
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.discrepancy.trials.jobs import as_given
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.trials.refit_jobs import as_given
 from hvdc_ident.discrepancy.trials.select import Pick
-from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
 from hvdc_ident.effects import SlotSignal, effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.model import Model
@@ -27,7 +27,11 @@ Views = Callable[[], Sequence[View]]
 
 
 def closer_look(
-    search: Search, opened: Round, views: Views, number: int, wanted: Callable[[Candidate], bool] = lambda _: True
+    search: SearchContext,
+    opened: Round,
+    views: Views,
+    number: int,
+    wanted: Callable[[CandidateEffect], bool] = lambda _: True,
 ) -> tuple[Round, tuple[Pick, ...]]:
     """The round with the sizes that a closer look found, and the picks to refit for them. wanted: what is looked at."""
     before, found, options = opened.before, opened.candidates, search.options
@@ -54,7 +58,7 @@ def closer_look(
     found = _joined(found, better)
     known = {_key(c): k for k, c in enumerate(found)}
     at = [known[_key(c)] for c in better]
-    columns = tuple(Column(k, len(found[k].probes) - 1) for k in at)
+    columns = tuple(SignatureColumn(k, len(found[k].probes) - 1) for k in at)
     scores = opened.scores.joined(replace(seen.scores, columns=columns, beside=seen.largest))
     picks = [
         Pick(c.candidate, c.probe, 1.0, s.score, tuple(s.theta.tolist()))
@@ -79,16 +83,16 @@ def _views(before: Refit, nominal: Nominal, paths: Mapping[str, Path]) -> list[V
     return views
 
 
-def _joined(found: Sequence[Candidate], better: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def _joined(found: Sequence[CandidateEffect], better: Sequence[CandidateEffect]) -> tuple[CandidateEffect, ...]:
     """The candidates, with the sizes that a scan found after their own."""
     more = {_key(c): c.probes for c in better}
     return tuple(replace(c, probes=(*c.probes, *more.get(_key(c), ()))) for c in found)
 
 
-def _key(candidate: Candidate) -> Hashable:
+def _key(candidate: CandidateEffect) -> Hashable:
     return candidate.effect, candidate.at, candidate.named
 
 
-def _worth_a_scan(candidate: Candidate) -> bool:
+def _worth_a_scan(candidate: CandidateEffect) -> bool:
     """Whether many sizes are looked at: at one slot that moves."""
     return len(candidate.at) == 1 and not candidate.still

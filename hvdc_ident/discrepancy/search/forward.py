@@ -8,15 +8,15 @@ from hvdc_ident.discrepancy.refits.refit import Refit, judged
 from hvdc_ident.discrepancy.search.pairs import pair
 from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.search.settle import settled
-from hvdc_ident.discrepancy.trials.jobs import as_given
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
+from hvdc_ident.discrepancy.trials.refit_jobs import as_given
 from hvdc_ident.discrepancy.trials.refitted import is_far, is_noise
 from hvdc_ident.discrepancy.trials.select import Ruler
-from hvdc_ident.discrepancy.trials.state import Round, Search
 from hvdc_ident.errors import SimulationError
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class SearchOutcome:
     """Where the search ended.
 
     rounds: all of them; kept: by effect of the final model, the round that judges its rivals; notes: what could not be done.
@@ -28,7 +28,7 @@ class Outcome:
     notes: tuple[str, ...] = ()
 
 
-def from_either_side(search: Search, first: Refit) -> Outcome:
+def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
     """The search from the refitted gains; where that leaves more than noise, from the given ones if it then ends nearer.
 
     Gains that have moved far to make up for what is missing may leave no room for it: beside them a lag of its true size is
@@ -49,7 +49,7 @@ def from_either_side(search: Search, first: Refit) -> Outcome:
     return again if nearer else outcome
 
 
-def forward(search: Search, first: Refit) -> Outcome:
+def forward(search: SearchContext, first: Refit) -> SearchOutcome:
     """The effects that are added one after the other, each with all others refitted, until nothing is worth adding."""
     rounds: list[Round] = []
     kept: list[Round] = []
@@ -82,4 +82,4 @@ def forward(search: Search, first: Refit) -> Outcome:
     if len(kept) > 1:
         here, kept, more = settled(search, first, here, kept, len(rounds))
         notes += more
-    return Outcome(here, tuple(rounds), tuple(kept), notes)
+    return SearchOutcome(here, tuple(rounds), tuple(kept), notes)

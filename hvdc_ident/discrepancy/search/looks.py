@@ -20,8 +20,9 @@ from hvdc_ident.discrepancy.search.akin import (
     with_begun,
 )
 from hvdc_ident.discrepancy.search.closer import Views, closer_look, views_of
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.signatures.finite import Column
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.finite import SignatureColumn
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
 from hvdc_ident.discrepancy.trials.race import Race
 from hvdc_ident.discrepancy.trials.refitted import (
     HEAT,
@@ -36,8 +37,7 @@ from hvdc_ident.discrepancy.trials.refitted import (
     refitted,
     telling,
 )
-from hvdc_ident.discrepancy.trials.select import Pick, Trial, neighbours, others, shortlist
-from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, neighbours, others, shortlist
 
 LOOKED_AT = 80
 """Candidates, the best by score, whose signatures are compared with each other."""
@@ -59,28 +59,28 @@ class Stand:
     the best scores. trials: the refits so far. late: the other kinds of delay that were begun.
     """
 
-    search: Search
+    search: SearchContext
     opened: Round
     nominal: Nominal
     number: int
     picks: tuple[Pick, ...]
     best: tuple[Pick, ...]
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[CandidateFit, ...] = ()
     late: tuple[Pick, ...] = ()
 
     def text(self, look: str) -> str:
         """What whoever watches is told of a look."""
         return f"round {self.number}: {look}"
 
-    def refits(self, picks: Sequence[Pick], look: str, race: Race = RACE) -> list[Trial]:
+    def refits(self, picks: Sequence[Pick], look: str, race: Race = RACE) -> list[CandidateFit]:
         """Some picks refitted in a race with those so far."""
         return refitted(self.search, self.opened, picks, self.text(look), self.trials, race)
 
-    def with_more(self, trials: Sequence[Trial]) -> Stand:
+    def with_more(self, trials: Sequence[CandidateFit]) -> Stand:
         """The stand with further refits."""
         return replace(self, trials=(*self.trials, *trials))
 
-    def with_best(self, trials: Sequence[Trial]) -> Stand:
+    def with_best(self, trials: Sequence[CandidateFit]) -> Stand:
         """The stand with further refits, of each candidate the best."""
         return replace(self, trials=tuple(best_each([*self.trials, *trials])))
 
@@ -106,8 +106,8 @@ Look = Callable[[Stand], Stand]
 
 
 def looked(
-    search: Search, opened: Round, nominal: Nominal, number: int, picks: tuple[Pick, ...]
-) -> tuple[Round, tuple[Trial, ...]]:
+    search: SearchContext, opened: Round, nominal: Nominal, number: int, picks: tuple[Pick, ...]
+) -> tuple[Round, tuple[CandidateFit, ...]]:
     """The round and its refits, after all the looks that are worth their time."""
     threshold = opened.scores.threshold(0.5)  # what noise reaches every other time is not worth a look
     best = tuple(p for p in picks[:LOOKED_AT] if p.score > threshold)
@@ -136,7 +136,7 @@ def looked(
 def _shortlisted(stand: Stand) -> Stand:
     """The best by score, one of each that leave the same trace."""
     opened = stand.opened
-    columns = [Column(p.candidate, p.probe) for p in stand.best]
+    columns = [SignatureColumn(p.candidate, p.probe) for p in stand.best]
     rows = signature_rows(stand.nominal, opened.candidates, opened.paths, columns)
     chosen, same = shortlist(stand.best, opened.candidates, rows, stand.search.options)
     stand = replace(stand, opened=replace(opened, same=same))
@@ -194,7 +194,7 @@ def _closer(stand: Stand) -> Stand:
     return _looked_closer(stand, views, lambda c: not is_akin(c, leading))
 
 
-def _looked_closer(stand: Stand, views: Views, wanted: Callable[[Candidate], bool]) -> Stand:
+def _looked_closer(stand: Stand, views: Views, wanted: Callable[[CandidateEffect], bool]) -> Stand:
     """The refits of a closer look at the candidates that are wanted, of those within reach."""
     reached = stand.opened.reaches
     opened, extra = closer_look(stand.search, stand.opened, views, stand.number, lambda c: reached(c) and wanted(c))
@@ -244,7 +244,7 @@ def _once_more(stand: Stand) -> Stand:
     return further.with_best(_again(further, [best]))
 
 
-def _again(stand: Stand, trials: Sequence[Trial]) -> list[Trial]:
+def _again(stand: Stand, trials: Sequence[CandidateFit]) -> list[CandidateFit]:
     return once_more(stand.search, stand.opened, trials, stand.text("once more"))
 
 

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.refits.refit import Job, Refit
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.scores.scored import signature_rows
 from hvdc_ident.discrepancy.search.rounds import against, gained
-from hvdc_ident.discrepancy.signatures.finite import Column
-from hvdc_ident.discrepancy.trials.jobs import job
+from hvdc_ident.discrepancy.signatures.finite import SignatureColumn
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
 from hvdc_ident.discrepancy.trials.race import Race
-from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial, best_of
-from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.discrepancy.trials.refit_jobs import job
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler, best_of
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 
@@ -24,14 +24,16 @@ LOOKED_AT = 60
 TRIED = 3
 
 
-def pair(search: Search, before: Refit, found: Round) -> tuple[Round, Round] | None:
+def pair(search: SearchContext, before: Refit, found: Round) -> tuple[Round, Round] | None:
     """Two rounds, each with one of the pair as its winner, where a pair passes that no single effect does; else None."""
     nominal = before.nominal()
     # A size that has to be met cannot be told from the score while something else is missing.
     picks = [p for p in best_of(found.scores, found.candidates) if not _scanned(found, p)][:LOOKED_AT]
     if len(picks) < 2:
         return None
-    rows = signature_rows(nominal, found.candidates, found.paths, [Column(p.candidate, p.probe) for p in picks])
+    rows = signature_rows(
+        nominal, found.candidates, found.paths, [SignatureColumn(p.candidate, p.probe) for p in picks]
+    )
     residual = nominal.projected(nominal.residual[:, None])[:, 0]
     couples = [(picks[i], picks[j]) for i, j in _best(rows, residual)[:TRIED]]
     best = min((t.refit.chi2 for t in found.trials), default=before.chi2)
@@ -64,10 +66,10 @@ def _best(rows: Array, residual: Array) -> list[tuple[int, int]]:
 
 
 def _refitted(
-    search: Search, before: Refit, found: Round, groups: Sequence[tuple[Pick, ...]], best: float
+    search: SearchContext, before: Refit, found: Round, groups: Sequence[tuple[Pick, ...]], best: float
 ) -> list[tuple[tuple[Pick, ...], Refit]]:
     """The refits of some effects together, group by group; those that cannot sit there beside each other left out."""
-    jobs: list[tuple[tuple[Pick, ...], Job]] = []
+    jobs: list[tuple[tuple[Pick, ...], RefitJob]] = []
     for picks in groups:
         with suppress(HvdcIdentError):
             jobs.append((picks, job(before, found.candidates, picks)))
@@ -76,7 +78,7 @@ def _refitted(
     return [(picks, refit) for (picks, _), refit in zip(jobs, refits, strict=True)]
 
 
-def _halves(search: Search, before: Refit, found: Round, couple: tuple[Pick, ...]) -> list[Refit]:
+def _halves(search: SearchContext, before: Refit, found: Round, couple: tuple[Pick, ...]) -> list[Refit]:
     """Each effect of a pair by itself, as it was refitted in the round, or now; fewer than two where one cannot be."""
     known = {t.pick.candidate: t.refit for t in found.trials}
     missing = [(p,) for p in couple if p.candidate not in known]
@@ -85,22 +87,22 @@ def _halves(search: Search, before: Refit, found: Round, couple: tuple[Pick, ...
 
 
 def _judged(
-    search: Search, before: Refit, found: Round, couple: tuple[Pick, ...], both: Refit
+    search: SearchContext, before: Refit, found: Round, couple: tuple[Pick, ...], both: Refit
 ) -> tuple[Round, Round] | None:  # fmt: skip
     """The two rounds of a pair that passes; None where it does not."""
     one, two = couple
     ruler = Ruler.of(both)
-    whole = gained(Trial(two, both, 0.0), before, ruler)
+    whole = gained(CandidateFit(two, both, 0.0), before, ruler)
     if against(search, before, whole, found, first=True):
         return None
     halves = _halves(search, before, found, couple)
     if len(halves) < 2:
         return None
     alone = min(halves, key=lambda h: h.chi2)
-    trial = Trial(two, both, ruler.gain(alone.chi2, both.chi2, both.count - alone.count))
+    trial = CandidateFit(two, both, ruler.gain(alone.chi2, both.chi2, both.count - alone.count))
     if against(search, alone, trial, found, first=True):
         return None
-    first = Trial(one, halves[0], ruler.gain(before.chi2, halves[0].chi2, halves[0].count - before.count))
+    first = CandidateFit(one, halves[0], ruler.gain(before.chi2, halves[0].chi2, halves[0].count - before.count))
     left = replace(found, trials=(first,), winner=first, ruler=ruler, same={}, why="")
     right = replace(found, before=halves[0], trials=(trial,), winner=trial, ruler=ruler, same={}, why="")
     return left, right

@@ -13,10 +13,10 @@ from hvdc_ident.discrepancy.scores.tones import tones
 from hvdc_ident.discrepancy.search.closer import closer_look, views_of
 from hvdc_ident.discrepancy.search.looks import looked
 from hvdc_ident.discrepancy.signatures.candidates import candidates
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.objections import evidence, objections
 from hvdc_ident.discrepancy.trials.refitted import all_far, excess, like_noise, once_more, refitted
-from hvdc_ident.discrepancy.trials.select import Ruler, Trial, behinds, best_of
-from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Ruler, behinds, best_of
 
 REFIT_SCORE = 0.5
 """What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
@@ -30,7 +30,7 @@ NEARLY = 0.1
 BEYOND = "none of it leaves noise, and what is found from the data alone does"
 
 
-def one_round(search: Search, before: Refit, number: int) -> Round:
+def one_round(search: SearchContext, before: Refit, number: int) -> Round:
     """A round on the model as it stands. Raises SimulationError where that model cannot be run."""
     options, nominal = search.options, before.nominal()
     search.tell(0, 1, f"round {number}: the model's answers at every slot")
@@ -68,7 +68,7 @@ def one_round(search: Search, before: Refit, number: int) -> Round:
     return closed(search, *looked(search, opened, nominal, number, near), number)
 
 
-def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
+def _met(search: SearchContext, opened: Round, nominal: Nominal) -> Round:
     """The round after a closer look alone, where nothing else has a score though more than noise is left."""
     text = "round 1: refits of the closer look"
     seen, picks = closer_look(search, opened, views_of(opened, nominal), 1)
@@ -80,7 +80,7 @@ def _met(search: Search, opened: Round, nominal: Nominal) -> Round:
     return closed(search, replace(seen, significant=True, why=""), trials, 1)
 
 
-def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) -> Round:
+def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
     """The round with its refits ranked and its winner, or what speaks against the best.
 
     Ranked by what the fitted and the held-out data say together.
@@ -100,14 +100,14 @@ def closed(search: Search, opened: Round, trials: Sequence[Trial], number: int) 
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
 
 
-def gained(trial: Trial, before: Refit, ruler: Ruler) -> Trial:
+def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
     """The trial with what it gains in BIC over the model before, and what the held-out data add to that."""
     more = trial.refit.count - before.count
-    own = Trial(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
+    own = CandidateFit(trial.pick, trial.refit, ruler.gain(before.chi2, trial.refit.chi2, more))
     return replace(own, evidence=evidence(before, own, ruler.effective / ruler.rows / ruler.scale))
 
 
-def against(search: Search, before: Refit, trial: Trial, opened: Round, *, first: bool) -> str:
+def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
     """What speaks against naming a trial's effect; empty where nothing does. opened: the round whose scores it has.
 
     A refit may end at another size than it began at, so the candidate's best score counts; one whose answer no expansion

@@ -7,14 +7,14 @@ from contextlib import suppress
 from dataclasses import replace
 
 from hvdc_ident.discrepancy.refits.begin import Placed
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, run
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.search.rounds import closed, one_round
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.trials.jobs import job_of
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
 from hvdc_ident.discrepancy.trials.race import done
+from hvdc_ident.discrepancy.trials.refit_jobs import job_of
 from hvdc_ident.discrepancy.trials.refitted import is_far
-from hvdc_ident.discrepancy.trials.select import Pick, Trial, at_edge, clear
-from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, at_edge, clear
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 
 OTHERS = 6
@@ -22,7 +22,7 @@ OTHERS = 6
 
 
 def settled(
-    search: Search, first: Refit, here: Refit, kept: Sequence[Round], number: int
+    search: SearchContext, first: Refit, here: Refit, kept: Sequence[Round], number: int
 ) -> tuple[Refit, list[Round], tuple[str, ...]]:
     """The refit, by effect the round that judges its rivals, and what could not be done, after looking for each again and
     doing without it.
@@ -68,8 +68,8 @@ def _beside_these(own: Round, others: Sequence[Placed], last: bool) -> bool:
 
 
 def _looked_again(
-    search: Search, first: Refit, here: Refit, found: Round, k: int, without: Refit, number: int
-) -> tuple[Round, Trial]:
+    search: SearchContext, first: Refit, here: Refit, found: Round, k: int, without: Refit, number: int
+) -> tuple[Round, CandidateFit]:
     """The round that looks for the effect in place k beside the others, and its winner: one that was not best alone may be.
 
     Those that came near it in its own round are tried too. The effect itself stays where nothing better may be named.
@@ -79,7 +79,7 @@ def _looked_again(
     again, mine = _with(again, own)
     sound = [t for t in again.trials if t.pick.candidate != mine]
     tried = {own.label, *(again.candidates[t.pick.candidate].label for t in sound)}
-    refits: list[tuple[Pick, Job]] = []
+    refits: list[tuple[Pick, RefitJob]] = []
     for trial in found.trials[: OTHERS + 1]:
         placed = trial.refit.placed[-1]
         among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
@@ -93,15 +93,15 @@ def _looked_again(
                 refits.append((Pick(number_of, 0, 1.0, 0.0), job))
     texts = [f"again with the others: {again.candidates[p.candidate].label}" for p, _ in refits]
     ended = done(search, [j for _, j in refits], texts)
-    sound += [Trial(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
+    sound += [CandidateFit(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
     mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
-    sound.append(mine_again[0] if mine_again else Trial(_pick(again, mine), _last(here, k), 0.0))
+    sound.append(mine_again[0] if mine_again else CandidateFit(_pick(again, mine), _last(here, k), 0.0))
     ranked = closed(search, again, [*sound, *again.failed], number)
     winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
     return replace(ranked, winner=winner), winner
 
 
-def _with(found: Round, candidate: Candidate) -> tuple[Round, int]:
+def _with(found: Round, candidate: CandidateEffect) -> tuple[Round, int]:
     """The round with the candidate among its own, and where it stands there."""
     for k, c in enumerate(found.candidates):
         if c.label == candidate.label:

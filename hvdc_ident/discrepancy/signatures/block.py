@@ -39,7 +39,7 @@ Quick = Callable[[Array, Mapping[str, Array]], Array]
 """Y, (K, nc), of u, (K, nc), and parameters, (1, nc) each."""
 
 
-class Block:
+class EffectBlock:
     """One effect's equations, from the signals u and source (K, nc) to y (K, nc)."""
 
     def __init__(self, model: Model, quick: Quick | None = None) -> None:
@@ -267,19 +267,19 @@ def _order(graph: Graph, roots: list[int]) -> list[int]:
 
 
 @lru_cache(maxsize=128)
-def block(effect: str, present: tuple[str, ...], source: bool) -> Block:
+def block(effect: str, present: tuple[str, ...], source: bool) -> EffectBlock:
     """The block of an effect with these parameters away from neutral; its parameters keep the effect's own names."""
     return _made(effect, present, source)
 
 
-def _made(effect: str, present: tuple[str, ...], source: bool) -> Block:
+def _made(effect: str, present: tuple[str, ...], source: bool) -> EffectBlock:
     from hvdc_ident.effects import effects
 
     entry = effects()[effect]
     # Any value away from neutral gives the structure; the run takes its own values.
     values = {n: _away(q) if n in present else q.value for n, q in entry.parameters.items()}
     use = EffectUse(effect, ("u",), FrozenMap(values), prefix="own", source="source" if source else "")
-    return Block(alone(use, source), _quick(entry))
+    return EffectBlock(alone(use, source), _quick(entry))
 
 
 def _quick(entry: Effect) -> Quick | None:

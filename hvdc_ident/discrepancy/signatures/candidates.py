@@ -35,7 +35,7 @@ STILL = 1e-9
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateEffect:
     """One effect at one place, or at several that share its parameters. source: the signal it brings in, or, joined by
     commas, one for each place.
 
@@ -84,7 +84,7 @@ def candidates(
     names: Iterable[str] | Literal["all"],
     places: Iterable[str | tuple[str, ...]] | None,
     tones: Iterable[float] = (),
-) -> tuple[Candidate, ...]:
+) -> tuple[CandidateEffect, ...]:
     """Every candidate. signals: at the model's slots, those of measured outputs included; times: (K,) of each experiment."""
     live = [p for p in signals if _moves(model, p)]
     groups = places_of(model, live, places)
@@ -94,7 +94,7 @@ def candidates(
         brought += tuple(p for p in live if kind_of(model, p) == "output")
     tried = entries(names)
     doubled = any(e.name == "coupling" for e in tried)
-    found: list[Candidate] = []
+    found: list[CandidateEffect] = []
     for at in groups:
         joined = SlotSignal.joined([about[p] for p in at])
         still = joined.high - joined.low <= STILL * max(joined.peak, STILL)
@@ -119,18 +119,18 @@ def _at(
     still: bool,
     about: Mapping[str, SlotSignal],
     brought: Sequence[str],
-) -> list[Candidate]:
+) -> list[CandidateEffect]:
     if effect.resistance:
         found = list(resistances(model, at[0])) if len(at) == 1 and isinstance(model, Model) else []
         return [
-            Candidate(
+            CandidateEffect(
                 effect.name, at, probes(effect, signal, given={effect.resistance: model.parameters[n].value}),
                 named=FrozenMap({effect.resistance: n}), still=still,
             )
             for n in found
         ]  # fmt: skip
     if not effect.needs_source:
-        return [Candidate(effect.name, at, probes(effect, signal), still=still and not additive(effect))]
+        return [CandidateEffect(effect.name, at, probes(effect, signal), still=still and not additive(effect))]
     open_to = [_open_to(model, p, [*about]) for p in at]
     seen = {
         own: SlotSignal.joined([about[s] for s in own])
@@ -138,7 +138,7 @@ def _at(
         if all(s in may for s, may in zip(own, open_to, strict=True))
     }
     return [
-        Candidate(effect.name, at, _halved(probes(effect, signal, other)), source=joined(own))
+        CandidateEffect(effect.name, at, _halved(probes(effect, signal, other)), source=joined(own))
         for own, other in seen.items()
         if not (still and other.high == other.low)
     ]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.signatures.block import block, parameter
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.signatures.ends import Ends
-from hvdc_ident.discrepancy.signatures.kernel import replaced
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.closed import Ends
+from hvdc_ident.discrepancy.signatures.propagation import replaced
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import effects
 
@@ -32,7 +32,7 @@ TOGETHER = 4_000_000
 
 
 @dataclass(frozen=True)
-class Column:
+class SignatureColumn:
     """One probe of one candidate, by their places in the lists."""
 
     candidate: int
@@ -60,12 +60,14 @@ class Task:
     index: int
 
 
-def columns_of(candidates: Sequence[Candidate]) -> tuple[Column, ...]:
+def columns_of(candidates: Sequence[CandidateEffect]) -> tuple[SignatureColumn, ...]:
     """Every probe of every candidate whose signal moves."""
-    return tuple(Column(i, k) for i, c in enumerate(candidates) if not c.still for k in range(len(c.probes)))
+    return tuple(SignatureColumn(i, k) for i, c in enumerate(candidates) if not c.still for k in range(len(c.probes)))
 
 
-def tasks(candidates: Sequence[Candidate], columns: Sequence[Column], size: int) -> tuple[tuple[Task, ...], ...]:
+def tasks(
+    candidates: Sequence[CandidateEffect], columns: Sequence[SignatureColumn], size: int
+) -> tuple[tuple[Task, ...], ...]:
     """The columns in parcels; those at the same slots, which are computed together, stand in one. size: of one answer."""
     most = max(TOGETHER // max(size, 1), 50)
     by_place: dict[tuple[str, ...], list[Task]] = {}
@@ -84,12 +86,12 @@ def tasks(candidates: Sequence[Candidate], columns: Sequence[Column], size: int)
     return tuple(tuple(p) for p in parcels if p)
 
 
-def _present(candidate: Candidate, probe: int) -> tuple[str, ...]:
+def _present(candidate: CandidateEffect, probe: int) -> tuple[str, ...]:
     entry, values = effects()[candidate.effect], candidate.probes[probe].values
     return tuple(n for n, q in entry.parameters.items() if not (q.optional and values[n] == q.neutral))
 
 
-def kind_of(candidate: Candidate, probe: int) -> Kind:
+def kind_of(candidate: CandidateEffect, probe: int) -> Kind:
     """The equations that a probe of a candidate asks for."""
     return Kind(candidate.effect, _present(candidate, probe), bool(candidate.source))
 

@@ -14,9 +14,8 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.discrepancy.signatures.grid import instants
-from hvdc_ident.discrepancy.signatures.kernel import propagate
-from hvdc_ident.discrepancy.signatures.tangent import Partials, Tangent, tangent
+from hvdc_ident.discrepancy.signatures.partials import EquationPartials, Partials, tangent
+from hvdc_ident.discrepancy.signatures.propagation import propagate
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
@@ -24,11 +23,17 @@ from hvdc_ident.simulate import simulate
 from hvdc_ident.simulate.recording import with_recording
 
 CHUNK = 128
+FEWEST = 600
+"""Fewer instants over a record are filled up."""
+AFTER = np.geomspace(2e-5, 2e-2, 22)
+"""Where instants are put after a jump, s: what a missing lag or delay does happens there."""
+AROUND = AFTER[10:17:6]
+"""The same after a corner, where less happens at once: an input that was recorded has one at every row."""
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """x' = phi x + g0 e + g1 e_next + ..., for all slots; the names are those of `kernel.propagate`."""
+    """x' = phi x + g0 e + g1 e_next + ..., for all slots; the names are those of `propagation.propagate`."""
 
     phi: Array
     g0: Array
@@ -115,7 +120,7 @@ def _of(matrix: Array, at: Sequence[int]) -> Array:
     return np.ascontiguousarray(matrix[:, :, at])
 
 
-def _observed(model: Model, parts: Tangent) -> Model:
+def _observed(model: Model, parts: EquationPartials) -> Model:
     """The model whose outputs are all its variables."""
     return replace(model, outputs=FrozenMap({n: Output(symbol(n)) for n in parts.variables}))
 
@@ -144,13 +149,39 @@ def along(model: Model, experiment: Experiment, values: Mapping[str, float]) -> 
     return Along(time, rows, seen, outputs, places(plant, outputs), system, before, share, experiment.time.size)
 
 
+def instants(experiment: Experiment) -> tuple[Array, NDArray[np.int64]]:
+    """(K,) instants, s, a jump's twice; and (K,) the row of the record that each is, -1 where it is none."""
+    time = experiment.time
+    begin, end = float(time[0]), float(time[-1])
+    rows = np.unique(time)
+    pieces = max(1, int(np.ceil(FEWEST / max(rows.size - 1, 1))))
+    inner = [rows[:-1] + k / pieces * np.diff(rows) for k in range(1, pieces)]
+    inputs = experiment.inputs.values()
+    breaks = np.unique([b for s in inputs for b in s.breaks.tolist() if begin < b < end])
+    jumps = np.intersect1d(breaks, [t for s in inputs for t in s.jumps.tolist()])
+    after = [b + (AFTER if b in jumps else AROUND) for b in breaks]
+    inside = np.concatenate([np.empty(0), *after])
+    every = np.unique(np.concatenate([rows, *inner, inside[inside < end], breaks]))
+    close = np.append(False, np.diff(every) < 1e-9 * max(end - begin, 1e-12)) & ~np.isin(every, rows)
+    every = every[~close]
+    grid = np.sort(np.concatenate([every, np.intersect1d(every, jumps)]))
+    row = np.full(grid.size, -1, dtype=np.int64)
+    # Of an instant that stands twice on the grid and once in the record the later one is compared: after the jump.
+    left, right = np.searchsorted(grid, time, "left"), np.searchsorted(grid, time, "right") - 1
+    first = np.append(np.diff(time) == 0, False)
+    row[np.where(first, left, right)] = np.arange(time.size)
+    return grid, row
+
+
 def places(model: Model, outputs: Sequence[str]) -> tuple[str, ...]:
     """Every slot of the model, measured outputs last; outputs that are not measured have no place."""
     inner = (*model.states, *model.signals, *model.algebraic, *model.inputs)
     return (*inner, *(o if o not in inner else f"outputs.{o}" for o in outputs))
 
 
-def _system(parts: Tangent, plant: Model, time: Array, rows: NDArray[np.int64], states: Array, p: Array) -> System:
+def _system(
+    parts: EquationPartials, plant: Model, time: Array, rows: NDArray[np.int64], states: Array, p: Array
+) -> System:
     blocks = [
         _matrices(parts, plant, parts.partials(time[k : k + CHUNK], states[k : k + CHUNK], p))
         for k in range(0, time.size, CHUNK)
@@ -191,7 +222,7 @@ class _Split:
     w: Array
 
 
-def _split(parts: Tangent, m: Array) -> _Split:
+def _split(parts: EquationPartials, m: Array) -> _Split:
     nx, nv, nu = len(parts.states), len(parts.signals), len(parts.inputs)
     return _Split(*np.split(m, np.cumsum([nx, nv, nu]), axis=2))
 
@@ -202,7 +233,7 @@ def _columns(through: Array, s: _Split, own: Array) -> Array:
     return direct + s.v @ through
 
 
-def _matrices(parts: Tangent, plant: Model, d: Partials) -> tuple[Array, ...]:
+def _matrices(parts: EquationPartials, plant: Model, d: Partials) -> tuple[Array, ...]:
     h, f, c, r = (_split(parts, m) for m in (d.signals, d.states, d.outputs, d.sources))
     k, no, nx, nv, nu = h.x.shape[0], len(parts.outputs), len(parts.states), len(parts.signals), len(parts.inputs)
 
@@ -225,7 +256,7 @@ def _matrices(parts: Tangent, plant: Model, d: Partials) -> tuple[Array, ...]:
     return a, b, bw, cs, ds, csw, co, do, dow, cf, df, dfw
 
 
-def _start(parts: Tangent, plant: Model, d: Partials) -> tuple[Array, Array]:
+def _start(parts: EquationPartials, plant: Model, d: Partials) -> tuple[Array, Array]:
     """(x, slots) and (w, slots): the shift of the steady start by a constant disturbance; of a given start none."""
     h, q, r = (_split(parts, m) for m in (d.signals, d.rest, d.sources))
     nx, nv, no, nw = len(parts.states), len(parts.signals), len(parts.outputs), len(parts.memory)
@@ -248,7 +279,7 @@ def _start(parts: Tangent, plant: Model, d: Partials) -> tuple[Array, Array]:
     return found[:nx], found[nx:]
 
 
-def _memory(parts: Tangent, plant: Model, time: Array, p: Array) -> tuple[NDArray[np.int64], Array]:
+def _memory(parts: EquationPartials, plant: Model, time: Array, p: Array) -> tuple[NDArray[np.int64], Array]:
     """For each instant and delayed or sampled value: between which instants its source lies, and how far."""
     nd = len(plant.delays)
     before = np.full((time.size, len(parts.memory)), -1, dtype=np.int64)
@@ -273,4 +304,4 @@ def _memory(parts: Tangent, plant: Model, time: Array, p: Array) -> tuple[NDArra
     return before, share
 
 
-__all__ = ["Along", "along", "places"]
+__all__ = ["Along", "along", "instants", "places"]

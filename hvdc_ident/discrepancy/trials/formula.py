@@ -9,9 +9,9 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.begin import Placed
-from hvdc_ident.discrepancy.refits.refit import Job, Refit
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.scores.scored import Path
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.trials.library import Term, along
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free
@@ -41,7 +41,7 @@ class Law:
     others: tuple[Refit, ...] = ()
 
 
-def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients: Array) -> Job:
+def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients: Array) -> RefitJob:
     """The refit of a model with the sum of k1, k2, … times the terms added at a slot, begun at those coefficients.
 
     Raises ModelError where the term cannot be put there.
@@ -59,7 +59,7 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
     free = tuple(Free(m, values[n], *bounds[n]) for n, m in zip(names, new, strict=True))
     problem = replace(before.problem, simulator=ModelSimulator(model), free=(*before.problem.free, *free))
     placed = Placed(
-        Candidate("term", (place,), ()),
+        CandidateEffect("term", (place,), ()),
         use,
         FrozenMap(dict(zip(names, new, strict=True))),
         FrozenMap(bounds),
@@ -70,7 +70,7 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
         np.concatenate([before.theta[:k], [share * v for v in values.values()], before.theta[k:]])
         for share in (1.0, *LESS)
     )
-    return Job(model, (*before.placed, placed), problem, (begin,), before.noise, spare=tuple(spare))
+    return RefitJob(model, (*before.placed, placed), problem, (begin,), before.noise, spare=tuple(spare))
 
 
 def labelled(refit: Refit) -> str:

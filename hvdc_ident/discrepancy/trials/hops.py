@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import orthonormal
-from hvdc_ident.discrepancy.refits.refit import Found, Job, Refit, found_by, judged, of_held_out, run, signal
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, RefitResult, found_by, judged, of_held_out, run, signal
 from hvdc_ident.discrepancy.scores.dense import BETWEEN, by_level, sized
 from hvdc_ident.discrepancy.scores.scan import PATIENT
-from hvdc_ident.discrepancy.trials.jobs import as_given
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.objections import unseen_rows
 from hvdc_ident.discrepancy.trials.race import done
-from hvdc_ident.discrepancy.trials.state import Search
+from hvdc_ident.discrepancy.trials.refit_jobs import as_given
 from hvdc_ident.effects import SlotSignal, effects, scanned
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
@@ -87,7 +87,7 @@ class _Sweep:
             return np.empty(0)
 
 
-def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Refit]:
+def hopped(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
     """What refits come to that look for their last effect's size again, as long as that helps, and once very closely.
 
     All of them go from look to look together, for a look at one is many runs. texts: what whoever watches is told of each.
@@ -115,17 +115,17 @@ def hopped(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Re
     return [found[k] for k in range(len(jobs))]
 
 
-def _polished(here: Refit) -> Found:
+def _polished(here: Refit) -> RefitResult:
     """What the refit from where a simplex ends comes to, where that is better: rows that go over an edge make of a slope a stair."""
     simplex = NelderMead(max_evaluations=RUNS, size=SIMPLEX, cost=0.05, step=1e-8, restarts=2)
     end = simplex.run(replace(here.problem, simulator=ModelSimulator(here.model, PATIENT)), here.theta)
-    there = run(Job(here.model, here.placed, here.problem, (end.theta,), here.noise))
+    there = run(RefitJob(here.model, here.placed, here.problem, (end.theta,), here.noise))
     return found_by(min(here, here if there.failure else there, key=_left))
 
 
 def _further(
-    search: Search,
-    jobs: Sequence[Job],
+    search: SearchContext,
+    jobs: Sequence[RefitJob],
     texts: Sequence[str],
     here: Mapping[int, Refit],
     begins: Mapping[int, Sequence[Array]],
@@ -180,7 +180,7 @@ def _other_counts(here: Refit) -> Array:
     return np.sort(sizes[(sizes > low) & (sizes < high)])
 
 
-def _agreed(search: Search, refits: Mapping[int, Refit]) -> dict[int, Refit]:
+def _agreed(search: SearchContext, refits: Mapping[int, Refit]) -> dict[int, Refit]:
     """The refits, each at the size that suits all data best of those that the fitted ones do not tell apart.
 
     Where a level or a sample falls on the other side of an edge a row jumps, whatever the standard deviation.
@@ -224,7 +224,7 @@ def _held(here: Refit) -> float:
     return max(float(e.time[-1] - e.time[0]) for e in here.problem.fitted_experiments)
 
 
-def _begins(search: Search, here: Mapping[int, Refit], sweep: _Sweep) -> dict[int, list[Array]]:
+def _begins(search: SearchContext, here: Mapping[int, Refit], sweep: _Sweep) -> dict[int, list[Array]]:
     """By job unknowns with the best sizes of a sweep, those the refit has and those that were given."""
     asked = {k: g for k, r in here.items() if (g := sweep.of(r)).size > 1}
     rough = _looked(search, here, asked, "fitted")
@@ -251,7 +251,7 @@ def _begins(search: Search, here: Mapping[int, Refit], sweep: _Sweep) -> dict[in
 
 
 def _between(
-    search: Search, here: Mapping[int, Refit], grids: Mapping[int, Array], best: Mapping[int, NDArray[np.intp]]
+    search: SearchContext, here: Mapping[int, Refit], grids: Mapping[int, Array], best: Mapping[int, NDArray[np.intp]]
 ) -> dict[int, list[float]]:
     """By job the best size between the neighbours of each of the best of its grid."""
     beside = {(k, n): _beside(grids[k], n) for k, own in best.items() for n in own}
@@ -264,7 +264,7 @@ def _beside(grid: Array, n: int) -> Array:
     return np.geomspace(grid[max(n - 1, 0)], grid[min(n + 1, grid.size - 1)], 2 * BETWEEN + 1)
 
 
-def _looked(search: Search, here: Mapping[K, Refit], grids: Mapping[K, Array], what: Data) -> dict[K, Array]:
+def _looked(search: SearchContext, here: Mapping[K, Refit], grids: Mapping[K, Array], what: Data) -> dict[K, Array]:
     """By key what is left at each size of a grid, wherever that is worked out."""
     cuts = {k: [g[n : n + PIECE] for n in range(0, g.size, PIECE)] for k, g in grids.items()}
     pieces = [_Piece(here[k], c, what) for k, own in cuts.items() for c in own]

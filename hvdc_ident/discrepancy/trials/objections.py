@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.refit import Refit, held_out, unseen
-from hvdc_ident.discrepancy.trials.select import Trial, at_edge, clear, material_gap
+from hvdc_ident.discrepancy.trials.select import CandidateFit, at_edge, clear, material_gap
 
 AGREED = 10.0
 """By how much chi2 of the held-out data has to fall for them to agree, or to rise for them to speak against an effect."""
@@ -19,7 +19,13 @@ STEP = 0.05
 
 
 def objections(
-    before: Refit, trial: Trial, p: float, options: Options, material: Mapping[str, float], *, first: bool
+    before: Refit,
+    trial: CandidateFit,
+    p: float,
+    options: DiagnosisOptions,
+    material: Mapping[str, float],
+    *,
+    first: bool,
 ) -> str:
     """What speaks against naming a trial's effect; empty where nothing does.
 
@@ -55,7 +61,7 @@ def objections(
     return ""
 
 
-def evidence(before: Refit, trial: Trial, share: float) -> float:
+def evidence(before: Refit, trial: CandidateFit, share: float) -> float:
     """What a trial gains in BIC on the fitted data and in chi2 on the others together; share: independent ones of all rows."""
     was, now = unseen(before), unseen(trial.refit)
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):

@@ -11,13 +11,13 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.nominal import orthonormal
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, find
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, find
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit.problem import stacked
 
 if TYPE_CHECKING:
-    from hvdc_ident.discrepancy.trials.state import Search
+    from hvdc_ident.discrepancy.trials.context import SearchContext
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Race:
     second: int = 0
     entrants: int | None = None
 
-    def admitted(self, search: Search, jobs: Sequence[Job], text: str) -> list[int]:
+    def admitted(self, search: SearchContext, jobs: Sequence[RefitJob], text: str) -> list[int]:
         """Which of the jobs are run, in their order."""
         if self.entrants is None or len(jobs) <= self.entrants:
             return list(range(len(jobs)))
@@ -44,7 +44,7 @@ class Race:
         return sorted(np.argsort(promised, kind="stable")[: self.entrants].tolist())
 
     def run(
-        self, search: Search, before: float, jobs: Sequence[Job], texts: Sequence[str], best: float = np.inf
+        self, search: SearchContext, before: float, jobs: Sequence[RefitJob], texts: Sequence[str], best: float = np.inf
     ) -> list[Refit]:
         """The jobs' refits: some evaluations each, and then those to their ends that are within reach of the best.
 
@@ -64,12 +64,12 @@ class Race:
         return _on(search, rest, refits, near, [f"{t}, to the end" for t in texts])
 
 
-def promises(jobs: Sequence[Job]) -> Array:
+def promises(jobs: Sequence[RefitJob]) -> Array:
     """What each promises. Those of one model go together: only one worker then makes its machine code."""
     return np.array([promise(job) for job in jobs])
 
 
-def promise(job: Job) -> float:
+def promise(job: RefitJob) -> float:
     """chi2 that a refit comes to from where it begins first, to first order; infinite where the model does not run there."""
     try:
         residual, jacobian = stacked(job.problem.blocks(job.begins[0]))
@@ -81,7 +81,7 @@ def promise(job: Job) -> float:
 
 
 def _on(
-    search: Search, jobs: Sequence[Job], refits: Sequence[Refit], which: Sequence[int], texts: Sequence[str]
+    search: SearchContext, jobs: Sequence[RefitJob], refits: Sequence[Refit], which: Sequence[int], texts: Sequence[str]
 ) -> list[Refit]:
     """The refits, some of them run on from where they are; one that fails stays there."""
     further = done(search, [replace(jobs[k], begins=(refits[k].theta,)) for k in which], [texts[k] for k in which])
@@ -89,7 +89,7 @@ def _on(
     return [better.get(k, r) for k, r in enumerate(refits)]
 
 
-def done(search: Search, jobs: Sequence[Job], texts: Sequence[str]) -> list[Refit]:
+def done(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
     """The jobs' refits, in their order, wherever they are done."""
     if jobs:
         search.tell(0, len(jobs), texts[0])

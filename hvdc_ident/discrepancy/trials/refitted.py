@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from hvdc_ident.discrepancy.refits.adequacy import adequacy, loud_after_breaks
 from hvdc_ident.discrepancy.refits.nominal import Nominal
-from hvdc_ident.discrepancy.refits.refit import Job, Refit, of_held_out, unseen
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, of_held_out, unseen
+from hvdc_ident.discrepancy.refits.residual_tests import loud_after_breaks, residual_tests
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext
 from hvdc_ident.discrepancy.trials.hops import hopped
-from hvdc_ident.discrepancy.trials.jobs import job
 from hvdc_ident.discrepancy.trials.objections import unseen_rows
 from hvdc_ident.discrepancy.trials.race import Race
-from hvdc_ident.discrepancy.trials.select import Pick, Trial
-from hvdc_ident.discrepancy.trials.state import Round, Search
+from hvdc_ident.discrepancy.trials.refit_jobs import job
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.model import AnyModel
@@ -48,8 +48,13 @@ TELLING = 0.1
 
 
 def refitted(
-    search: Search, opened: Round, picks: Sequence[Pick], text: str, earlier: Sequence[Trial] = (), race: Race = RACE
-) -> list[Trial]:
+    search: SearchContext,
+    opened: Round,
+    picks: Sequence[Pick],
+    text: str,
+    earlier: Sequence[CandidateFit] = (),
+    race: Race = RACE,
+) -> list[CandidateFit]:
     """The picks refitted, those that the race admits, in a race with each other and with those refitted earlier."""
     before, found = opened.before, opened.candidates
     jobs, of, trials = [], [], []
@@ -60,18 +65,23 @@ def refitted(
             of.append(p)
         except HvdcIdentError as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
-            trials.append(Trial(p, none, -np.inf))
+            trials.append(CandidateFit(p, none, -np.inf))
     admitted = race.admitted(search, jobs, text)
     jobs, of = [jobs[k] for k in admitted], [of[k] for k in admitted]
     texts = [f"{text}: {found[p.candidate].label}" for p in of]
     best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
     refits = race.run(search, before.chi2, jobs, texts, best)
-    return [*trials, *(Trial(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
+    return [*trials, *(CandidateFit(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
 
 
 def once_more(
-    search: Search, opened: Round, trials: Sequence[Trial], text: str, most: int = AGAIN, best: float = np.inf
-) -> list[Trial]:
+    search: SearchContext,
+    opened: Round,
+    trials: Sequence[CandidateFit],
+    text: str,
+    most: int = AGAIN,
+    best: float = np.inf,
+) -> list[CandidateFit]:
     """The trials, with another size where one is found beside the gains that a refit came to.
 
     best: the least chi2 of refits done elsewhere; those far behind it are left as they are. Of each effect the best comes
@@ -80,7 +90,7 @@ def once_more(
     found, was = opened.candidates, opened.before.chi2
     order = by_cost(trials)
     goal = max(WORTHY * (was - min([best, *(t.refit.chi2 for t in order)])), telling(opened.before))
-    chosen: dict[str, list[Trial]] = {}
+    chosen: dict[str, list[CandidateFit]] = {}
     for t in sorted(order, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
         if effects()[effect].scanned and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < most:
@@ -93,9 +103,11 @@ def once_more(
     return kept
 
 
-def _resized(search: Search, opened: Round, trials: Sequence[Trial], again: Sequence[Trial], text: str) -> list[Trial]:
+def _resized(
+    search: SearchContext, opened: Round, trials: Sequence[CandidateFit], again: Sequence[CandidateFit], text: str
+) -> list[CandidateFit]:
     """The trials, some of them with another size where one is found."""
-    jobs = [Job(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
+    jobs = [RefitJob(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
     refits = hopped(search, jobs, [f"{text}: {opened.candidates[t.pick.candidate].label}" for t in again])
     better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
     return [better.get(id(t), t) for t in trials]
@@ -106,9 +118,9 @@ def telling(before: Refit) -> float:
     return TELLING * (before.chi2 - before.rows)
 
 
-def best_each(trials: Sequence[Trial]) -> list[Trial]:
+def best_each(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
     """Of the trials of each candidate the best, in their order."""
-    kept: dict[int, Trial] = {}
+    kept: dict[int, CandidateFit] = {}
     for t in trials:
         had = kept.get(t.pick.candidate)
         if had is None or had.refit.failure or (not t.refit.failure and cost_of(t) < cost_of(had)):
@@ -116,12 +128,12 @@ def best_each(trials: Sequence[Trial]) -> list[Trial]:
     return list(kept.values())
 
 
-def by_cost(trials: Sequence[Trial]) -> list[Trial]:
+def by_cost(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
     """Those that came to a result, the best first."""
     return sorted((t for t in trials if not t.refit.failure), key=cost_of)
 
 
-def cost_of(trial: Trial) -> float:
+def cost_of(trial: CandidateFit) -> float:
     """What a refit leaves of all data, and what its parameters cost, before it is known what BIC counts by."""
     refit, held = trial.refit, unseen(trial.refit)
     return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
@@ -149,7 +161,7 @@ def left_by(refit: Refit) -> float:
     return max(refit.chi2 / refit.rows, (unseen(refit) or 0.0) ** 2) - 1.0
 
 
-def all_far(before: Refit, trials: Sequence[Trial], near: float = NEAR) -> bool:
+def all_far(before: Refit, trials: Sequence[CandidateFit], near: float = NEAR) -> bool:
     """Whether no refit comes near the noise, on the fitted data and on the others, or near enough: to a share of what was."""
     far = all(_leaves_much(before, t.refit, near) for t in trials if not t.refit.failure)
     return far and not any(like_noise(t.refit) for t in by_cost(trials)[:LOOKED_AT])
@@ -188,4 +200,4 @@ def is_noise(refit: Refit, seed: int) -> bool:
 
 def shapeless(nominal: Nominal, seed: int) -> bool:
     """Whether sums over time of what a model leaves are what they are of noise."""
-    return all(b.p > SHAPED for b in adequacy(nominal, {}, bootstraps=100, seed=seed))
+    return all(b.p > SHAPED for b in residual_tests(nominal, {}, bootstraps=100, seed=seed))

@@ -9,10 +9,10 @@ from itertools import zip_longest
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.discrepancy.scores.scored import SEEN, Scores
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import effects
 
@@ -43,7 +43,7 @@ class Pick:
 
 
 @dataclass(frozen=True)
-class Trial:
+class CandidateFit:
     """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC).
 
     evidence: the same with what it brings on the held-out data, where that is known.
@@ -60,7 +60,7 @@ class Trial:
         return self.gain if self.evidence is None else self.evidence
 
 
-def behinds(trials: Sequence[Trial]) -> list[float]:
+def behinds(trials: Sequence[CandidateFit]) -> list[float]:
     """By how much each is behind the best, in BIC: on all data together; or on the fitted ones, where that is less and the
     held-out ones do not speak clearly against it, for a difference of a few units there is not known better than the noise.
 
@@ -70,13 +70,13 @@ def behinds(trials: Sequence[Trial]) -> list[float]:
     return [min(gain - t.gain, told - t.told) if told - t.told < CLEARLY else told - t.told for t in trials]
 
 
-def best_gain(trials: Sequence[Trial]) -> float:
+def best_gain(trials: Sequence[CandidateFit]) -> float:
     """The largest gain of those that the held-out data do not speak clearly against."""
     told = max((t.told for t in trials), default=0.0)
     return max((t.gain for t in trials if told - t.told < CLEARLY), default=0.0)
 
 
-def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:
+def best_of(scores: Scores, found: Sequence[CandidateEffect]) -> tuple[Pick, ...]:
     """Each candidate at its best size, by falling score."""
     t, expected = scores.t, scores.expected
     best: dict[int, int] = {}
@@ -94,7 +94,7 @@ def best_of(scores: Scores, found: Sequence[Candidate]) -> tuple[Pick, ...]:
 
 
 def shortlist(
-    picks: Sequence[Pick], found: Sequence[Candidate], rows: Array, options: Options
+    picks: Sequence[Pick], found: Sequence[CandidateEffect], rows: Array, options: DiagnosisOptions
 ) -> tuple[tuple[Pick, ...], dict[int, list[Pick]]]:
     """The picks to refit, and for each (by candidate) those whose signature is the same at another place.
 
@@ -126,7 +126,7 @@ def shortlist(
     return tuple(picks[k] for k in chosen), same
 
 
-def _same_form(found: Sequence[Candidate], one: Pick, other: Pick) -> bool:
+def _same_form(found: Sequence[CandidateEffect], one: Pick, other: Pick) -> bool:
     """Whether two picks whose signatures are one may be one at every size.
 
     In proportion to their one size they are; a deadband of a load that stands still is one with that of a torque at one
@@ -139,7 +139,11 @@ def _same_form(found: Sequence[Candidate], one: Pick, other: Pick) -> bool:
 
 
 def neighbours(
-    picks: Sequence[Pick], found: Sequence[Candidate], done: Sequence[int], best: Sequence[Candidate], limit: int
+    picks: Sequence[Pick],
+    found: Sequence[CandidateEffect],
+    done: Sequence[int],
+    best: Sequence[CandidateEffect],
+    limit: int,
 ) -> tuple[Pick, ...]:
     """Candidates not refitted yet with the effect of one of the best, or at its places, by falling score."""
     kinds = {c.effect for c in best}
@@ -150,7 +154,7 @@ def neighbours(
 
 
 def others(
-    picks: Sequence[Pick], scores: Scores, found: Sequence[Candidate], done: Sequence[int], limit: int
+    picks: Sequence[Pick], scores: Scores, found: Sequence[CandidateEffect], done: Sequence[int], limit: int
 ) -> tuple[Pick, ...]:
     """One candidate for every effect and place that was not tried, the best by score first.
 

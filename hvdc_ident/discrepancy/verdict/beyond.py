@@ -11,16 +11,16 @@ from collections.abc import Mapping
 
 from hvdc_ident.discrepancy.outside.filtered import filters
 from hvdc_ident.discrepancy.outside.hidden import regression
-from hvdc_ident.discrepancy.refits.refit import Job, Refit
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.scores.scored import Path
 from hvdc_ident.discrepancy.search.rounds import gained
 from hvdc_ident.discrepancy.signatures.candidates import additive, source_signals
+from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.formula import at_run, formula_job
 from hvdc_ident.discrepancy.trials.library import Term, terms
 from hvdc_ident.discrepancy.trials.race import done
 from hvdc_ident.discrepancy.trials.refitted import PRICE
-from hvdc_ident.discrepancy.trials.select import Trial
-from hvdc_ident.discrepancy.trials.state import Round, Search, slot_signals
+from hvdc_ident.discrepancy.trials.select import CandidateFit
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
@@ -29,7 +29,7 @@ TRIED = 6
 """Formulas, the best by regression, that are refitted."""
 
 
-def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
+def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
     """The refits of forms outside the catalogue in the winner's stead; those that failed are left out.
 
     Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
@@ -51,10 +51,10 @@ def beyond(search: Search, found: Round) -> tuple[Trial, ...]:
     jobs = _jobs(found, placed.candidate.at[0], placed.candidate.source)
     texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
     refits = [r for r in done(search, jobs, texts) if not r.failure]
-    return tuple(gained(Trial(winner.pick, r, 0.0), found.before, found.ruler) for r in refits)
+    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits)
 
 
-def _jobs(found: Round, place: str, source: str) -> list[Job]:
+def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
     """The formulas that by regression leave least for what their coefficients cost."""
     paths = found.answers()
     library, formulas = _formulas(found.before, paths, place.removeprefix("outputs."), source)

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refits.adequacy import loud_after_breaks
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.constancy import constancy
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.refits.refit import Refit, signal, unseen
-from hvdc_ident.discrepancy.search.forward import Outcome
+from hvdc_ident.discrepancy.refits.residual_tests import loud_after_breaks
+from hvdc_ident.discrepancy.search.forward import SearchOutcome
+from hvdc_ident.discrepancy.trials.context import Round
 from hvdc_ident.discrepancy.trials.refitted import LOUD
-from hvdc_ident.discrepancy.trials.select import Trial
-from hvdc_ident.discrepancy.trials.state import Round
+from hvdc_ident.discrepancy.trials.select import CandidateFit
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 
@@ -37,7 +37,7 @@ class Doubt:
 
 
 def doubt(
-    outcome: Outcome, left: Nominal, explained: float, told: float, floor: float, options: Options
+    outcome: SearchOutcome, left: Nominal, explained: float, told: float, floor: float, options: DiagnosisOptions
 ) -> Doubt | None:
     """What tells most against the effects of a search's outcome; None where nothing does.
 
@@ -124,7 +124,7 @@ def _not_foretold(last: Refit, told: float, floor: float) -> Doubt | None:
     )
 
 
-def _more(outcome: Outcome, trifle: float, options: Options) -> Doubt | None:
+def _more(outcome: SearchOutcome, trifle: float, options: DiagnosisOptions) -> Doubt | None:
     """That another effect beside them is too small to matter and yet no noise."""
     more = _further(outcome.rounds[-1], options)
     if more is None or outcome.refit.chi2 - more.refit.chi2 <= trifle:
@@ -136,7 +136,7 @@ def _more(outcome: Outcome, trifle: float, options: Options) -> Doubt | None:
     )
 
 
-def _further(last: Round, options: Options) -> Trial | None:
+def _further(last: Round, options: DiagnosisOptions) -> CandidateFit | None:
     """The best further effect of a round that ended the search because none is large enough, where it is no noise."""
     if last.winner is not None:
         return None

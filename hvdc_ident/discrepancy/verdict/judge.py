@@ -11,17 +11,17 @@ import numpy as np
 
 from hvdc_ident.data import Array, event_time
 from hvdc_ident.discrepancy.findings.ambiguity import formula_rivals, rivals
-from hvdc_ident.discrepancy.findings.result import Rival, Verdict
+from hvdc_ident.discrepancy.findings.conclusion import Rival, Verdict
 from hvdc_ident.discrepancy.noise.records import FEWEST
-from hvdc_ident.discrepancy.options import Options
-from hvdc_ident.discrepancy.refits.adequacy import Binned, adequacy
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.refits.refit import Refit, signal, unseen
-from hvdc_ident.discrepancy.search.forward import Outcome
+from hvdc_ident.discrepancy.refits.residual_tests import Binned, residual_tests
+from hvdc_ident.discrepancy.search.forward import SearchOutcome
+from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.formula import Law
 from hvdc_ident.discrepancy.trials.objections import silent, worst
 from hvdc_ident.discrepancy.trials.select import material_gap
-from hvdc_ident.discrepancy.trials.state import Search
 from hvdc_ident.discrepancy.verdict.beyond import beyond
 from hvdc_ident.discrepancy.verdict.doubts import TRIFLE, Doubt, doubt, remains
 from hvdc_ident.effects import effects
@@ -56,7 +56,7 @@ class Judgement:
     doubt: str = ""
 
 
-def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
+def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgement:
     """The verdict on a search that has ended."""
     options, last = search.options, outcome.refit
     left = last.nominal()
@@ -91,13 +91,13 @@ def judge(search: Search, first: Refit, outcome: Outcome) -> Judgement:
     return found if against is None else _in_doubt(found, labels, against)
 
 
-def tests_of(search: Search, last: Refit) -> tuple[Binned, ...]:
+def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
     """Whether what a model leaves is noise, over time and over the signals at the slots of its effects."""
-    return adequacy(last.nominal(), _signals(last), bootstraps=search.options.bootstraps, seed=search.seed)
+    return residual_tests(last.nominal(), _signals(last), bootstraps=search.options.bootstraps, seed=search.seed)
 
 
 def _with_formulas(
-    search: Search, outcome: Outcome, sets: tuple[tuple[Rival, ...], ...]
+    search: SearchContext, outcome: SearchOutcome, sets: tuple[tuple[Rival, ...], ...]
 ) -> tuple[tuple[tuple[Rival, ...], ...], Law | None]:
     """By effect that was put in, it and what cannot be told from it; and a formula that explains more than one of them does.
 
@@ -119,7 +119,11 @@ def _with_formulas(
 
 
 def _named(
-    labels: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Binned, ...], explained: float, options: Options
+    labels: str,
+    sets: tuple[tuple[Rival, ...], ...],
+    tests: tuple[Binned, ...],
+    explained: float,
+    options: DiagnosisOptions,
 ) -> Judgement:
     """Named, or ambiguous where something else may be behind it; or unnameable where what is left is no noise in the region
     that the effect was put there for."""
@@ -148,7 +152,7 @@ def _in_doubt(found: Judgement, labels: str, against: Doubt) -> Judgement:
     return replace(found, verdict="ambiguous", text=text, experiment={"text": against.advice}, doubt=against.why)
 
 
-def _predicted(first: Refit, last: Refit, floor: float, options: Options) -> float:
+def _predicted(first: Refit, last: Refit, floor: float, options: DiagnosisOptions) -> float:
     """The share of the held-out gap that is explained; 1 where that gap is none, or what is left of it of no interest.
 
     floor: the mean square that noise leaves.
@@ -208,7 +212,7 @@ def noise_left(left: Nominal) -> float:
     return max(total / max(sum(rows.values()), 1), 1.0)
 
 
-def _nothing(search: Search, first: Refit, outcome: Outcome, tests: tuple[Binned, ...]) -> Judgement:
+def _nothing(search: SearchContext, first: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Judgement:
     found = outcome.rounds[-1]
     options = search.options
     if found.law is not None:

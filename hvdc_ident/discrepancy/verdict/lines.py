@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.discrepancy.findings.result import Line
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.findings.conclusion import Line
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.refit import unseen
-from hvdc_ident.discrepancy.search.forward import Outcome
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
-from hvdc_ident.discrepancy.trials.select import Trial
-from hvdc_ident.discrepancy.trials.state import Round
+from hvdc_ident.discrepancy.search.forward import SearchOutcome
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.trials.context import Round
+from hvdc_ident.discrepancy.trials.select import CandidateFit
 from hvdc_ident.effects import clearance, effects
 from hvdc_ident.immutable import FrozenMap
 
 ABSORBED = 0.99
 
 
-def lines(outcome: Outcome) -> tuple[Line, ...]:
+def lines(outcome: SearchOutcome) -> tuple[Line, ...]:
     """Every candidate of every round, those of the first round first, each round by what was found of them."""
     found: list[Line] = []
     for number, r in enumerate(outcome.rounds, start=1):
@@ -42,7 +42,13 @@ def _columns(r: Round) -> dict[int, list[int]]:
 
 
 def _line(
-    r: Round, number: int, c: Candidate, columns: Sequence[int], trial: Trial | None, threshold: float, round_: int
+    r: Round,
+    number: int,
+    c: CandidateEffect,
+    columns: Sequence[int],
+    trial: CandidateFit | None,
+    threshold: float,
+    round_: int,
 ) -> Line:
     s = r.scores
     if not columns:
@@ -68,7 +74,7 @@ def _line(
     )  # fmt: skip
 
 
-def smallest(r: Round, c: Candidate, columns: Sequence[int], threshold: float) -> FrozenMap[float] | None:
+def smallest(r: Round, c: CandidateEffect, columns: Sequence[int], threshold: float) -> FrozenMap[float] | None:
     """The smallest size whose expected score noise alone would hardly reach; None where no size tried would.
 
     Between the sizes tried the score is taken to follow a power of the distance from neutral; below them its square.
@@ -102,7 +108,7 @@ def smallest(r: Round, c: Candidate, columns: Sequence[int], threshold: float) -
     return _scaled(c, s.columns[k].probe, float(wanted / distance))
 
 
-def _scaled(c: Candidate, probe: int, factor: float) -> FrozenMap[float]:
+def _scaled(c: CandidateEffect, probe: int, factor: float) -> FrozenMap[float]:
     entry, values = effects()[c.effect], dict(c.probes[probe].values)
     for n, q in entry.parameters.items():
         if q.neutral is None or (q.optional and values[n] == q.neutral):
@@ -112,7 +118,7 @@ def _scaled(c: Candidate, probe: int, factor: float) -> FrozenMap[float]:
     return FrozenMap(values)
 
 
-def detectable(outcome: Outcome, options: Options) -> dict[str, Any]:
+def detectable(outcome: SearchOutcome, options: DiagnosisOptions) -> dict[str, Any]:
     """By candidate, the smallest size that would have been seen in the first round; None: none that was tried."""
     r = outcome.rounds[0]
     threshold, by_candidate = r.scores.threshold(options.significance), _columns(r)

@@ -60,8 +60,7 @@ def diagnosed(
 
     Raises StudyError where it lacks data or candidates, NothingIdentified where the report leaves no parameter to be fitted.
     """
-    from hvdc_ident.discrepancy import Options as Budget
-    from hvdc_ident.discrepancy import diagnose
+    from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
     from hvdc_ident.identifiability import gate
     from hvdc_ident.study.schema import DiagnoseTable
 
@@ -79,7 +78,7 @@ def diagnosed(
         effects="all" if asked.effects == "all" else list(asked.effects),
         material=asked.material,
         report=report,
-        options=Budget(most=asked.most, thorough=asked.thorough),
+        options=DiagnosisOptions(most=asked.most, thorough=asked.thorough),
         seed=seed,
         executor=executor,
         progress=progress,

@@ -9,7 +9,7 @@ from typing import Any
 from common import diagnosing, paper
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.discrepancy import Options, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.effects import effects as catalogue
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import Free, Problem, fit
@@ -26,7 +26,7 @@ HELD_OUT = ("p-03-step", "q-03-step", "vdc-03-step")
 SAMPLE = 2e-3  # s
 LOUDER = (2e-3,)
 """Other standard deviations: of the size of the paper's residuals, 2e-4 to 5e-3."""
-OPTIONS = Options(fallback=False)
+OPTIONS = DiagnosisOptions(fallback=False)
 """As by default, but nothing outside the catalogue."""
 
 
@@ -35,7 +35,7 @@ class Asked:
     """What is recorded, and what is let count."""
 
     outputs: tuple[str, ...]
-    options: Options = OPTIONS
+    options: DiagnosisOptions = OPTIONS
 
 
 MORE = (*paper.OUTPUTS, "Vdc1", "P2", "Q1", "Ir1", "Ir2")

@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 
 Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
 AUGMENTED = "augmented-model.toml"
+SHOWN = 10
+"""Candidates in the figure, the best by BIC."""
 Table = Mapping[str, Mapping[str, float | None]]
 """By output and experiment, in the output's unit; None where the run fails."""
 
 
 @dataclass(frozen=True)
-class Size:
+class EffectSize:
     """A parameter of an effect, in `unit`. ci95: its 95 % interval; an end that is None is not known."""
 
     value: float
@@ -34,7 +36,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundEffect:
     """An effect that was put into the model.
 
     at: its slots. parameters: by the effect's own parameter names. text: one sentence. chosen_from: how many candidates
@@ -43,7 +45,7 @@ class Found:
 
     effect: str
     at: tuple[str, ...]
-    parameters: FrozenMap[Size]
+    parameters: FrozenMap[EffectSize]
     text: str
     chosen_from: int
     source: str = ""
@@ -137,7 +139,7 @@ class Diagnosis(Shown):
 
     verdict: Verdict
     text: str
-    effects: tuple[Found, ...]
+    effects: tuple[FoundEffect, ...]
     ambiguity: tuple[tuple[Rival, ...], ...]
     separating_experiment: Mapping[str, Any]
     candidates: tuple[Line, ...]
@@ -230,10 +232,41 @@ class Diagnosis(Shown):
         return data_frame(columns)
 
     def plot(self) -> Figure:
-        """The gap before and after by output, and the best candidates."""
-        from hvdc_ident.discrepancy.findings.plots import overview
+        """Bar charts: the pooled gap of the three models on fitted and held-out data, and the BIC of the best candidates."""
+        import numpy as np
+        from matplotlib.figure import Figure
 
-        return overview(self)
+        fig = Figure(figsize=(10.0, 4.2), layout="constrained")
+        left, right = fig.subplots(1, 2, width_ratios=[1.0, 1.4])
+        names = ["nominal", "refitted", "augmented"]
+        width = 0.38
+        for k, (part, label) in enumerate((("fit", "fitted"), ("holdout", "held out"))):
+            values = [self.gap.pooled[n][part] for n in names]
+            at = np.arange(3) + (k - 0.5) * width
+            left.bar(
+                at, [np.nan if v is None else v for v in values], width, label=label, color=("#1f5fa8", "#d08020")[k]
+            )
+        left.axhline(1.0, color="#222222", linewidth=1.0, linestyle=":", label="noise")
+        left.set_yscale("log")
+        left.set_xticks(range(3), ["given gains", "refitted", "with effect"])
+        left.set_ylabel("residual in noise units")
+        left.legend(fontsize="small")
+        refitted = [c for c in self.candidates if c.delta_bic is not None and c.round == 1]
+        best = sorted(refitted, key=lambda c: -(c.delta_bic or 0.0))[:SHOWN][::-1]
+        if best:
+            right.barh(range(len(best)), [c.delta_bic or 0.0 for c in best], color="#1f5fa8")
+            labels = [f"{c.effect} at {', '.join(c.at)}" + (f" from {c.source}" if c.source else "") for c in best]
+            right.set_yticks(range(len(best)), labels, fontsize="small")
+            right.set_xlabel("gain in BIC over the refitted model")
+        else:
+            right.set_axis_off()
+            right.text(0.5, 0.5, "no candidate was refitted", ha="center", va="center", transform=right.transAxes)
+        fig.suptitle(
+            f"{self.verdict}: {', '.join(e.text for e in self.effects) or self.text}",
+            fontsize="medium",
+            wrap=True,
+        )
+        return fig
 
 
 def _span(ci95: tuple[float | None, float | None] | None) -> str:
@@ -241,13 +274,13 @@ def _span(ci95: tuple[float | None, float | None] | None) -> str:
     return "" if low is None or high is None else f"{low:.4g} to {high:.4g}"
 
 
-def _named(value: Found | Rival | Line) -> dict[str, Any]:
+def _named(value: FoundEffect | Rival | Line) -> dict[str, Any]:
     """A line with `from` only where a signal is brought in."""
     out = {k: plain(getattr(value, k)) for k in value.__dataclass_fields__ if k != "source"}
     return out | ({"from": value.source} if value.source else {})
 
 
-def _member(value: Found | Rival) -> dict[str, Any]:
+def _member(value: FoundEffect | Rival) -> dict[str, Any]:
     """The same, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
     out = {k: v for k, v in _named(value).items() if k != "expression" or v}
     return out | ({} if value.late is None else {"late": value.late})

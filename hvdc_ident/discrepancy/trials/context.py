@@ -7,27 +7,27 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.options import Options
+from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.discrepancy.scores.reach import Reach
 from hvdc_ident.discrepancy.scores.scored import Path, Scores, runs
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.trials.formula import Law
-from hvdc_ident.discrepancy.trials.select import Pick, Ruler, Trial
+from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 
 
 @dataclass(frozen=True)
-class Search:
+class SearchContext:
     """What stays the same over the rounds."""
 
     effects: tuple[str, ...] | Literal["all"]
     places: tuple[str | tuple[str, ...], ...] | None
     material: FrozenMap[float]
-    options: Options
+    options: DiagnosisOptions
     seed: int
     executor: Executor | None = None
     progress: Progress | None = None
@@ -58,18 +58,18 @@ class Round:
 
     before: Refit
     paths: Mapping[str, Path]
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[CandidateEffect, ...]
     scores: Scores
-    trials: tuple[Trial, ...]
-    failed: tuple[Trial, ...]
+    trials: tuple[CandidateFit, ...]
+    failed: tuple[CandidateFit, ...]
     same: Mapping[int, list[Pick]]
-    winner: Trial | None
+    winner: CandidateFit | None
     why: str
     significant: bool
     ruler: Ruler | None
     reach: Reach | None = None
     laws: tuple[Law, ...] | None = None
-    filters: tuple[Trial, ...] | None = None
+    filters: tuple[CandidateFit, ...] | None = None
     spared: bool = False
 
     @property
@@ -77,7 +77,7 @@ class Round:
         """The formula that leaves next to nothing but noise, where no effect that was refitted does."""
         return next((one for one in self.laws or () if one.near), None)
 
-    def reaches(self, candidate: Candidate) -> bool:
+    def reaches(self, candidate: CandidateEffect) -> bool:
         """Whether a candidate sits where enough of the gap could be made good."""
         return self.reach is None or any(p in self.reach.enough for p in candidate.at)
 

@@ -26,7 +26,7 @@ class Partials:
     """Partial derivatives of groups of equations by the variables, at K instants.
 
     signals (K, v, n), states (K, x, n), outputs (K, o, n), sources (K, w, n), rest (K, x, n): n variables in the order
-    of `Tangent.variables`; v signals and unknowns, x states, o outputs, w delayed and sampled sources.
+    of `EquationPartials.variables`; v signals and unknowns, x states, o outputs, w delayed and sampled sources.
     """
 
     signals: Array
@@ -36,7 +36,7 @@ class Partials:
     rest: Array
 
 
-class Tangent:
+class EquationPartials:
     """The equations of one model structure, compiled with their partial derivatives; it knows no values, and serves for any."""
 
     def __init__(self, model: Model, outputs: tuple[str, ...]) -> None:
@@ -106,9 +106,9 @@ class Tangent:
         return Partials(*parts)
 
 
-_tangent = by_structure(Tangent, room=8)
+_tangent = by_structure(EquationPartials, room=8)
 
 
-def tangent(model: Model, outputs: tuple[str, ...]) -> Tangent:
+def tangent(model: Model, outputs: tuple[str, ...]) -> EquationPartials:
     """The tangent of a model's structure for some outputs, compiled once."""
     return _tangent(model, outputs)

@@ -9,8 +9,8 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.refits.begin import PATIENCE, Placed, added, moved
-from hvdc_ident.discrepancy.refits.refit import Job, Refit
-from hvdc_ident.discrepancy.signatures.candidates import Candidate
+from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Pick
 from hvdc_ident.effects import effects
@@ -24,8 +24,8 @@ BIASED = 0.4
 
 
 def job(
-    before: Refit, found: Sequence[Candidate], picks: Sequence[Pick], made: dict[Hashable, AnyModel] | None = None
-) -> Job:
+    before: Refit, found: Sequence[CandidateEffect], picks: Sequence[Pick], made: dict[Hashable, AnyModel] | None = None
+) -> RefitJob:
     """The refit of a model with some more effects, from where their scores put them.
 
     Gains that have taken an effect's place hold the refit where they are: where one has moved far, or stands on a bound,
@@ -52,10 +52,10 @@ def job(
     if (given := as_given(before)) is not None:
         begins.append(_begin(before, given, asked))
     spare = [] if exact or len(picks) > 1 else [_begin(before, before.theta, s) for s in _sizes(only, placed[-1])]
-    return Job(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare))
+    return RefitJob(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare))
 
 
-def _sizes(candidate: Candidate, placed: Placed) -> list[Array]:
+def _sizes(candidate: CandidateEffect, placed: Placed) -> list[Array]:
     """Of a candidate's probes that have the same parameters free, and lie within their bounds, the values of these."""
     bounds = placed.bounds
     alike = [p.values for p in candidate.probes if set(p.free) == set(bounds)]
@@ -77,7 +77,7 @@ def as_given(refit: Refit) -> Array | None:
     return theta if far else None
 
 
-def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> Job:
+def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> RefitJob:
     """The refit of the nominal model with these effects; sizes: of some, by their place, instead of where they stand."""
     model, free, again = first.model, list(first.problem.free), []
     at = here.values
@@ -99,4 +99,4 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
     nuisance = here.theta[len(here.problem.free) :]
     gains = [at[f.name] for f in first.problem.free]
     begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])
-    return Job(model, tuple(again), problem, (begin,), here.noise)
+    return RefitJob(model, tuple(again), problem, (begin,), here.noise)

@@ -37,7 +37,7 @@ class Binned:
         return max(self.statistic - self.expected, 0.0)
 
 
-def adequacy(
+def residual_tests(
     nominal: Nominal, signals: Mapping[str, Mapping[str, Array]], *, bootstraps: int, seed: int
 ) -> tuple[Binned, ...]:
     """The residuals over stretches of time, and over levels and slopes of each signal given (by name and experiment, at its rows)."""

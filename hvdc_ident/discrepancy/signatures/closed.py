@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal
-from hvdc_ident.discrepancy.signatures.grid import instants
+from hvdc_ident.discrepancy.signatures.response import instants
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import External
