@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
-    Interpolation,
     event_time,
-    input_signal,
     noise_estimate,
     noise_floor,
     pre_event_ar,
     row_scatter,
 )
-from hvdc_ident.data.signals import InputSignal, multisine, ramp, step
+from hvdc_ident.data.signals import InputSignal, Interpolation, input_signal, multisine, ramp, step
 from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.data.units import PREFIXED, PREFIXES, UNITS, conversion, is_unit, same_unit, scaled, seconds_of
 

@@ -9,8 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hvdc_ident.data.noise import input_signal
-from hvdc_ident.data.signals import InputSignal
+from hvdc_ident.data.signals import InputSignal, input_signal
 from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import WaveformError, unknown_name
@@ -29,7 +28,7 @@ class Experiment(Shown):
     time: (n,) instants at which outputs are wanted, s; one that stands twice asks for the values before and after a jump.
     name: unique among the experiments of a fit.
     inputs: by input name a number (constant), an InputSignal (`step`, `ramp`, `multisine`), or (n,) samples at `time`,
-    joined as those of a data file are (`waveform.input_signal`). An input not named keeps the model's start value.
+    joined as those of a data file are (`input_signal`). An input not named keeps the model's start value.
     outputs: by output name (n,) recorded samples at `time`, NaN where not recorded. Left out for a plain simulation.
     noise: standard deviation of each recorded output, in its unit; where it is left out, a fit estimates it.
     event: instant of the first disturbance, s. window: (from, to) in s of the rows that are compared.

@@ -1,42 +1,15 @@
-"""Recorded waveforms as a model needs them: input signals with their breaks, the event, the noise.
-
-The rules stand in the description of the study file: how rows are joined, what a jump is, what counts as noise.
-"""
+"""Noise of recorded signals, and the instant at which they begin to move."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from hvdc_ident.data.signals import InputSignal
+from hvdc_ident.data.signals import MERGE_TOLERANCE, InputSignal, off_line
 from hvdc_ident.data.trajectory import Array
-from hvdc_ident.errors import WaveformError
 
-__all__ = [
-    "Interpolation",
-    "event_time",
-    "input_signal",
-    "noise_estimate",
-    "noise_floor",
-    "pre_event_ar",
-    "row_scatter",
-]
-
-Interpolation = Literal["hold", "linear"]
-
-HOLD_SHARE = 0.9
-"""Share of successive equal rows from which a signal is taken to hold its value between rows."""
-JUMP_RATIO = 20.0
-"""A change over so many times the median nonzero change is a jump."""
-MERGE_TOLERANCE = 1e-9
-"""Rows this close to the line through their neighbours, as a share of the range, are merged into it."""
-CORNER_TOLERANCE = 1e-4
-"""A corner is marked where leaving it out moves the signal by more than this share of its range."""
-MAX_CORNERS = 64
-"""With more marked corners the signal is curved or noisy, and none of them is a break."""
 FLOOR_SHARE = 1e-6
 """Smallest noise that is assumed, as a share of the range."""
 
@@ -48,26 +21,6 @@ _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
 _GAP = 1.5  # times the median stride between recorded rows, the same share as `fit.whitening.GAP`
 _DEPARTURE = 6.0  # standard deviations
 _OUTLIER = 5.0  # standard deviations
-
-
-def input_signal(time: ArrayLike, values: ArrayLike, interpolation: Interpolation | None = None) -> InputSignal:
-    """The signal recorded by rows, as a piecewise linear one with jumps.
-
-    time: (n,) in s, non-decreasing; two rows at one time are a jump. values: (n,), any unit.
-    interpolation: "hold": a value holds from its row until the next, so that a step lies at the first row that shows
-    the new value. "linear": joined by lines. None: hold where at least 90 % of successive rows are equal; else linear,
-    where a change of over 20 times the median nonzero change is a jump at the new row.
-    Rows on one line are merged. Breaks are the jumps and, where they are few, the corners.
-    Raises WaveformError for rows that are not finite, go back in time or stand more than twice at one time.
-    """
-    whole = InputSignal(np.array(time, dtype=float), np.array(values, dtype=float), np.empty(0))
-    t, v = whole.times, whole.values
-    if interpolation not in (None, "hold", "linear"):
-        raise WaveformError("no such interpolation", expected="'hold' or 'linear'", got=f"{interpolation!r}")
-    if interpolation == "hold" or (interpolation is None and _holds(v)):
-        return _held(t, v)
-    jumps = _large_changes(v) if interpolation is None else np.zeros(v.size, dtype=bool)
-    return _joined(*_with_jumps(t, v, jumps))
 
 
 def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
@@ -172,89 +125,6 @@ def pre_event_ar(values: ArrayLike) -> float:
     return float(np.clip((v.size * r + 2.0) / (v.size - 4.0), -0.99, 0.99))
 
 
-def _holds(v: Array) -> bool:
-    return v.size < 2 or float(np.mean(np.diff(v) == 0)) >= HOLD_SHARE
-
-
-def _held(t: Array, v: Array) -> InputSignal:
-    """The staircase through the rows; of two rows at one time the second holds."""
-    last = np.append(np.diff(t) > 0, True)
-    times, after = t[last], v[last]
-    before = np.concatenate([v[:1], after[:-1]])
-    steps = after != before
-    at = times[steps]
-    corner_times = np.concatenate([t[:1], np.repeat(at, 2)])
-    corner_values = np.concatenate([v[:1], np.column_stack([before[steps], after[steps]]).ravel()])
-    if at.size and at[0] == t[0]:  # a jump at the very first row: the start and its own "before" are one point
-        corner_times, corner_values = corner_times[1:], corner_values[1:]
-    return InputSignal(corner_times, corner_values, at)
-
-
-def _large_changes(v: Array) -> NDArray[np.bool_]:
-    """(n,) the rows that show a change of over 20 times the median nonzero one."""
-    change = np.abs(np.diff(v, prepend=v[:1]))
-    nonzero = change[change > 0]
-    return change > (JUMP_RATIO * np.median(nonzero) if nonzero.size else np.inf)
-
-
-def _with_jumps(t: Array, v: Array, jumps: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """The rows with the value before each jump put in at its instant; no instant more than twice, no row twice."""
-    at = np.flatnonzero(jumps)
-    t, v = np.insert(t, at, t[at]), np.insert(v, at, v[at - 1])
-    new = np.diff(t) > 0
-    keep = np.append(True, new) | np.append(new, True)  # first and last row of each instant
-    t, v = t[keep], v[keep]
-    keep = np.append(True, (np.diff(t) > 0) | (np.diff(v) != 0))
-    return t[keep], v[keep]
-
-
-def _joined(t: Array, v: Array) -> InputSignal:
-    """The polygon through the rows, rows on one line merged."""
-    scale = float(np.ptp(v))
-    if scale == 0.0:
-        return InputSignal(t[:1], v[:1], np.empty(0))
-    double = np.append(np.diff(t) == 0, False)
-    fixed = double | np.append(False, double[:-1])
-    fixed[[0, -1]] = True
-    bent = fixed.copy()
-    bent[1:-1] |= np.abs(_off_line(t, v)) > MERGE_TOLERANCE * scale
-    kept = _simplified(t, v, bent, MERGE_TOLERANCE * scale, t.size)
-    marked = _simplified(t, v, fixed, CORNER_TOLERANCE * scale, int(fixed.sum()) + MAX_CORNERS)
-    corners = marked & ~fixed
-    breaks = t[double] if corners.sum() > MAX_CORNERS else t[double | corners]
-    return InputSignal(t[kept], v[kept], np.unique(breaks))
-
-
-def _off_line(t: Array, v: Array) -> Array:
-    """(n - 2,) how far each inner row lies off the line through its neighbours; 0 beside a jump."""
-    width = t[2:] - t[:-2]
-    share = (t[1:-1] - t[:-2]) / np.where(width > 0, width, 1.0)
-    return np.where(width > 0, v[1:-1] - v[:-2] - share * (v[2:] - v[:-2]), 0.0)
-
-
-def _simplified(t: Array, v: Array, kept: NDArray[np.bool_], tolerance: float, most: int) -> NDArray[np.bool_]:
-    """(n,) the rows through which the polygon stays within the tolerance of all rows.
-
-    Starts from `kept` and adds the farthest row of every stretch that is off (Douglas and Peucker 1973), all stretches
-    at once; stops when more than `most` rows are kept.
-    """
-    kept = kept.copy()
-    while kept.sum() <= most:
-        corners = np.flatnonzero(kept)
-        width = np.diff(t[corners])
-        slope = np.diff(v[corners]) / np.where(width > 0, width, 1.0)
-        stretch = np.cumsum(kept)[:-1] - 1
-        start = corners[stretch]
-        off = np.abs(v[:-1] - v[start] - slope[stretch] * (t[:-1] - t[start]))
-        off[corners[:-1]] = 0.0
-        farthest = np.maximum.reduceat(off, corners[:-1])
-        candidates = np.flatnonzero((off == farthest[stretch]) & (off > tolerance))
-        if candidates.size == 0:
-            break
-        kept[candidates[np.unique(stretch[candidates], return_index=True)[1]]] = True  # the first of each stretch
-    return kept
-
-
 def _first_change(signal: InputSignal) -> float | None:
     t, v = signal.times, signal.values
     if signal.is_constant:
@@ -282,7 +152,7 @@ def _bend(t: Array, v: Array) -> tuple[Array, Array]:
     if t.size < 3:
         return np.zeros(0), np.ones(0)
     share = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
-    return _off_line(t, v), np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+    return off_line(t, v), np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
 
 
 def _detrended(t: Array, v: Array) -> Array:

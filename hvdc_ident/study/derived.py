@@ -8,8 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Trajectory
-from hvdc_ident.data.phases import PhaseFilter, quantities
-from hvdc_ident.data.phasors import PhasorColumns, PhasorSettings, frequency_noise, phasor_quantities
+from hvdc_ident.data.three_phase import (
+    PhaseFilter,
+    PhasorColumns,
+    PhasorSettings,
+    frequency_noise,
+    phase_quantities,
+    phasor_quantities,
+)
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.study import schema
 
@@ -38,7 +44,7 @@ def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajec
     _check_new(line.gives, data, where)
     window = line.window if line.window is not None else 1.0 / line.frequency  # one cycle
     try:
-        return quantities(
+        return phase_quantities(
             data,
             line.voltage,
             line.current,

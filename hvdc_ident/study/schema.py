@@ -187,7 +187,7 @@ class PhasorTable(TomlTable):
 
 
 class PhasorsTable(TomlTable):
-    """One line of an experiment's `phasors`: quantities made of recorded magnitudes and angles (`hvdc_ident.data.phasors`).
+    """One line of an experiment's `phasors`: quantities made of recorded magnitudes and angles (`hvdc_ident.data.three_phase`).
 
     magnitudes: how they are counted, for powers. window: s, over which the frequency is the angle's mean slope.
     reference: "start", or the column of angles that angles are counted from; left out: as recorded.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import Trajectory, trajectory
-from hvdc_ident.data.phasors import (
+from hvdc_ident.data.three_phase import (
     PhasorColumns,
     PhasorSettings,
     frequency_noise,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import Trajectory
-from hvdc_ident.data.phases import PhaseFilter, quantities
+from hvdc_ident.data.three_phase import PhaseFilter, phase_quantities
 from hvdc_ident.errors import InputError
 
 F = 50.0
@@ -27,7 +27,7 @@ def record(f: float = F, negative: float = 0.0, rate: float = 10_000.0) -> Traje
 
 
 def ask(rec: Trajectory, *names: str, smoothing: PhaseFilter = MEAN, f: float = F) -> Trajectory:
-    return quantities(rec, ["va", "vb", "vc"], ["ia", "ib", "ic"], names, frequency=f, smoothing=smoothing)
+    return phase_quantities(rec, ["va", "vb", "vc"], ["ia", "ib", "ic"], names, frequency=f, smoothing=smoothing)
 
 
 def test_a_balanced_set_gives_its_phasors() -> None:
@@ -83,4 +83,4 @@ def test_what_cannot_be_had_is_refused(rec: Trajectory, names: tuple[str, ...], 
 
 def test_currents_are_asked_for_where_they_are_needed() -> None:
     with pytest.raises(InputError, match="needs the currents"):
-        quantities(record(), ["va", "vb", "vc"], None, ["p"], frequency=F, smoothing=MEAN)
+        phase_quantities(record(), ["va", "vb", "vc"], None, ["p"], frequency=F, smoothing=MEAN)
