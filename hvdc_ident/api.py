@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.linearize import FrequencyResponse, LinearModel, OperatingPoint, Side
-    from hvdc_ident.sensitivity.derivatives import Ranges
-    from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
-    from hvdc_ident.sensitivity.sweep_result import SweepResult
+    from hvdc_ident.sensitivity import LocalSensitivities, Ranges, SweepResult
     from hvdc_ident.simulate import Simulation, Tolerance
     from hvdc_ident.study.assemble import DataLike, ModelLike, ParametersLike
     from hvdc_ident.study.export import FmuOptions
@@ -249,7 +247,7 @@ def sensitivities(
 
     from hvdc_ident.errors import InputError
     from hvdc_ident.model import Model
-    from hvdc_ident.sensitivity.local_sensitivities import sensitivities as derivatives
+    from hvdc_ident.sensitivity import sensitivities as derivatives
     from hvdc_ident.study.assemble import experiments_of, names_of, subject_of, values_of
     from hvdc_ident.study.study import Study
 
@@ -296,7 +294,7 @@ def sweep(
     """Return the RMSE of each output in each experiment, and poles where wanted, at many values of some parameters.
 
     parameters: {name: values}, several make their product; or `grid`, `log_grid`, `latin_hypercube` of
-    `hvdc_ident.sensitivity.sampling`. A study has its own in [[sweep]]. data: a study, experiments or a table.
+    `hvdc_ident.sensitivity.sweep_points`. A study has its own in [[sweep]]. data: a study, experiments or a table.
     against: "data" (default where outputs were recorded), "base" (the run at the model's own values) or another model.
     want: "rmse", "poles" or "bode" (default: "rmse", without data "poles").
     executor, progress: as in `fit`. A point that fails is a row with a reason and no number.
@@ -307,7 +305,7 @@ def sweep(
     (3, 6)
     """
     from hvdc_ident.errors import StudyError
-    from hvdc_ident.sensitivity.sweep_run import sweep as swept
+    from hvdc_ident.sensitivity import sweep as swept
     from hvdc_ident.study.assemble import model_of, names_of, study_of, values_of
     from hvdc_ident.study.sweeps import against_of, axes_of, wanted
 

@@ -18,9 +18,7 @@ from hvdc_ident.fit.uncertainty import autocorrelation
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.linearize import find_operating_point, loop, margins
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity.derivatives import trajectory_sensitivities
-from hvdc_ident.sensitivity.sweep_result import SweepResult
-from hvdc_ident.sensitivity.sweep_run import sweep
+from hvdc_ident.sensitivity import SweepResult, sweep, trajectory_sensitivities
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.study import Study, load_study
 from hvdc_ident.study.sweeps import axes_of

@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR
+from hvdc_ident.sensitivity import SENSITIVITY_ERROR
 
 
 class Simulation(Protocol):

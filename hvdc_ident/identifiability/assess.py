@@ -27,8 +27,7 @@ from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.structure import structure as structure_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
-from hvdc_ident.sensitivity.fisher import collinear_subsets
-from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities, sensitivities
+from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
 from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 ENOUGH = 5

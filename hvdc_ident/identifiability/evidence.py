@@ -19,7 +19,7 @@ from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import independent, pivoted_order, rise_over_range
+from hvdc_ident.sensitivity import independent, pivoted_order, rise_over_range
 
 DRAWS = 999
 SCATTER = 0.1

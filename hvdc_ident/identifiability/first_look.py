@@ -13,7 +13,7 @@ from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.identifiability.combinations import combinations_of
 from hvdc_ident.identifiability.pilot import unfitted
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import independent, null_directions
+from hvdc_ident.sensitivity import independent, null_directions
 from hvdc_ident.text import listed, quantity
 
 HALF_95 = 1.96

@@ -17,7 +17,7 @@ from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.starts import latin_hypercube
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, held_of
-from hvdc_ident.sensitivity.fisher import SENSITIVITY_ERROR, null_directions
+from hvdc_ident.sensitivity import SENSITIVITY_ERROR, null_directions
 
 METHOD = "numerical, local"
 POINTS = 5

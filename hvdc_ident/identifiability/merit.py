@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import independent
+from hvdc_ident.sensitivity import independent
 
 HOPELESS = 1e3
 """A half-width of more than so many units of the scaled coordinate is no knowledge."""

@@ -33,13 +33,8 @@ from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import (
-    independent,
-    inflation_index,
-    null_directions,
-    pivoted_order,
-    rise_over_range,
-)
+from hvdc_ident.sensitivity import independent, null_directions, pivoted_order, rise_over_range
+from hvdc_ident.sensitivity.information import inflation_index
 
 WORTH = 0.02
 """A fall of the cost by less than this share of a threshold moves no interval: the walks of profiles restart from there too."""

@@ -23,7 +23,7 @@ from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import misfit_weights
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import Information
+from hvdc_ident.sensitivity import Information
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Optimum:
     @cached_property
     def information(self) -> Information:
         """On the parameters, the nuisances of each experiment marginalised."""
-        from hvdc_ident.sensitivity.fisher import marginal
+        from hvdc_ident.sensitivity import marginal
 
         k = len(self.problem.free)
         matrices: dict[str, Array] = {}

@@ -22,8 +22,7 @@ from hvdc_ident.identifiability.recommend import Recommendation
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import Collinear
-from hvdc_ident.sensitivity.local_sensitivities import LocalSensitivities
+from hvdc_ident.sensitivity import Collinear, LocalSensitivities
 
 CONDITIONS = (
     "Every verdict holds for these outputs, experiments, noise and bounds, at the optimum of the pilot fit; with other "

@@ -15,8 +15,12 @@ from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.local_rank import METHOD, local_rank
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
-from hvdc_ident.sensitivity.rank.invariants import StructuralCombination
-from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
+from hvdc_ident.sensitivity import (
+    StructuralCombination,
+    StructuralResult,
+    identifiable_subset,
+    structural_identifiability,
+)
 from hvdc_ident.simulate.structure import Structure as Equations
 
 SECONDS = 10.0

@@ -5,58 +5,80 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
-    from hvdc_ident.sensitivity.derivatives import (
+    from hvdc_ident.sensitivity.forward import (
+        LinearSensitivities,
+        LocalSensitivities,
+        Ranges,
         Sensitivities,
         SteadySensitivities,
+        linear_sensitivities,
+        sensitivities,
         steady_sensitivities,
         trajectory_sensitivities,
     )
-    from hvdc_ident.sensitivity.fisher import Information, marginal
-    from hvdc_ident.sensitivity.global_screening import ScreeningResult, morris, sobol
-    from hvdc_ident.sensitivity.local_sensitivities import (
-        LinearSensitivities,
-        LocalSensitivities,
-        linear_sensitivities,
-        sensitivities,
+    from hvdc_ident.sensitivity.information import (
+        SENSITIVITY_ERROR,
+        Collinear,
+        Information,
+        collinear_subsets,
+        independent,
+        marginal,
+        null_directions,
+        pivoted_order,
+        rise_over_range,
     )
-    from hvdc_ident.sensitivity.sampling import Points, Samples, grid, latin_hypercube, listed, log_grid
-    from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
-    from hvdc_ident.sensitivity.sweep_result import SweepResult
-    from hvdc_ident.sensitivity.sweep_run import sweep
+    from hvdc_ident.sensitivity.screening import ScreeningResult, morris, sobol
+    from hvdc_ident.sensitivity.structural import (
+        StructuralCombination,
+        StructuralResult,
+        identifiable_subset,
+        structural_identifiability,
+    )
+    from hvdc_ident.sensitivity.sweep_points import Points, Samples, grid, latin_hypercube, listed, log_grid
+    from hvdc_ident.sensitivity.sweep_run import SweepResult, sweep
 else:
     __getattr__ = offered(
         __name__,
         {
-            "derivatives": "Sensitivities SteadySensitivities steady_sensitivities trajectory_sensitivities",
-            "fisher": "Information marginal",
-            "global_screening": "ScreeningResult morris sobol",
-            "local_sensitivities": "LinearSensitivities LocalSensitivities linear_sensitivities sensitivities",
-            "sampling": "Points Samples grid latin_hypercube listed log_grid",
-            "structural": "StructuralResult identifiable_subset structural_identifiability",
-            "sweep_result": "SweepResult",
-            "sweep_run": "sweep",
+            "forward": "LinearSensitivities LocalSensitivities Ranges Sensitivities SteadySensitivities "
+            "linear_sensitivities sensitivities steady_sensitivities trajectory_sensitivities",
+            "information": "SENSITIVITY_ERROR Collinear Information collinear_subsets independent marginal "
+            "null_directions pivoted_order rise_over_range",
+            "screening": "ScreeningResult morris sobol",
+            "structural": "StructuralCombination StructuralResult identifiable_subset structural_identifiability",
+            "sweep_points": "Points Samples grid latin_hypercube listed log_grid",
+            "sweep_run": "SweepResult sweep",
         },
     )
 
 __all__ = [
+    "SENSITIVITY_ERROR",
+    "Collinear",
     "Information",
     "LinearSensitivities",
     "LocalSensitivities",
     "Points",
+    "Ranges",
     "Samples",
     "ScreeningResult",
     "Sensitivities",
     "SteadySensitivities",
+    "StructuralCombination",
     "StructuralResult",
     "SweepResult",
+    "collinear_subsets",
     "grid",
     "identifiable_subset",
+    "independent",
     "latin_hypercube",
     "linear_sensitivities",
     "listed",
     "log_grid",
     "marginal",
     "morris",
+    "null_directions",
+    "pivoted_order",
+    "rise_over_range",
     "sensitivities",
     "sobol",
     "steady_sensitivities",

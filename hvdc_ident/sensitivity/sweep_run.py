@@ -1,22 +1,249 @@
-"""Sweeps: a model run at many points of its parameters, compared with data, another model or itself."""
+"""Sweeps: a model run at many points of its parameters, compared with data, another model or itself; and the result."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
+from hvdc_ident.display import Shown, Table, data_frame
+from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.executor import Executor, Progress, ends
+from hvdc_ident.files import csv_cell
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.sensitivity.sampling import AxesLike, Points, points_of
-from hvdc_ident.sensitivity.sweep_point import PointTask, Want, check, task_of
-from hvdc_ident.sensitivity.sweep_result import SweepResult
+from hvdc_ident.sensitivity.sweep_points import AxesLike, Points, PointTask, Samples, Want, check, points_of, task_of
+
+if TYPE_CHECKING:
+    import xarray
+
+
+# --- result ---
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SweepResult(Shown):
+    """A sweep's n points.
+
+    axes: of the product. units: by parameter. series: (output, experiment) of the columns of rmse, with series_units.
+    against: "data", "base" or the name of the other model. base: where the axes' parameters stand without a sweep.
+    rmse: (n, series) in the outputs' units; poles: (n, modes) 1/s; response: (n, frequencies, outputs, inputs) at
+    omega rad/s; rows of failed points are not numbers. failed: reason by row.
+    """
+
+    model: str
+    axes: tuple[Samples, ...]
+    units: FrozenMap[str]
+    series: tuple[tuple[str, str], ...]
+    series_units: tuple[str, ...]
+    against: str
+    base: FrozenMap[float]
+    rmse: Array
+    poles: np.ndarray[Any, np.dtype[np.complex128]]
+    omega: Array
+    response: np.ndarray[Any, np.dtype[np.complex128]]
+    channels: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    failed: Mapping[int, str] = field(default_factory=dict)
+    wanted: tuple[str, ...] = ("rmse",)
+
+    def __post_init__(self) -> None:
+        for name in ("rmse", "poles", "omega", "response"):
+            getattr(self, name).setflags(write=False)
+
+    @cached_property
+    def points(self) -> Points:
+        """The points, in the order of the rows."""
+        return Points(self.axes)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The swept parameters."""
+        return self.points.names
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def values(self, name: str) -> Array:
+        """(n,): one parameter's value in each row, in its unit."""
+        if name not in self.parameters:
+            raise unknown_name("swept parameter", name, self.parameters)
+        return self.points.rows(0, len(self))[:, self.parameters.index(name)]
+
+    def error(self, output: str, experiment: str) -> Array:
+        """(n,): RMSE of one output in one experiment, in its unit; nan where the point failed."""
+        if (output, experiment) not in self.series:
+            raise unknown_name("series", f"{output} in {experiment}", [f"{o} in {e}" for o, e in self.series])
+        return self.rmse[:, self.series.index((output, experiment))]
+
+    def best(self, output: str, experiment: str) -> dict[str, float]:
+        """The values at the row of the smallest RMSE. Raises ComputationError where every point failed."""
+        errors = self.error(output, experiment)
+        if not np.isfinite(errors).any():
+            raise ComputationError("every point of the sweep failed", got=next(iter(self.failed.values()), ""))
+        row = int(np.nanargmin(errors))
+        return dict(zip(self.parameters, self.points.rows(row, row + 1)[0].tolist(), strict=True))
+
+    def row(self, index: int) -> dict[str, Any]:
+        """One point as sweep.json has it: values, rmse, status, reason, poles and bode where wanted."""
+        return self._row(index, self.points.rows(index, index + 1)[0].tolist())
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Every point as sweep.json has it, made one at a time."""
+        for start in range(0, len(self), 1024):
+            for offset, values in enumerate(self.points.rows(start, start + 1024).tolist()):
+                yield self._row(start + offset, values)
+
+    def _row(self, index: int, values: list[float]) -> dict[str, Any]:
+        bad = self.failed.get(index)
+        rmse: dict[str, dict[str, float | None]] = {}
+        for (output, experiment), error in zip(self.series, self.rmse[index].tolist(), strict=True):
+            rmse.setdefault(output, {})[experiment] = None if bad is not None else error
+        found: dict[str, Any] = {
+            "values": dict(zip(self.parameters, values, strict=True)),
+            "rmse": rmse,
+            "status": "done" if bad is None else "failed",
+            "reason": bad or "",
+        }
+        if "poles" in self.wanted:
+            found["poles"] = None if bad is not None else [[p.real, p.imag] for p in self.poles[index].tolist()]
+        if "bode" in self.wanted:
+            found["bode"] = None if bad is not None else self._response(index)
+        return found
+
+    def _response(self, index: int) -> dict[str, dict[str, list[list[float]]]]:
+        inputs, outputs = self.channels
+        return {
+            o: {i: [[z.real, z.imag] for z in self.response[index, :, b, a].tolist()] for a, i in enumerate(inputs)}
+            for b, o in enumerate(outputs)
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """Return the part of sweep.json beside the points: parameters with axis and base, units, what was compared, failures."""
+        kinds = {n: a for a in self.axes for n in a.names}
+        return {
+            "parameters": {
+                n: {"unit": self.units[n], "base": self.base[n], "kind": kinds[n].kind, "points": len(kinds[n])}
+                for n in self.parameters
+            },
+            "against": self.against,
+            "units": {o: u for (o, _), u in zip(self.series, self.series_units, strict=True)},
+            "wanted": list(self.wanted),
+            **({"omega": self.omega.tolist()} if "bode" in self.wanted else {}),
+            "count": len(self),
+            "failed": len(self.failed),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """The sweep as sweep.json has it, without its heading."""
+        return {**self.summary(), "points": list(self.rows())}
+
+    def to_csv(self) -> str:
+        """CSV text, one row a point: parameters, rmse.OUTPUT.EXPERIMENT, status, reason; every digit of every number.
+
+        Text that a spreadsheet would take for a formula begins with an apostrophe.
+        """
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        header = [*self.parameters, *(f"rmse.{o}.{e}" for o, e in self.series), "status", "reason"]
+        writer.writerow([csv_cell(h) for h in header])
+        for start in range(0, len(self), 1024):
+            block = self.points.rows(start, start + 1024).tolist()
+            errors = self.rmse[start : start + 1024].tolist()
+            for offset, (values, line) in enumerate(zip(block, errors, strict=True)):
+                bad = self.failed.get(start + offset)
+                numbers = ["" if bad is not None or not math.isfinite(v) else repr(v) for v in line]
+                writer.writerow(
+                    [*map(repr, values), *numbers, "done" if bad is None else "failed", csv_cell(bad or "")]
+                )
+        return stream.getvalue()
+
+    def to_xarray(self) -> xarray.Dataset:
+        """A dataset over the axes (a hypercube's rows are one axis): rmse, status, reason, poles and response."""
+        import xarray
+
+        dims = [a.names[0] if len(a.names) == 1 else f"point{k or ''}" for k, a in enumerate(self.axes)]
+        shape = self.points.shape
+        coords: dict[str, Any] = {}
+        for dim, axis in zip(dims, self.axes, strict=True):
+            for column, name in enumerate(axis.names):
+                coords[name] = (dim, axis.values[:, column], {"units": self.units[name]})
+        outputs, experiments = (list(dict.fromkeys(s[k] for s in self.series)) for k in (0, 1))
+        errors = np.full((len(self), len(outputs), len(experiments)), np.nan)
+        for k, (o, e) in enumerate(self.series):
+            errors[:, outputs.index(o), experiments.index(e)] = self.rmse[:, k]
+        reasons = np.array([self.failed.get(i, "") for i in range(len(self))], dtype=object)
+        data: dict[str, Any] = {
+            "rmse": ((*dims, "output", "experiment"), errors.reshape(*shape, len(outputs), len(experiments))),
+            "status": (dims, np.where(reasons == "", "done", "failed").reshape(shape)),
+            "reason": (dims, reasons.reshape(shape)),
+        }
+        coords |= {"output": outputs, "experiment": experiments}
+        if "poles" in self.wanted:
+            data["poles"] = ((*dims, "mode"), self.poles.reshape(*shape, -1), {"units": "1/s"})
+        if "bode" in self.wanted:
+            coords |= {"omega": self.omega, "response_input": list(self.channels[0])}
+            coords["response_output"] = list(self.channels[1])
+            axes = (*dims, "omega", "response_output", "response_input")
+            data["response"] = (axes, self.response.reshape(*shape, *self.response.shape[1:]))
+        return xarray.Dataset(data, coords=coords, attrs={"model": self.model, "against": self.against})
+
+    def plot(self, ax: Any = None) -> Any:
+        """Axes with the RMSE over the first parameter: a curve a series, points where several parameters move."""
+        import matplotlib.pyplot as plt
+
+        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        name = self.parameters[0]
+        x = self.values(name)
+        for k, (output, experiment) in enumerate(self.series):
+            style = "-" if len(self.parameters) == 1 else "."
+            axes.plot(x, self.rmse[:, k], style, label=f"{output}, {experiment}")
+        axes.axvline(self.base[name], color="0.6", linestyle=":")
+        unit = self.units[name]
+        axes.set_xlabel(f"{name}, {unit}" if unit else name)
+        axes.set_ylabel(
+            "RMSE" + (f", {self.series_units[0]}" if len(set(self.series_units)) == 1 and self.series_units[0] else "")
+        )
+        if self.series:
+            axes.legend()
+        return axes
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame, a row a point: parameters, RMSE by output and experiment, status and reason.
+
+        Raises InputError where pandas is missing.
+        """
+        points = self.points.rows(0, len(self))
+        columns: dict[str, Any] = {n: points[:, k] for k, n in enumerate(self.parameters)}
+        columns |= {f"rmse.{o}.{e}": self.rmse[:, k] for k, (o, e) in enumerate(self.series)}
+        reasons = [self.failed.get(i, "") for i in range(len(self))]
+        return data_frame({**columns, "status": ["failed" if r else "done" for r in reasons], "reason": reasons})
+
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Sweep of {', '.join(self.parameters)}: {len(self)} points, {len(self.failed)} failed"
+        rows = []
+        for k, ((o, e), unit) in enumerate(zip(self.series, self.series_units, strict=True)):
+            if np.isfinite(self.rmse[:, k]).any():
+                at = ", ".join(f"{n} = {v:.6g} {self.units[n]}".rstrip() for n, v in self.best(o, e).items())
+                low, high = float(np.nanmin(self.rmse[:, k])), float(np.nanmax(self.rmse[:, k]))
+                rows.append((o, e, unit, low, at, high))
+        yield Table(("output", "experiment", "unit", "smallest RMSE", "at", "largest"), tuple(rows)) if rows else ""
+        if "poles" in self.wanted and np.isfinite(self.poles).any():
+            right = self.poles.real[np.isfinite(self.poles).all(axis=1)].max(axis=1)
+            yield f"Rightmost pole: {np.min(right):.4g} to {np.max(right):.4g} 1/s; {int((right > 0).sum())} points are unstable"
+        yield f"The first that failed: {next(iter(self.failed.values()))}" if self.failed else ""
+
+
+# --- run ---
+
 
 CHUNK = 2048  # points looked up, queued or written at a time
 PROBE, WORTH = 0.3, 2.0  # s: points run here first; work left that is worth starting other processes for

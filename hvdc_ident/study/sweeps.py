@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from hvdc_ident.errors import StudyError
-from hvdc_ident.sensitivity.sampling import Points, Samples, grid, latin_hypercube, listed, log_grid
+from hvdc_ident.sensitivity import Points, Samples, grid, latin_hypercube, listed, log_grid
 from hvdc_ident.study import schema
 
 

@@ -18,7 +18,7 @@ from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError
 from hvdc_ident.fmu.model import read_fmu
-from hvdc_ident.sensitivity.sweep_run import sweep
+from hvdc_ident.sensitivity import sweep
 
 pytestmark = needs_compiler
 

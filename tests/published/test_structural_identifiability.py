@@ -11,7 +11,7 @@ import pytest
 
 from hvdc_ident.expression import parse
 from hvdc_ident.model import Model, Output, State
-from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
+from hvdc_ident.sensitivity import StructuralResult, identifiable_subset, structural_identifiability
 
 
 def _model(parameters: str, states: dict[str, str], outputs: dict[str, str], inputs: str = "") -> Model:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import StudyError
-from hvdc_ident.sensitivity.sampling import MOST, Points, Samples, grid, latin_hypercube, listed, log_grid, points_of
+from hvdc_ident.sensitivity import Points, Samples, grid, latin_hypercube, listed, log_grid
+from hvdc_ident.sensitivity.sweep_points import MOST, points_of
 
 
 def test_grids_and_lists():

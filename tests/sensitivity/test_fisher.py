@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvdc_ident.sensitivity.fisher import (
+from hvdc_ident.sensitivity import (
     collinear_subsets,
-    collinearity_index,
     independent,
-    inflation_index,
-    information,
     marginal,
     null_directions,
     pivoted_order,
     rise_over_range,
 )
+from hvdc_ident.sensitivity.information import collinearity_index, inflation_index, information
 
 
 def test_information_adds_up_and_tells_who_gives_it() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.model import parse_card
-from hvdc_ident.sensitivity.derivatives import steady_sensitivities, trajectory_sensitivities
+from hvdc_ident.sensitivity import steady_sensitivities, trajectory_sensitivities
 
 CARD = """
 schema = 1

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hvdc_ident.sensitivity.fisher import leading
+from hvdc_ident.sensitivity.information import leading
 
 
 def test_of_entries_that_are_equal_to_rounding_the_first_leads():

@@ -16,9 +16,17 @@ import sympy as sp
 
 from hvdc_ident.expression import parse
 from hvdc_ident.model import Algebraic, Model, Output, State
-from hvdc_ident.sensitivity.rank.equations import Equations, EquationSource
-from hvdc_ident.sensitivity.rank.rings import PRIMES, HighPrecision, NoSuchNumber, PrimeField, context, numerator, roots
-from hvdc_ident.sensitivity.rank.taylor import Taylor
+from hvdc_ident.sensitivity.structural.finite_field import (
+    PRIMES,
+    HighPrecision,
+    NoSuchNumber,
+    PrimeField,
+    context,
+    numerator,
+    roots,
+)
+from hvdc_ident.sensitivity.structural.observability import EquationSource
+from hvdc_ident.sensitivity.structural.taylor_series import Equations, Taylor
 
 FIELD = PrimeField()
 

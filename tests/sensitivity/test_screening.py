@@ -11,7 +11,7 @@ import pytest
 from hvdc_ident.data import experiment
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.model import parse_card
-from hvdc_ident.sensitivity.global_screening import morris, sobol
+from hvdc_ident.sensitivity import morris, sobol
 
 mpl.use("Agg")
 CARD = """

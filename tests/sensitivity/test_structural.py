@@ -12,9 +12,9 @@ from hvdc_ident.errors import InputError, UnknownNameError
 from hvdc_ident.expression import parse
 from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity import structural
-from hvdc_ident.sensitivity.rank.rings import NotRational
-from hvdc_ident.sensitivity.structural import StructuralResult, identifiable_subset, structural_identifiability
+from hvdc_ident.sensitivity import StructuralResult, identifiable_subset, structural_identifiability
+from hvdc_ident.sensitivity.structural import local_identifiability as structural
+from hvdc_ident.sensitivity.structural.finite_field import NotRational
 from hvdc_ident.simulate import simulate
 
 GAINS = ("KPVDC", "KIVDC", "KPQ", "KIQ", "KPP", "KIP", "KPQ2", "KIQ2")

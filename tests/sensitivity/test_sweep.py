@@ -14,8 +14,7 @@ from hvdc_ident.errors import InputError, StudyError, UnknownNameError
 from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
 from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity.sampling import grid, latin_hypercube, listed
-from hvdc_ident.sensitivity.sweep_run import sweep
+from hvdc_ident.sensitivity import grid, latin_hypercube, listed, sweep
 from hvdc_ident.study.executors import Ended
 from tests.effort import calls
 

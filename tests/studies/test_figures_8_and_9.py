@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hvdc_ident.sensitivity.sweep_run import sweep
+from hvdc_ident.sensitivity import sweep
 from hvdc_ident.study.study import load_study
 from tests.studies.study_module import STUDIES, expected
 

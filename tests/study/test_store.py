@@ -44,12 +44,12 @@ GRID = '[[sweep]]\nparameter = "k"\nmin = 0\nmax = 4\npoints = {points}\n'
 WORKER = """
 import os, signal, sys, threading
 from pathlib import Path
-from hvdc_ident.sensitivity import sweep_point
+from hvdc_ident.sensitivity import sweep_points
 from hvdc_ident.study.pipeline import run_stage
 from hvdc_ident.study.stage import Options
 from hvdc_ident.study.study import load_study
 study, points, delay = load_study(sys.argv[1]), int(sys.argv[3]), float(sys.argv[4])
-run, done = sweep_point.PointTask.__call__, []
+run, done = sweep_points.PointTask.__call__, []
 
 
 def counted(self, p):
@@ -59,7 +59,7 @@ def counted(self, p):
     return run(self, p)
 
 
-sweep_point.PointTask.__call__ = counted
+sweep_points.PointTask.__call__ = counted
 run_stage(study, "sweep", Path(sys.argv[2]), Options())
 """
 HOLD = "import sys; from pathlib import Path; from hvdc_ident.study.store import exclusive\n"
@@ -147,10 +147,12 @@ def test_only_what_is_missing_is_run(tmp_path, monkeypatch):
     calls = []
     path = study(tmp_path, GRID.format(points=5))
     sweep(path)
-    from hvdc_ident.sensitivity import sweep_point
+    from hvdc_ident.sensitivity import sweep_points
 
-    run = sweep_point.PointTask.__call__
-    monkeypatch.setattr(sweep_point.PointTask, "__call__", lambda self, p: (calls.append(float(p[0])), run(self, p))[1])
+    run = sweep_points.PointTask.__call__
+    monkeypatch.setattr(
+        sweep_points.PointTask, "__call__", lambda self, p: (calls.append(float(p[0])), run(self, p))[1]
+    )
     sweep(path)
     assert calls == []
     path.write_text(STUDY + GRID.format(points=9))

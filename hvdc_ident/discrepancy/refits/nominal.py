@@ -18,7 +18,7 @@ from hvdc_ident.fit.residual import Block
 from hvdc_ident.identifiability.gate import gate, gated
 from hvdc_ident.identifiability.pilot import Optimum, pilot
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity.fisher import independent, null_directions
+from hvdc_ident.sensitivity import independent, null_directions
 
 NEAR = 0.05
 """Share of the rows' interval: a row this near to a jump of an input lies on it."""

@@ -16,7 +16,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     import math
 
     from hvdc_ident.errors import StudyError
-    from hvdc_ident.sensitivity.global_screening import morris, sobol
+    from hvdc_ident.sensitivity import morris, sobol
     from hvdc_ident.study.at_work import workers_of
     from hvdc_ident.study.needs import need_candidates, need_experiments
     from hvdc_ident.study.schema import ScreeningTable

@@ -16,7 +16,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     """A row for each point, as JSON and as CSV; finished points are kept in the folder and not run again."""
     from hvdc_ident.errors import StudyError
     from hvdc_ident.files import Rows
-    from hvdc_ident.sensitivity.sweep_run import sweep
+    from hvdc_ident.sensitivity import sweep
     from hvdc_ident.study.at_work import workers_of
     from hvdc_ident.study.needs import need_experiments
     from hvdc_ident.study.store import Store

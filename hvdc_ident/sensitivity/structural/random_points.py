@@ -14,9 +14,16 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from hvdc_ident.sensitivity.rank.equations import Equations
-from hvdc_ident.sensitivity.rank.points import Base, PointRows, Question, affected, rows
-from hvdc_ident.sensitivity.rank.rings import NoSuchNumber, NotRational, OutOfTime, PrimeField, numerator, roots
+from hvdc_ident.sensitivity.structural.finite_field import (
+    NoSuchNumber,
+    NotRational,
+    OutOfTime,
+    PrimeField,
+    numerator,
+    roots,
+)
+from hvdc_ident.sensitivity.structural.observability import Base, PointRows, Question, affected, rows
+from hvdc_ident.sensitivity.structural.taylor_series import Equations
 from hvdc_ident.simulate.graph import Graph
 
 FIXED = -1

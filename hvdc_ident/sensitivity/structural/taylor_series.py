@@ -5,16 +5,17 @@ A coefficient is a row: its value, then its derivatives.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from random import Random
 from typing import Any
 
 import numpy as np
 
-from hvdc_ident.sensitivity.rank.equations import Equations
-from hvdc_ident.sensitivity.rank.rings import Array, NoSuchNumber, NotRational, OutOfTime, Ring
+from hvdc_ident.sensitivity.structural.finite_field import Array, NoSuchNumber, NotRational, OutOfTime, Ring
 from hvdc_ident.simulate.graph import Graph
 
 
@@ -220,7 +221,7 @@ class Coefficients:
         return out
 
 
-FUNCTIONS = ("exp", "log", "sin", "cos", "tan", "tanh", "atan")
+TRANSCENDENTAL = ("exp", "log", "sin", "cos", "tan", "tanh", "atan")
 
 
 class Taylor:
@@ -361,7 +362,7 @@ class Taylor:
         used = {
             (("sin" if g.nodes[n][0] == "cos" else g.nodes[n][0]), g.nodes[n][1])
             for n in nodes
-            if g.nodes[n][0] in FUNCTIONS
+            if g.nodes[n][0] in TRANSCENDENTAL
         }
         if len(used) > 1:
             raise NotRational("several functions beyond roots and fractions")
@@ -378,3 +379,35 @@ def inverse(ring: Ring, matrix: Array) -> Array:
     if pivots[:n] != list(range(n)):
         raise NoSuchNumber("the unknowns are not determined")
     return reduced[:, n:]
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Nodes of one graph: derivatives and residuals of the unknowns, outputs, what stands at 0 at the start, named signals.
+
+    starts: per state the node that is 0 at the start, or None where the start is free.
+    """
+
+    graph: Graph
+    derivatives: tuple[int, ...]
+    residuals: tuple[int, ...]
+    outputs: tuple[int, ...]
+    starts: tuple[int | None, ...]
+    signals: tuple[int, ...]
+    _slopes: dict[int, list[tuple[int, int]]] = field(default_factory=dict, repr=False, compare=False)
+
+    def unknown_slopes(self, node: int) -> list[tuple[int, int]]:
+        """(unknown, node) pairs: the derivatives of a node by the algebraic unknowns."""
+        if node not in self._slopes:
+            nx = len(self.derivatives)
+            keys = ((self.graph.nodes[v], d) for v, d in self.graph.gradient(node).items())
+            self._slopes[node] = [(k[2] - nx, d) for k, d in keys if k[1] == "y" and k[2] >= nx]
+        return self._slopes[node]
+
+    @staticmethod
+    def fraction(value: float) -> Fraction:
+        """The fraction a float stands for: of small terms if there is one, else its decimal text."""
+        if not math.isfinite(value):
+            raise NotRational("a constant that is not finite")
+        near = Fraction(value).limit_denominator(10**6)
+        return near if float(near) == value else Fraction(repr(value))

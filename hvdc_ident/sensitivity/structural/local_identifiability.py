@@ -18,9 +18,9 @@ import numpy as np
 from hvdc_ident.errors import InputError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
-from hvdc_ident.sensitivity.fisher import leading
-from hvdc_ident.sensitivity.rank.equations import EquationSource, Start
-from hvdc_ident.sensitivity.rank.invariants import (
+from hvdc_ident.sensitivity.information import leading
+from hvdc_ident.sensitivity.structural.finite_field import PRIMES, NotRational, OutOfTime, PrimeField, context
+from hvdc_ident.sensitivity.structural.invariants import (
     SPARE,
     Invariant,
     StructuralCombination,
@@ -30,9 +30,15 @@ from hvdc_ident.sensitivity.rank.invariants import (
     nulls,
     tied,
 )
-from hvdc_ident.sensitivity.rank.points import InputClass, PointRows, Question, RealPoints
-from hvdc_ident.sensitivity.rank.prime_points import FieldPoints
-from hvdc_ident.sensitivity.rank.rings import PRIMES, NotRational, OutOfTime, PrimeField, context
+from hvdc_ident.sensitivity.structural.observability import (
+    EquationSource,
+    InputClass,
+    PointRows,
+    Question,
+    RealPoints,
+    Start,
+)
+from hvdc_ident.sensitivity.structural.random_points import FieldPoints
 
 REAL_POINTS = 5
 LOW = 8  # Taylor order that often shows all there is to see

@@ -19,8 +19,8 @@ from hvdc_ident.errors import ComputationError, InputError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.sensitivity.derivatives import table_text
-from hvdc_ident.sensitivity.sampling import Samples
+from hvdc_ident.sensitivity.forward import table_text
+from hvdc_ident.sensitivity.sweep_points import Samples
 from hvdc_ident.sensitivity.sweep_run import sweep
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.sensitivity.rank.points import PointRows
-from hvdc_ident.sensitivity.rank.rings import Array, Ring
+from hvdc_ident.sensitivity.structural.finite_field import Array, Ring
+from hvdc_ident.sensitivity.structural.observability import PointRows
 
 
 @dataclass(frozen=True)

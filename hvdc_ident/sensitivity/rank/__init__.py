@@ -1,1 +1,0 @@
-"""Ranks for structural identifiability: rings, Taylor series over them, random points, and invariants of the parameters."""
