@@ -57,7 +57,7 @@ def diagnose(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """What the model lacks, if the data tell: the effect with its place and size, the model with it, and the gap before and after.
+    """Return what the model lacks, as far as the data tell: the effect with its place and size, the model with it, and the gap.
 
     subject: a model; or anything that can be simulated, with effects at its inputs and outputs only.
     experiments: with measured outputs; those of role "holdout" judge, the others are fitted. parameters: what may be
@@ -182,7 +182,7 @@ def _own(refit: Refit) -> dict[str, float]:
 
 
 def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: SearchContext) -> dict[str, Any]:
-    """What is left: whether it looks like noise, the share that was explained, and where it lies."""
+    """Return the remaining residual: a test against noise, the explained share, and where it lies."""
     rest: Nominal = last.nominal()
     excess, left = first.chi2 - first.rows, max(last.chi2 - last.rows, 0.0)
     place = localise(None, rest)

@@ -1,4 +1,4 @@
-"""How a diagnosis is done: thresholds and budgets, each with the reason for its default."""
+"""Thresholds and budgets of a diagnosis."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ from hvdc_ident.errors import StudyError
 class DiagnosisOptions:
     """Thresholds and budgets of a diagnosis.
 
-    significance: largest max-T p of a named effect. bootstraps: noise records drawn for it (p is at least 1/(n + 1)).
-    named_bic: the delta BIC a named effect must exceed. set_bic: rivals within it join the ambiguity set.
-    shortlist: how many of the best by score are refitted; collinear: cosine from which a candidate is refitted beside
-    its partner. refits: candidates refitted in one round at most. most: effects at most.
+    significance: largest max-T p of a named effect.
+    bootstraps: noise records drawn for it (p is at least 1/(n + 1)).
+    named_bic: the delta BIC that a named effect must exceed.
+    set_bic: rivals within it join the ambiguity set.
+    shortlist: number of the best by score that are refitted.
+    collinear: cosine from which a candidate is refitted beside its partner.
+    refits: candidates refitted in one round, at most.
+    most: effects, at most.
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
     refuted: share of what an effect explains that may be left, in structure, in the region it was put there for.
-    starts: runs of the nominal multistart. fallback: whether a form outside the catalogue is looked for.
-    thorough: whether candidates are refitted, too, of which the scores tell little, where no other comes near the noise.
+    starts: runs of the nominal multistart.
+    fallback: search for a form outside the catalogue.
+    thorough: refit candidates, too, whose scores tell little, where no other comes near the noise.
+
     Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.
     """
 

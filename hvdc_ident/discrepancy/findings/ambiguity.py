@@ -62,8 +62,8 @@ def rivals(found: Round, options: DiagnosisOptions, droop: bool = True) -> tuple
 
 
 def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
-    """Whether a form with a parameter more is not refuted by its price though the winner is alone: at the same place, where
-    the data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
+    """Return True where a form with one more parameter stays possible though the winner is alone: at the same place, where the
+    data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
     """
     assert found.winner is not None and found.ruler is not None
     best = found.candidates[found.winner.pick.candidate]
@@ -91,7 +91,7 @@ def formula_rivals(found: Round, formulas: Sequence[CandidateFit], options: Diag
 
 
 def _all_needed(refit: Refit) -> bool:
-    """Whether every parameter of the last effect is clearly off 0."""
+    """Return True where every parameter of the last effect is clearly off 0."""
     sizes, names = refit.sizes(refit.placed[-1]), refit.placed[-1].names
     stds = {n: refit.std.get(names[n]) for n in sizes}
     return all(std is not None and abs(sizes[n]) > NEEDED * std for n, std in stds.items())
@@ -122,7 +122,7 @@ def _unfitted(found: Round, best: float, options: DiagnosisOptions, droop: bool)
 
 
 def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
-    """What bends a signal that never moves does what a gain does there, and leaves no trace of its own to be scored by.
+    """Nonlinear effects at a signal that never moves: they act as a gain there and have no signature of their own.
 
     A limit, a saturation and a deadband take away; levels may add too.
     """
@@ -153,7 +153,7 @@ def _keeps_sign(signal: Array) -> bool:
 
 
 def _as_droop(rival: Rival, k: float, droop: bool) -> list[Rival]:
-    """The same thing under its other name: a negative coupling is a droop without deadband."""
+    """Droops that equal the rival: a negative coupling is a droop without deadband."""
     if rival.effect != "coupling" or k >= 0 or not droop:
         return []
     return [replace(rival, effect="droop", parameters=FrozenMap({"k": -k}), refitted=False)]

@@ -1,4 +1,4 @@
-"""What a diagnosis found, and its JSON."""
+"""The result of a diagnosis and its JSON."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Line:
-    """What was found about one candidate.
+    """Score, p, size and status of one candidate effect.
 
     score: T = (s'Mr)^2/(s'Ms) at its best size. p: chance of such a score anywhere, under the noise. delta_bic: gain over
     the refitted nominal, None where not refitted. holdout_rmse: pooled in noise units. absorbed: share of its signature

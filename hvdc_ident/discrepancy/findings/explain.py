@@ -55,7 +55,7 @@ def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
 def advice(
     first: str, others: list[tuple[str, tuple[str, ...]]], at: tuple[str, ...], recorded: Collection[str] = ()
 ) -> str:
-    """What experiment or record would tell the members of an ambiguity set apart; what is recorded already is not asked for."""
+    """Experiment or record that would tell the members of an ambiguity set apart, in words; nothing already recorded."""
     entry = effects()[first]
     parts = []
     for name in dict.fromkeys(n for n, _ in others if n != first):

@@ -1,4 +1,4 @@
-"""How the model answers for other sizes of the effect that was found: what a reader moves to believe it."""
+"""Responses of the augmented model over a range of sizes of the named effect, for the report's slider."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How noise is correlated from row to row: the likelihood of AR(1) noise in short records, and what several outputs tell together.
+"""Correlation of noise from row to row: the likelihood of AR(1) noise in short records, of one output and of several.
 
 The standard deviation and the coefficient of a short record are uncertain together: what is sure is the size of the
 steps from row to row, sigma^2 (1 - rho^2). Each is therefore told with the other, and a standard deviation that is known

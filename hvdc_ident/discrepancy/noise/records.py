@@ -67,7 +67,7 @@ class OutputNoise:
 
     @property
     def rounding(self) -> Rounding | None:
-        """How the record is rounded, where white noise does not hide it."""
+        """Rounding of the record, where white noise does not hide it; else None."""
         coarse = self.step > 0 and self.std is not None and not self.model and self.below < COARSE * self.step
         return Rounding(self.step, max(self.below, FINEST * self.step)) if coarse else None
 
@@ -109,7 +109,7 @@ class Quiet:
 
     @property
     def coarse(self) -> bool:
-        """Whether what moves is white noise too small to hide the rounding."""
+        """True where the noise is white and too small to hide the rounding."""
         power = sum(float(r @ r) for r in self.records)
         slow = sum(float(r[1:] @ r[:-1]) for r in self.records) > SLOW * power
         return self.step > 0.0 and self.std < COARSE * self.step and not (self.moves and slow)
@@ -155,7 +155,7 @@ def _colours(quiet: Mapping[str, Quiet], short: Mapping[str, Likelihood]) -> dic
 
 
 def _agrees(found: Likelihood, given: float | None) -> bool:
-    """Whether a standard deviation that was given may be the records'."""
+    """Return True where a given standard deviation is compatible with the records."""
     return given is not None and _lack(found, given)[0] < SURE**2
 
 
@@ -201,7 +201,7 @@ def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNois
 
 
 def _even(experiments: Sequence[Experiment]) -> bool:
-    """Whether the rows are evenly spaced, so that a model from row to row means something."""
+    """Return True where the rows are evenly spaced, as an AR model needs."""
     try:
         for e in experiments:
             segments(e.time, e.name)
@@ -265,7 +265,7 @@ def _before(experiment: Experiment, output: str) -> tuple[Array, Array]:
 
 
 def _step(records: Sequence[Array]) -> float:
-    """What the records are rounded to; 0 where they are not."""
+    """Resolution to which the records are rounded; 0 where they are not."""
     steps = []
     for r in records:
         floor = noise_floor(r) if r.size else 0.0

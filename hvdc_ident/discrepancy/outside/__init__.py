@@ -1,1 +1,0 @@
-"""What is not in the catalogue: laws of the model's own signals, filters, and curves with their band."""

@@ -28,7 +28,7 @@ PLACES = 6
 
 @dataclass(frozen=True, eq=False)
 class Fallback:
-    """What was found outside the catalogue. kind: term, filter, disturbance, curve or nothing.
+    """A form found outside the catalogue. kind: term, filter, disturbance, curve or nothing.
 
     at: the slot; expression and coefficients: of a term or a filter; stability: share of noise records that choose the same terms;
     curve: of the others, {over, at, value, std}. as_good: terms, {at, expression}, that explain as much. refit: the model with

@@ -62,7 +62,7 @@ def _band(candidate: CandidateEffect) -> CandidateEffect:
 
 
 def _rings(refit: Refit) -> bool:
-    """Whether poles and zeros of the filter are complex, as of no chain of lags and lead-lags, and the zeros not a delay's."""
+    """Return True where poles and zeros are complex, as of no chain of lags and lead-lags, and the zeros not a delay's."""
     zeros, poles = _polynomials(refit)
     return _complex(zeros) and _complex(poles) and zeros[1] / zeros[0] > LATE * poles[1]
 
@@ -81,7 +81,7 @@ def _polynomials(refit: Refit) -> tuple[Array, Array]:
 
 
 def shape(refit: Refit) -> str:
-    """Whether the filter that a refit ends with lowers or raises most, and where, in words."""
+    """The fitted filter in words: a notch or a resonance, and its frequency."""
     omega = refit.sizes(refit.placed[-1])["wn"] * np.geomspace(0.1, 10.0, 2001)
     numerator, denominator = _polynomials(refit)
     level = np.log(np.abs(np.polyval(numerator, 1j * omega) / np.polyval(denominator, 1j * omega)))

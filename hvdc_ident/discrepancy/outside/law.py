@@ -50,7 +50,7 @@ OVER = 6
 
 @dataclass(frozen=True, eq=False)
 class _SlotLibrary:
-    """What is regressed at one slot: a library, and curves, each of hats over a signal's levels.
+    """Candidate terms for the regression at one slot: a library, and curves, each of hats over a signal's levels.
 
     noise: (N, B) records of it, projected; price: what a term has to bring.
     """
@@ -81,7 +81,7 @@ class _Form:
 
     @property
     def label(self) -> str:
-        """What is put in, and where."""
+        """The form and its slot, in words."""
         what = (
             " + ".join(t.text for t in self.terms)
             if self.stability is not None
@@ -90,7 +90,7 @@ class _Form:
         return f"{what} at {self.place}"
 
     def less(self) -> list[_Form]:
-        """It, and without its last term where that came to a pair: linear in a bias of the gains, it may not be needed."""
+        """Return the form, and the form without its last term: linear in a bias of the gains, that term may not be needed."""
         shorter = replace(self, terms=self.terms[:-1], coefficients=self.coefficients[:-1])
         return [self, shorter] if len(self.terms) == MOST else [self]
 
@@ -188,7 +188,7 @@ def _levels(signals: Sequence[Array]) -> Array:
 
 
 def _at_slot(slot: _SlotLibrary) -> list[_Form]:
-    """What is chosen at a slot from its library, and its best curve; as far as they are worth their price."""
+    """Best formula and best curve at a slot, as far as they are worth their price."""
     curves = [f for c in slot.curves if len(c) > 2 and (f := _curve(slot, c)) is not None]
     best = max(curves, key=lambda f: f.worth(slot.price), default=None)
     return [f for f in (_formula(slot), best) if f is not None]
@@ -205,7 +205,7 @@ def _curve(slot: _SlotLibrary, curve: tuple[Term, ...]) -> _Form | None:
 
 
 def _formula(slot: _SlotLibrary) -> _Form | None:
-    """What is chosen at a slot from its library; None where nothing is worth its price."""
+    """Best formula at a slot from its library; None where no term is worth its price."""
     found = regression(slot.nominal, slot.paths, slot.place, [at_run(t) for t in slot.library])
     chosen = found.selected(MOST, slot.price)
     if not chosen:

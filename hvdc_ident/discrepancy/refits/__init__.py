@@ -1,1 +1,0 @@
-"""Gains and effects fitted together, and whether what a fit leaves looks like noise."""

@@ -1,4 +1,4 @@
-"""Whether an effect is the same in all experiments: one that is named in another's stead has a size of its own in each."""
+"""Test that an effect has one size in all experiments: one named in another's stead has a size of its own in each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOLD = 1e-4
 
 @dataclass(frozen=True)
 class Constancy:
-    """What sizes of each experiment's own would explain. told: the fall of chi2; p: the chance of such a fall under noise."""
+    """Gain of one size per experiment. told: the fall of chi2; p: the chance of such a fall under noise."""
 
     told: float
     p: float
@@ -29,9 +29,9 @@ NOTHING = Constancy(0.0, 1.0)
 
 
 def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
-    """How far the experiments ask for different sizes of an effect, to first order, by an F test.
+    """F test, to first order, that the experiments ask for different sizes of an effect.
 
-    Nothing (p = 1) where only one experiment tells of it, and for effects whose answer has steps in their size: those have
+    p = 1 where only one experiment tells of it, and for effects whose answer has steps in their size: those have
     no slopes. left: the refit's residuals.
 
     Source: Chow, Econometrica 28 (1960), as a score test.

@@ -49,7 +49,7 @@ class RefitJob:
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """What a refit came to. failure: why it has no result, empty where it has one.
+    """Result of a refit. failure: why it has no result, empty where it has one.
 
     chi2: sum of squared residuals (`Block.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
@@ -80,12 +80,12 @@ class Refit:
 
     @property
     def count(self) -> int:
-        """How many parameters the effects added."""
+        """Number of parameters that the effects added."""
         return sum(len(p.bounds) for p in self.placed)
 
     @property
     def effective(self) -> float:
-        """How many independent residuals there are: fewer than rows where neighbours are alike."""
+        """Number of independent residuals: fewer than rows where neighbours are alike."""
         rho = min(max(self.correlation, 0.0), 0.999)
         return max(self.rows * (1.0 - rho) / (1.0 + rho), 4.0)
 
@@ -115,7 +115,7 @@ class Refit:
 
 @dataclass(frozen=True, eq=False)
 class RefitResult:
-    """What a job found, without what it was given: small enough to be sent and kept. Fields as in `Refit`."""
+    """Result of a refit without its job: small enough to be sent and stored. Fields as in `Refit`."""
 
     theta: Array
     chi2: float
@@ -135,12 +135,12 @@ class RefitResult:
 
 
 def find(job: RefitJob) -> RefitResult:
-    """What `run` finds."""
+    """Result of `run` without its job."""
     return found_by(run(job))
 
 
 def found_by(refit: Refit) -> RefitResult:
-    """What a refit came to, without what it was given."""
+    """Result of a refit without its job."""
     return RefitResult(**{f.name: getattr(refit, f.name) for f in fields(RefitResult)})
 
 
@@ -210,7 +210,7 @@ def judged(refit: Refit) -> Refit:
 
 
 def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks: Sequence[Block]) -> float:
-    """How many standard deviations an effect's parameters together are from doing nothing; 0 where that is not known."""
+    """Distance of an effect's parameters from neutral, in standard deviations; 0 where that is not known."""
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
     fitted = [n for n, name in placed.names.items() if name in known.names]
     here = clearance(entry, sizes)
@@ -284,7 +284,7 @@ def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:
 
 
 def of_held_out(problem: Problem) -> Problem | None:
-    """The same problem of the held-out experiments, without nuisances; None where there are none."""
+    """The problem on the held-out experiments, without nuisances; None where there are none."""
     others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
     others = [e for e in others if set(e.outputs) & set(problem.outputs)]
     return replace(problem, experiments=tuple(others)) if others else None

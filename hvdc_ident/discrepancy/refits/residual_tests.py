@@ -1,4 +1,4 @@
-"""Whether what is left looks like noise: residuals summed over bins of time and of the signals, against the same sums of noise."""
+"""Tests of the residual against noise: sums over bins of time and of the signals, compared with the same sums of noise."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Binned:
 
     @property
     def excess(self) -> float:
-        """What is left beyond noise."""
+        """Statistic beyond its expectation under noise, at least 0."""
         return max(self.statistic - self.expected, 0.0)
 
 
@@ -52,7 +52,7 @@ def residual_tests(
 
 
 def loud_after_breaks(nominal: Nominal) -> bool:
-    """Whether what is left is louder in the first rows after a break of an input than in the others, by more than chance.
+    """Return True where the residual is louder in the first rows after a break of an input than elsewhere, by more than chance.
 
     However loud the noise is, it knows nothing of the inputs; what answers within a few rows hardly shows in sums over more.
     """

@@ -62,17 +62,17 @@ class Dense:
 
 
 def has_to_be_met(candidate: CandidateEffect) -> bool:
-    """Whether the size has to be met."""
+    """Return True where the size has to be met exactly (levels of a quantiser, periods of a sampler)."""
     return effects()[candidate.effect].scanned
 
 
 def by_level(candidate: CandidateEffect) -> bool:
-    """Whether the size has to be met and is a level of the signal, not a time."""
+    """Return True where the size has to be met exactly and is a level of the signal, not a time."""
     return has_to_be_met(candidate) and effects()[candidate.effect].late is None
 
 
 def bent(candidate: CandidateEffect) -> bool:
-    """Whether the effect bends its signal at one slot by one parameter that need not be met, and is no kind of delay."""
+    """Return True for a nonlinear effect at one slot with one parameter that need not be met exactly, and no kind of delay."""
     entry = effects()[candidate.effect]
     single = len(candidate.at) == 1 and not candidate.source and all(len(p.free) == 1 for p in candidate.probes)
     return single and entry.late is None and not entry.scanned and not is_linear(kind_of(candidate, 0))

@@ -1,4 +1,4 @@
-"""What the records say of a slot's signal, and how well an effect of that signal explains them.
+"""Estimate of a slot's signal from the records, and the fit of an effect that acts on that signal.
 
 Gains that are biased by what is missing give the slot another signal than it had: an effect that hangs on its levels or
 instants leaves traces with little in common with the true ones. The records know better. What would have to be added at

@@ -216,6 +216,6 @@ def _even(e: Experiment, output: str) -> tuple[Array, Array]:
 
 
 def _is_inner(model: Model, name: str) -> bool:
-    """Whether a recorded output is a signal of the model, not a mere output or an input."""
+    """Return True where a recorded output is a signal of the model, not a mere output or an input."""
     inner = name in model.signals or name in model.algebraic or name in model.states
     return inner and insertion_point(model, name)[0] != "input"

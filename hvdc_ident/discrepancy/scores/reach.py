@@ -28,7 +28,7 @@ SURE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """What could be made good at each slot.
+    """Upper bound of the misfit that an addition at each slot could explain.
 
     shares: of the gap beyond noise, by slot, the largest first; above 1 where noise is fitted too. enough: the slots at
     which it is not far less than at the best.
@@ -40,7 +40,7 @@ class Reach:
 
 @dataclass(frozen=True, eq=False)
 class _SlotJob:
-    """What is asked of one slot."""
+    """One slot's share of the work."""
 
     nominal: Nominal
     paths: Mapping[str, Along]
@@ -48,7 +48,7 @@ class _SlotJob:
 
 
 def reach(nominal: Nominal, paths: Mapping[str, Path], slots: Sequence[str], executor: Executor | None) -> Reach | None:
-    """What could be made good at each of the slots, which all runs have; None where that cannot be told.
+    """Upper bound of the explainable misfit at each of the slots, which all runs have; None where that cannot be told.
 
     It cannot of a model that is closed inside, nor where the records have more rows than what is added has values: a
     quick one would not be followed then; nor where there is no gap beyond what chance leaves.

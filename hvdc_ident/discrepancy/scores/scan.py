@@ -67,7 +67,7 @@ class Spot:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What a closer look found. spots: the best sizes; scores: of them; largest: (B,) of all sizes under noise."""
+    """Result of a grid refinement. spots: the best sizes; scores: of them; largest: (B,) of all sizes under noise."""
 
     spots: tuple[Spot, ...]
     scores: Scores
@@ -84,7 +84,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Slot:
-    """What is looked at through one slot's signal: the model's runs, the candidates there, and (N, B) noise.
+    """One slot's share of a grid refinement: the model's runs, the candidates there, and (N, B) noise.
 
     own: whether the model's own signal is looked at too, not only the one that the records tell.
     """

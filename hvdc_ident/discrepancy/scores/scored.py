@@ -117,7 +117,7 @@ def _largest(paths: Mapping[str, Path]) -> int:
 
 
 def two_sided(candidate: CandidateEffect) -> bool:
-    """Whether the effect may act either way: a parameter passes its neutral value, or a phase turns it round."""
+    """Return True where the effect may act either way: a parameter passes its neutral value, or a phase turns it round."""
     entry = effects()[candidate.effect]
     if "phase" in entry.parameters:
         return True
@@ -186,7 +186,7 @@ def scored(
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """How an experiment's answers become whitened rows, block by block."""
+    """Map from an experiment's answers to whitened rows, block by block."""
 
     name: str
     treatment: Treatment

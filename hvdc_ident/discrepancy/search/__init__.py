@@ -1,1 +1,0 @@
-"""Round after round: what is looked at, beside what was found before, until nothing more is told."""

@@ -1,4 +1,4 @@
-"""What the best refits so far suggest to be tried besides: other places, other forms, other kinds of delay."""
+"""Candidates related to the best refits so far: other places, other forms, other kinds of delay."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def carried(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]
 
 
 def bends(opened: Round) -> list[Pick]:
-    """What bends its signal at one slot, at every size probed: as many as records of this length leave time for.
+    """Nonlinear effects at one slot, at every size probed: as many as records of this length leave time for.
 
     Where a loop answers such an effect otherwise than a linear one would, no score tells of it, and from a size at which it
     does nothing, or nearly all, no slope leads to the right one. The largest traces come first.
@@ -176,7 +176,7 @@ def leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateEffe
 
 
 def is_akin(candidate: CandidateEffect, best: Sequence[CandidateEffect]) -> bool:
-    """Whether a candidate is worth a closer look because of what is best so far: the same at any place, where its size has
+    """Return True for a candidate related to the best so far, worth a grid refinement: the same at any place, where its size has
     to be met; a bend at any place, where something bends its signal; a sampler where something delays it."""
     if effects()[candidate.effect].scanned and best and best[0].effect == candidate.effect:
         return True
@@ -186,7 +186,7 @@ def is_akin(candidate: CandidateEffect, best: Sequence[CandidateEffect]) -> bool
 
 
 def _apart(a: float, b: float) -> float:
-    """How far two times are from each other, as a logarithm."""
+    """Distance of two times from each other, as a logarithm."""
     return abs(math.log(a / b))
 
 

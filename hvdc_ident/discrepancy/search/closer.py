@@ -94,5 +94,5 @@ def _key(candidate: CandidateEffect) -> Hashable:
 
 
 def _worth_a_scan(candidate: CandidateEffect) -> bool:
-    """Whether many sizes are looked at: at one slot that moves."""
+    """Return True where many sizes are scored: at one slot that moves."""
     return len(candidate.at) == 1 and not candidate.still

@@ -53,7 +53,7 @@ CLOSE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """How a round stands between two looks.
+    """State of a round between two stages.
 
     opened: the round with its scores; nominal: the model before. picks: each candidate at its best size; best: those of
     the best scores. trials: the refits so far. late: the other kinds of delay that were begun.
@@ -69,7 +69,7 @@ class Stand:
     late: tuple[Pick, ...] = ()
 
     def text(self, look: str) -> str:
-        """What whoever watches is told of a look."""
+        """Progress text of a stage."""
         return f"round {self.number}: {look}"
 
     def refits(self, picks: Sequence[Pick], look: str, race: Race = RACE) -> list[CandidateFit]:
@@ -92,12 +92,12 @@ class Stand:
 
     @property
     def far(self) -> bool:
-        """Whether no refit comes near the noise."""
+        """True where no refit comes near the noise."""
         return all_far(self.opened.before, self.trials)
 
     @property
     def anything_told(self) -> bool:
-        """Whether a refit takes away a share of what is beyond noise: where none does, the noise is louder than was told."""
+        """True where a refit takes away a share of what is beyond noise: where none does, the noise is louder than stated."""
         least = self.opened.before.chi2 - telling(self.opened.before)
         return any(not t.refit.failure and t.refit.chi2 < least for t in self.trials)
 
@@ -230,7 +230,7 @@ def _the_others(stand: Stand) -> Stand:
 
 
 def _from_every_size(stand: Stand) -> Stand:
-    """What bends its signal, from the sizes that promise most of every one probed."""
+    """Refits of nonlinear effects from the sizes that promise most of every one probed."""
     return stand.with_best(stand.refits(bends(stand.opened), "from every size", PROMISING))
 
 

@@ -108,7 +108,7 @@ def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
 
 
 def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
-    """What speaks against naming a trial's effect; empty where nothing does. opened: the round whose scores it has.
+    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round whose scores it has.
 
     A refit may end at another size than it began at, so the candidate's best score counts; one whose answer no expansion
     gave is scored by its refit. Where a refit brings many times what scores do at the sizes tried, these were the wrong ones.

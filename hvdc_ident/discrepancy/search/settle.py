@@ -62,7 +62,7 @@ def settled(
 
 
 def _beside_these(own: Round, others: Sequence[Placed], last: bool) -> bool:
-    """Whether the round that brought the last effect looked for it beside the others as they are, and refitted its rivals."""
+    """Return True where the round that brought the last effect searched beside the others as they are, and refitted its rivals."""
     before = [p.candidate.label for p in own.before.placed]
     return last and len(own.trials) > 1 and before == [p.candidate.label for p in others]
 

@@ -1,4 +1,4 @@
-"""What an effect makes of recorded signals, many at once, on a grid of instants: its own equations, without the plant.
+"""Output of an effect driven by given signals, many at once, on a grid of instants: its own equations, without the plant.
 
 The equations are those of the catalogue (`effects.alone`); states are stepped by an exponential form that is exact for
 a linear effect of a signal of straight pieces. What the steps cannot take (a delay of a state) goes to the simulator.
@@ -71,7 +71,7 @@ class EffectBlock:
         self.cornered = bool(g.switches)
 
     def linear(self, switching: tuple[str, ...]) -> bool:
-        """Whether y depends on these parameters, those that make the effect vanish, by a straight line and at once."""
+        """Return True where y is linear in these parameters, those that make the effect vanish, and answers at once."""
         own = {k for k, n in enumerate(self.leaves) if n in switching}
         leaf = dict(zip(self._leaf_nodes, range(len(self.leaves)), strict=True))
         first = self._by(self.output, leaf)
@@ -295,5 +295,5 @@ def _away(q: Any) -> float:
 
 
 def parameter(name: str) -> str:
-    """What a block calls an effect's parameter."""
+    """Name of an effect's parameter in a block."""
     return f"own_{name}"

@@ -1,4 +1,4 @@
-"""What is looked for: every effect of the catalogue at every place it may sit, in a few finite sizes."""
+"""Candidate effects: every effect of the catalogue at every slot it may sit at, in a few finite sizes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class CandidateEffect:
 
     @property
     def label(self) -> str:
-        """What tables call it."""
+        """Name in tables: the effect, its slots, its source."""
         return f"{self.effect} at {', '.join(self.at)}" + (f" from {self.source}" if self.source else "")
 
     @property
@@ -162,14 +162,14 @@ def own_sources(at: Sequence[str], brought: Sequence[str], known: Collection[str
 
 
 def _proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
-    """Whether one signal is the other times a number, in all experiments."""
+    """Return True where one signal is the other times a number, in all experiments."""
     u, v = np.concatenate(a), np.concatenate(b)
     across = u * float(np.linalg.norm(v)) - float(np.sign(u @ v)) * v * float(np.linalg.norm(u))
     return bool(np.linalg.norm(across) <= STILL * max(float(np.linalg.norm(u) * np.linalg.norm(v)), STILL))
 
 
 def additive(effect: Effect) -> bool:
-    """Whether the effect is there with a signal that never moves."""
+    """Return True where the effect acts on a signal that never moves, too."""
     return effect.name in ("offset", "gain", "disturbance")
 
 
@@ -198,7 +198,7 @@ def kind_of(model: AnyModel, place: str) -> str:
 
 
 def _open_to(model: AnyModel, place: str, brought: Sequence[str]) -> set[str]:
-    """What an effect at a place may bring in: nothing that would close a circle. At an end of a closed model signals of its
+    """Signals that an effect at a place may bring in: none that would close a circle. At an end of a closed model signals of its
     own side: an output at an input would close a loop around it, and what comes out does not see what goes in."""
     if isinstance(model, Model):
         return {*sources(model, place)} - {place}
@@ -206,7 +206,7 @@ def _open_to(model: AnyModel, place: str, brought: Sequence[str]) -> set[str]:
 
 
 def _moves(model: AnyModel, place: str) -> bool:
-    """Whether a slot's signal depends on states or inputs at all; what is made of parameters alone is no signal."""
+    """Return True where a slot's signal depends on states or inputs; what is made of parameters alone is no signal."""
     kind, name = kind_of(model, place), place
     if kind in ("input", "state", "output", "algebraic") or not isinstance(model, Model):
         return True
@@ -294,7 +294,7 @@ def _families(model: AnyModel, live: Sequence[str], kind: str) -> list[tuple[str
 
 
 def _alike(a: str, b: str) -> bool:
-    """Whether two names without their digits differ in one letter at most, and are more than that letter."""
+    """Return True where two names without their digits differ in one letter at most, and are more than that letter."""
     if len(a) != len(b) or a.isupper() != b.isupper():
         return False
     return sum(x != y for x, y in zip(a, b, strict=True)) <= min(1, len(a) - 1)

@@ -1,4 +1,4 @@
-"""How a model that is closed inside answers disturbances at its inputs and outputs: by being run again.
+"""Answers of a closed model (an FMU) to disturbances at its inputs and outputs: by running it again.
 
 An FMU has no equations to linearise. What is added to an input is added to the signal that is played in; what is added
 to an output is added to its record. Everything between stays untested, and the diagnosis says so.
@@ -49,7 +49,7 @@ class Ends:
         return self.values[place]
 
     def answer(self, places: Sequence[str], d: Array) -> tuple[Array, Array]:
-        """What the slots see, (m, K, nc), and the outputs show, (o, R, nc), of disturbances d (m, K, nc).
+        """Return the slots' signals, (m, K, nc), and the outputs, (o, R, nc), in answer to disturbances d (m, K, nc).
 
         A run that fails answers with nan: that size is then not scored.
         """

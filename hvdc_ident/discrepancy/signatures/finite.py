@@ -41,7 +41,7 @@ class SignatureColumn:
 
 @dataclass(frozen=True)
 class Kind:
-    """What one set of an effect's equations serves. present: the parameters away from neutral."""
+    """Key of one set of an effect's equations. present: the parameters away from neutral."""
 
     effect: str
     present: tuple[str, ...]
@@ -98,7 +98,7 @@ def kind_of(candidate: CandidateEffect, probe: int) -> Kind:
 
 @lru_cache(maxsize=256)
 def is_linear(kind: Kind) -> bool:
-    """Whether the effect adds to its slot in proportion to its size."""
+    """Return True where the effect adds to its slot in proportion to its size."""
     entry = effects()[kind.effect]
     own = [n for n in kind.present if entry.parameters[n].neutral is not None]
     return bool(own) and block(kind.effect, kind.present, kind.brings).linear(tuple(parameter(n) for n in own))
@@ -140,7 +140,7 @@ class _Parcel:
                 self.change[c] = 0.0
 
     def _disturbances(self, which: Sequence[int]) -> dict[int, Array]:
-        """What each effect adds to its slots' signals, (m, K); columns where that is not finite are left out."""
+        """Additions of each effect to its slots' signals, (m, K); columns where these are not finite are left out."""
         groups: dict[Kind, list[int]] = {}
         for c in which:
             groups.setdefault(self.parcel[c].kind, []).append(c)

@@ -1,4 +1,4 @@
-"""How a model answers small disturbances at its slots along the run of an experiment: linear, varying with time.
+"""Answers of a model to small disturbances at its slots along the run of an experiment: linear, varying with time.
 
 The base run is the model's own, exact and nonlinear; the answer to a disturbance added to a slot's signal is that of
 the equations linearised along it, limits as they stand. Every slot is had from one compilation.
@@ -76,7 +76,7 @@ class Along:
         return self.values[place]
 
     def answer(self, places: Sequence[str], d: Array) -> tuple[Array, Array]:
-        """What the slots see, (m, K, nc), and the outputs show at the record's rows, (o, R, nc), of disturbances d (m, K, nc).
+        """Return the slots' signals, (m, K, nc), and the outputs at the rows, (o, R, nc), in answer to disturbances d (m, K, nc).
 
         The start is the steady state of the disturbance's first value.
         """
@@ -93,7 +93,7 @@ class Along:
         return u, y
 
     def only(self, place: str) -> Along:
-        """The same with one slot: small enough to be sent to where it is worked with."""
+        """Return the run with one slot alone: small enough to be sent to a worker."""
         s, k = self.system, self.slots.index(place)
         at = [k]
         system = replace(

@@ -1,4 +1,4 @@
-"""What a search carries from room to room: what stays the same over its rounds, and what one of them found."""
+"""Context of a search, which stays over its rounds, and the result of one round."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hvdc_ident.model import AnyModel
 
 @dataclass(frozen=True)
 class SearchContext:
-    """What stays the same over the rounds."""
+    """Settings of a search, which stay over its rounds."""
 
     effects: tuple[str, ...] | Literal["all"]
     places: tuple[str | tuple[str, ...], ...] | None
@@ -33,22 +33,22 @@ class SearchContext:
     progress: Progress | None = None
 
     def tries(self, effect: str) -> bool:
-        """Whether an effect is among those looked for."""
+        """Return True for an effect that is searched for."""
         return self.effects == "all" or effect in self.effects
 
     def looks_at(self, slot: str) -> bool:
-        """Whether a slot is among those looked at."""
+        """Return True for a slot that is searched."""
         return self.places is None or any(slot in ((g,) if isinstance(g, str) else g) for g in self.places)
 
     def tell(self, done: int, total: int, text: str) -> None:
-        """Nothing; whoever watches is told."""
+        """Report progress."""
         if self.progress:
             self.progress(done, total, text)
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """What one round found. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
+    """Result of one round. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
 
     trials: every refit, the best first. same: by candidate, others with the same signature. ruler: what BIC counts by.
     reach: what of the gap could be made good at each slot; None where that is not known. laws: the formula outside the
@@ -78,11 +78,11 @@ class Round:
         return next((one for one in self.laws or () if one.near), None)
 
     def reaches(self, candidate: CandidateEffect) -> bool:
-        """Whether a candidate sits where enough of the gap could be made good."""
+        """Return True for a candidate at a slot where enough of the gap could be explained."""
         return self.reach is None or any(p in self.reach.enough for p in candidate.at)
 
     def answers(self) -> Mapping[str, Path]:
-        """How the model answers at its slots, by experiment: worked out again where the round has let go of that."""
+        """The model's answers at its slots, by experiment: computed again where the round has released them."""
         return self.paths or runs(self.before.model, self.before.nominal())
 
     def light(self) -> Round:

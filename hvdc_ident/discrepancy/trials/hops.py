@@ -80,7 +80,7 @@ class _Sweep:
     between: bool = True
 
     def of(self, refit: Refit) -> Array:
-        """They; none where the refit runs and the slot's signal by itself does not: what is counted is not known then."""
+        """Sizes to look at; none where the slot's signal cannot be simulated by itself: what is counted is not known then."""
         try:
             return self.sizes(refit)
         except SimulationError:
@@ -88,9 +88,9 @@ class _Sweep:
 
 
 def hopped(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
-    """What refits come to that look for their last effect's size again, as long as that helps, and once very closely.
+    """Return the refits after a nonsmooth search of their last effect's size: repeated while it helps, then once very closely.
 
-    All of them go from look to look together, for a look at one is many runs. texts: what whoever watches is told of each.
+    All of them go from step to step together, for a step of one is many runs. texts: progress text of each.
     """
     here = dict(enumerate(done(search, jobs, texts)))
     stuck = {k: r for k, r in here.items() if r.failure}
@@ -116,7 +116,7 @@ def hopped(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]
 
 
 def _polished(here: Refit) -> RefitResult:
-    """What the refit from where a simplex ends comes to, where that is better: rows that go over an edge make of a slope a stair."""
+    """Refit from the end of a simplex search, where that is better: rows that cross an edge turn the cost into stairs."""
     simplex = NelderMead(max_evaluations=RUNS, size=SIMPLEX, cost=0.05, step=1e-8, restarts=2)
     end = simplex.run(replace(here.problem, simulator=ModelSimulator(here.model, PATIENT)), here.theta)
     there = run(RefitJob(here.model, here.placed, here.problem, (end.theta,), here.noise))
@@ -141,7 +141,7 @@ def _further(
 
 
 def _left(refit: Refit) -> float:
-    """What a refit leaves of all data: of sizes that come near the fitted records one is near the others too."""
+    """Chi2 of a refit on all data: of sizes that come near the fitted records one is near the others too."""
     held = refit.holdout
     return refit.chi2 + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
@@ -214,7 +214,7 @@ def _size(here: Refit) -> tuple[int, float, float, float]:
 
 
 def _held(here: Refit) -> float:
-    """What is counted in sizes: the time a record takes where they are periods, else how far the slot's signal reaches.
+    """Length that sizes are counted in: the time a record takes where they are periods, else how far the slot's signal reaches.
 
     Raises SimulationError where that signal cannot be had.
     """
@@ -282,7 +282,7 @@ class _Piece:
 
 
 def _left_at(piece: _Piece) -> Array:
-    """What is left at each size; infinite for one that could not be run."""
+    """Chi2 at each size; infinite for one that could not be run."""
     left = _Left.of(piece.refit, _size(piece.refit)[0])
     asked: dict[Data, Callable[[float], float]] = {"fitted": left.fitted, "held out": left.unseen, "all": left}
     of = asked[piece.what]
@@ -314,7 +314,7 @@ class _Left:
         return self.fitted(size) + self.unseen(size)
 
     def fitted(self, size: float) -> float:
-        """What is left of the fitted data; infinite for a size that could not be run."""
+        """Chi2 on the fitted data; infinite for a size that could not be run."""
         try:
             r = np.concatenate([b.residual for b in self.problem.blocks(self._at(size), derivatives=False)])
         except SimulationError:
@@ -322,7 +322,7 @@ class _Left:
         return float(r @ r - np.sum((self.others.T @ r) ** 2))
 
     def unseen(self, size: float) -> float:
-        """What is left of the held-out data; 0 where there are none, infinite for a size that could not be run."""
+        """Chi2 on the held-out data; 0 where there are none, infinite for a size that could not be run."""
         if self.held is None:
             return 0.0
         try:

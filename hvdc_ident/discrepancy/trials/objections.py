@@ -1,4 +1,4 @@
-"""What speaks against naming an effect: noise, its size, what held-out data say, and what is of interest at all."""
+"""Objections to naming an effect: noise, its size, held-out data, and what is of interest at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def objections(
     *,
     first: bool,
 ) -> str:
-    """What speaks against naming a trial's effect; empty where nothing does.
+    """Objection to naming a trial's effect, in words; empty where there is none.
 
     before: the model without it; p: the chance of its score under noise; material: by output, what error is of interest.
     """
@@ -62,7 +62,7 @@ def objections(
 
 
 def evidence(before: Refit, trial: CandidateFit, share: float) -> float:
-    """What a trial gains in BIC on the fitted data and in chi2 on the others together; share: independent ones of all rows."""
+    """Gain of a trial in BIC on the fitted data plus that in chi2 on the others; share: independent ones of all rows."""
     was, now = unseen(before), unseen(trial.refit)
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
         return trial.gain
@@ -76,7 +76,7 @@ def unseen_rows(refit: Refit) -> int:
 
 
 def silent(before: Refit, after: Refit) -> bool:
-    """Whether the held-out experiments would look the same with the effect and without."""
+    """Return True where the held-out experiments would look the same with the effect and without."""
     one, two = (held_out(r.problem, r.theta) for r in (before, after))
     if not one or not two:
         return False

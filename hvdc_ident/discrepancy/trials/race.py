@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Race:
-    """How a race is run.
+    """Budget of the successive halving of refits.
 
     sprint: evaluations of every refit at first; more are for those within reach of the best. reach: share of the best
     refit's fall of chi2 from which another that has not ended is within its reach. second: refits, the best of the first
@@ -65,7 +65,7 @@ class Race:
 
 
 def promises(jobs: Sequence[RefitJob]) -> Array:
-    """What each promises. Those of one model go together: only one worker then makes its machine code."""
+    """Expected fall of chi2 of each. Those of one model go together: only one worker then makes its machine code."""
     return np.array([promise(job) for job in jobs])
 
 

@@ -134,41 +134,41 @@ def by_cost(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
 
 
 def cost_of(trial: CandidateFit) -> float:
-    """What a refit leaves of all data, and what its parameters cost, before it is known what BIC counts by."""
+    """Chi2 of a refit on all data plus the price of its parameters, before the scale of BIC is known."""
     refit, held = trial.refit, unseen(trial.refit)
     return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
 
 def on_bound(refit: Refit) -> bool:
-    """Whether an unknown of the fit ended on one of its bounds."""
+    """Return True where an unknown of the fit ended on one of its bounds."""
     free = refit.problem.free
     return any(f.on_bound(v) for f, v in zip(free, refit.theta[: len(free)], strict=True))
 
 
 def excess(refit: Refit) -> bool:
-    """Whether a model leaves more than noise, by size."""
+    """Return True where a model leaves more than noise, by size."""
     return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))
 
 
 def misses(refit: Refit) -> bool:
-    """Whether a model leaves more of data it has not seen than of those it was fitted to, by more than chance."""
+    """Return True where a model leaves more of unseen data than of those it was fitted to, by more than chance."""
     seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
     return now is not None and now**2 > seen * (1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective)))
 
 
 def left_by(refit: Refit) -> float:
-    """What a model leaves beyond noise, a row, of the fitted data or of the others."""
+    """Misfit beyond noise per row, of the fitted data or of the others."""
     return max(refit.chi2 / refit.rows, (unseen(refit) or 0.0) ** 2) - 1.0
 
 
 def all_far(before: Refit, trials: Sequence[CandidateFit], near: float = NEAR) -> bool:
-    """Whether no refit comes near the noise, on the fitted data and on the others, or near enough: to a share of what was."""
+    """Return True where no refit comes near the noise, or to a small share of the misfit before, on fitted and held-out data."""
     far = all(_leaves_much(before, t.refit, near) for t in trials if not t.refit.failure)
     return far and not any(like_noise(t.refit) for t in by_cost(trials)[:LOOKED_AT])
 
 
 def is_far(before: Refit, refit: Refit) -> bool:
-    """The same of one refit."""
+    """Return True where this refit does not come near the noise, or to a small share of the misfit before."""
     return _leaves_much(before, refit, NEAR) and not like_noise(refit)
 
 
@@ -177,7 +177,7 @@ def _leaves_much(before: Refit, refit: Refit, near: float) -> bool:
 
 
 def like_noise(refit: Refit) -> bool:
-    """Whether what a model leaves is without shape, though somewhat loud: noise is told from few rows.
+    """Return True where the residual is without shape, though somewhat loud: noise is told from few rows.
 
     Of the held-out data too, where more is left of them: their noise may be louder than that of the others.
     """
@@ -194,10 +194,10 @@ def like_noise(refit: Refit) -> bool:
 
 
 def is_noise(refit: Refit, seed: int) -> bool:
-    """Whether what a model leaves is noise, by its size and over time: then there is nothing more to look for."""
+    """Return True where the residual is noise, by its size and over time: then there is nothing more to look for."""
     return not excess(refit) and shapeless(refit.nominal(), seed)
 
 
 def shapeless(nominal: Nominal, seed: int) -> bool:
-    """Whether sums over time of what a model leaves are what they are of noise."""
+    """Return True where sums of the residual over time are like those of noise."""
     return all(b.p > SHAPED for b in residual_tests(nominal, {}, bootstraps=100, seed=seed))

@@ -56,7 +56,7 @@ class CandidateFit:
 
     @property
     def told(self) -> float:
-        """What all data say for it, as far as that is known."""
+        """Evidence of all data for it, as far as that is known, in BIC."""
         return self.gain if self.evidence is None else self.evidence
 
 
@@ -127,7 +127,7 @@ def shortlist(
 
 
 def _same_form(found: Sequence[CandidateEffect], one: Pick, other: Pick) -> bool:
-    """Whether two picks whose signatures are one may be one at every size.
+    """Return True where two picks with one signature may have one at every size.
 
     In proportion to their one size they are; a deadband of a load that stands still is one with that of a torque at one
     size only, and two time constants are met at one pair of many.
@@ -186,7 +186,7 @@ def others(
 
 @dataclass(frozen=True)
 class Ruler:
-    """What BIC is counted by. effective: independent residuals; scale: how much larger than noise they are in the best model."""
+    """Scale of BIC. effective: independent residuals; scale: how much larger than noise they are in the best model."""
 
     rows: int
     effective: float
@@ -204,17 +204,17 @@ class Ruler:
 
     @property
     def price(self) -> float:
-        """What one parameter more takes of it."""
+        """Price of one more parameter, in BIC."""
         return float(np.log(self.effective))
 
 
 def clear(refit: Refit, which: int) -> bool:
-    """Whether the parameters of an effect together are clearly off those with which it does nothing."""
+    """Return True where the parameters of an effect together are clearly off neutral."""
     return refit.apart[which] > CLEAR
 
 
 def at_edge(refit: Refit, which: int) -> bool:
-    """Whether the effect's size stands on the bound next to neutral: it is not there."""
+    """Return True where the effect's size stands on the bound next to neutral: it is not there."""
     placed = refit.placed[which]
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
     switches = [n for n, q in entry.parameters.items() if q.neutral is not None and n in placed.bounds]
@@ -236,7 +236,7 @@ def material_gap(
     before: float | None, after: float | None, share: float, bands: Mapping[str, float] | None,
     tables: tuple[Mapping[str, float], Mapping[str, float]] | None,
 ) -> bool:  # fmt: skip
-    """Whether the fall from before to after (pooled, noise units; or by output where bands are given) is of interest."""
+    """Return True where the fall from before to after (pooled, noise units; or by output where bands are given) is of interest."""
     if bands and tables:
         first, second = tables
         return any(first[o] > band and first[o] - second[o] > share * band for o, band in bands.items() if o in first)

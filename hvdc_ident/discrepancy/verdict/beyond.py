@@ -1,5 +1,5 @@
-"""What a named form might be instead, outside the catalogue: powers, magnitudes and products of signals at its slot, or a
-notch or a resonance.
+"""Alternatives to a named effect outside the catalogue: powers, magnitudes and products of signals at its slot, a notch,
+a resonance.
 
 A saturation bends by the third order, a coupling is a product at its operating point: whoever has only the catalogue's
 name for it takes a form for told that the data do not tell.

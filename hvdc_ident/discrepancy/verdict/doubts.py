@@ -1,4 +1,4 @@
-"""What tells that something else stands behind what would be named, though nothing that was tried explains as much."""
+"""Model checks: signs that something else is missing than what would be named, though nothing tried explains as much."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Doubt:
 def doubt(
     outcome: SearchOutcome, left: Nominal, explained: float, told: float, floor: float, options: DiagnosisOptions
 ) -> Doubt | None:
-    """What tells most against the effects of a search's outcome; None where nothing does.
+    """The strongest objection to the effects of a search's outcome; None where there is none.
 
     left: their residuals. explained: by how much chi2 fell; told: the share of the held-out gap that they explain; floor: the
     mean square that noise leaves.
@@ -55,7 +55,7 @@ def doubt(
 
 
 def remains(names: Sequence[str], left: str) -> Doubt:
-    """That more than noise is left: what is there does not leave anything, what stands in its place does.
+    """Doubt because more than noise is left: the true effect leaves nothing, one in its place does.
 
     A relay looks like a coupling with a backlash, or like a quantiser. names: the effects that were put in; left: where the
     rest is, as a sentence.
@@ -66,7 +66,7 @@ def remains(names: Sequence[str], left: str) -> Doubt:
 
 
 def _quick(left: Nominal) -> Doubt | None:
-    """That the first rows after a break are louder than the others."""
+    """Doubt because the first rows after a break are louder than the others."""
     if not loud_after_breaks(left):
         return None
     return Doubt(
@@ -76,7 +76,7 @@ def _quick(left: Nominal) -> Doubt | None:
 
 
 def _one_way(last: Refit) -> Doubt | None:
-    """That a play was passed in one direction only: whatever shifts a signal once it has moved does the same."""
+    """Doubt because a play was passed in one direction only: whatever shifts a signal once it has moved does the same."""
     for placed in last.placed:
         width = last.sizes(placed).get(effects()[placed.candidate.effect].turns)
         if width is None:
@@ -94,7 +94,7 @@ def _one_way(last: Refit) -> Doubt | None:
 
 
 def _turned(u: Array, width: float) -> bool:
-    """Whether a signal that has moved turns and goes back by more than a width."""
+    """Return True where a signal that has moved turns and goes back by more than a width."""
     risen, fallen = u - np.minimum.accumulate(u), np.maximum.accumulate(u) - u
     # After a turn both are large at once: how far it rose before its highest value yet, and how far it fell from there.
     return bool(
@@ -104,7 +104,7 @@ def _turned(u: Array, width: float) -> bool:
 
 
 def _varying(last: Refit, left: Nominal, trifle: float) -> Doubt | None:
-    """That the experiments ask for different sizes of an effect."""
+    """Doubt because the experiments ask for different sizes of an effect."""
     for placed in last.placed:
         found, label = constancy(last, left, placed), placed.candidate.label
         if found.p < VARYING_P and found.told > trifle:
@@ -114,7 +114,7 @@ def _varying(last: Refit, left: Nominal, trifle: float) -> Doubt | None:
 
 
 def _not_foretold(last: Refit, told: float, floor: float) -> Doubt | None:
-    """That held-out records are explained in part, where what is left of them is louder than noise may be taken for."""
+    """Doubt because held-out records are explained in part only, and the rest is louder than noise may be."""
     now = unseen(last)
     if told >= FORETOLD or now is None or now**2 <= LOUD * floor:
         return None
@@ -125,7 +125,7 @@ def _not_foretold(last: Refit, told: float, floor: float) -> Doubt | None:
 
 
 def _more(outcome: SearchOutcome, trifle: float, options: DiagnosisOptions) -> Doubt | None:
-    """That another effect beside them is too small to matter and yet no noise."""
+    """Doubt because another effect beside them is too small to matter and yet no noise."""
     more = _further(outcome.rounds[-1], options)
     if more is None or outcome.refit.chi2 - more.refit.chi2 <= trifle:
         return None

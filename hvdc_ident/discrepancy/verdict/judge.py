@@ -92,7 +92,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
 
 
 def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
-    """Whether what a model leaves is noise, over time and over the signals at the slots of its effects."""
+    """Tests of the residual against noise, over time and over the signals at the slots of the effects."""
     return residual_tests(last.nominal(), _signals(last), bootstraps=search.options.bootstraps, seed=search.seed)
 
 
@@ -165,7 +165,7 @@ def _predicted(first: Refit, last: Refit, floor: float, options: DiagnosisOption
 
 
 def _or_others(sets: tuple[tuple[Rival, ...], ...]) -> str:
-    """How many beside what was put in explain the data, as a sentence goes on; empty where none does."""
+    """Number of others that explain the data as well, as the rest of a sentence; empty where none does."""
     others = max(len(g) for g in sets) - 1
     return f", or one of {others} others" if others > 1 else ", or another one" if others else ""
 
@@ -181,12 +181,12 @@ def _half_told(labels: str, sets: tuple[tuple[Rival, ...], ...], tests: tuple[Bi
 
 
 def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
-    """Whether all that explain most of a gap are of one kind: it is told then, though none of them is to be believed."""
+    """Return True where all that explain most of a gap are of one kind: it is told then, though none of them is to be believed."""
     return max(len(g) for g in sets) > 1 and all(_one_kind(g) for g in sets)
 
 
 def _one_kind(group: Sequence[Rival]) -> bool:
-    """Whether the members of a set are one effect at several places, or delays of one kind or another."""
+    """Return True where the members of a set are one effect at several places, or delays of one kind or another."""
     return len({r.effect for r in group}) == 1 or all(effects()[r.effect].late is not None for r in group)
 
 
