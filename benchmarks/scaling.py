@@ -69,7 +69,7 @@ def of_states(terminals: int) -> dict[str, float]:
 
 def write_sweep(folder: Path, points: int) -> tuple[Path, int]:
     """A study of the phasor link over a grid of KPVDC and KIVDC, and how many points it has, `points` or a few more."""
-    from hvdc_ident.study.tables import csv_text
+    from hvdc_ident.files import csv_text
 
     side = max(1, round(points**0.5))
     other = -(-points // side)
@@ -91,18 +91,18 @@ def write_sweep(folder: Path, points: int) -> tuple[Path, int]:
 def of_sweep(points: int, workers: int) -> dict[str, float]:
     """What a sweep of so many points costs: s and MiB, the bytes it leaves in its store, and of its tables."""
     from hvdc_ident.study.pipeline import run_stage
-    from hvdc_ident.study.stage import Options
+    from hvdc_ident.study.stages import StageOptions
     from hvdc_ident.study.study import load_study
 
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         path, count = write_sweep(folder, points)
         study = load_study(str(path))
-        run_stage(study, "simulate", folder / "warm", Options())  # compiled here
+        run_stage(study, "simulate", folder / "warm", StageOptions())  # compiled here
         base = peak()
-        cpu, wall, done = spent(lambda: run_stage(study, "sweep", folder / "out", Options(workers=workers)))
+        cpu, wall, done = spent(lambda: run_stage(study, "sweep", folder / "out", StageOptions(workers=workers)))
         assert not done.failed, done.failed
-        again = spent(lambda: run_stage(study, "sweep", folder / "out", Options(workers=workers)))[0]
+        again = spent(lambda: run_stage(study, "sweep", folder / "out", StageOptions(workers=workers)))[0]
         store = sum(f.stat().st_size for f in (folder / "out" / ".store").iterdir())
         tables = sum((folder / "out" / n).stat().st_size for n in ("sweep.json", "sweep.csv"))
         return {

@@ -307,7 +307,7 @@ def sweep(
     from hvdc_ident.errors import StudyError
     from hvdc_ident.sensitivity import sweep as swept
     from hvdc_ident.study.assemble import model_of, names_of, study_of, values_of
-    from hvdc_ident.study.sweeps import against_of, axes_of, wanted
+    from hvdc_ident.study.stages.sweep import sweep_axes, sweep_quantities, sweep_reference
 
     study = study_of(model, data)
     tables = study.settings.sweep
@@ -317,17 +317,17 @@ def sweep(
         )
     recorded = any(e.outputs for e in study.experiments)
     if against is None:
-        said = against_of(tables) if tables else "data"
+        said = sweep_reference(tables) if tables else "data"
         against = study.against or ("base" if said == "base" or not recorded else "data")
     elif against not in ("data", "base"):
         against = model_of(against)
-    chosen: Any = names_of(want, "quantity") or (wanted(tables) if tables and parameters is None else None)
+    chosen: Any = names_of(want, "quantity") or (sweep_quantities(tables) if tables and parameters is None else None)
     linear = study.settings.linearize
     with _open(executor) as pool, _told(progress) as told:
         return swept(
             study.model,
             study.experiments,
-            axes_of(tables, 0) if parameters is None else parameters,
+            sweep_axes(tables, 0) if parameters is None else parameters,
             against=against,
             outputs=names_of(outputs, "output"),
             values={**study.given, **values_of(values, study.model)},
@@ -602,7 +602,7 @@ def _told(progress: Progress | bool | None) -> Iterator[Progress | None]:
     if not isinstance(progress, bool):
         yield progress
         return
-    from hvdc_ident.study.progress import progress as bar
+    from hvdc_ident.executor import progress_bar
 
-    with bar(quiet=not progress) as shown:
+    with progress_bar(quiet=not progress) as shown:
         yield shown

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from hvdc_ident.errors import HvdcIdentError, InputError
-from hvdc_ident.study.stage import Options, Stage, stages
+from hvdc_ident.study.stages import Stage, StageOptions, stages
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
@@ -212,14 +212,14 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate the shipped link on recordings made here."""
-    from hvdc_ident.study.demo import write_demo
-    from hvdc_ident.study.progress import progress
+    from hvdc_ident.executor import progress_bar
+    from hvdc_ident.study.examples import write_demo
     from hvdc_ident.study.study import load_study
 
-    with progress(quiet or json) as told:
+    with progress_bar(quiet or json) as told:
         study = load_study(write_demo(out, seed=seed, progress=told))
         announce = _announcer(json=json, quiet=quiet)
-        done = _run_all(study, out, Options(workers, seed, told, executor=executor, announce=announce))
+        done = _run_all(study, out, StageOptions(workers, seed, told, executor=executor, announce=announce))
     _tell_run(study, out, done, lambda line: _pasteable(line, study.path, out, False), json=json, quiet=quiet)
 
 
@@ -233,7 +233,7 @@ def new(
     quiet: Quiet = False,
 ) -> None:
     """Write a commented study, with data, to start from."""
-    from hvdc_ident.study.starter import write_starter
+    from hvdc_ident.study.examples import write_starter
 
     path = write_starter(folder)
     if json:
@@ -323,18 +323,18 @@ def run_(
 
     A second run redoes only what changed; after a kill it goes on.
     """
-    from hvdc_ident.study.progress import progress
+    from hvdc_ident.executor import progress_bar
     from hvdc_ident.study.study import load_study
 
     loaded = load_study(study, trust, _limits(deadline, load, memory))
     folder = out or loaded.folder
-    with progress(quiet or json) as told:
+    with progress_bar(quiet or json) as told:
         announce = _announcer(json=json, quiet=quiet)
-        done = _run_all(loaded, folder, Options(workers, seed, told, executor=executor, announce=announce))
+        done = _run_all(loaded, folder, StageOptions(workers, seed, told, executor=executor, announce=announce))
     _tell_run(loaded, folder, done, lambda line: _pasteable(line, study, out, trust), json=json, quiet=quiet)
 
 
-def _run_all(study: Study, folder: Path, options: Options) -> list[Any]:
+def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Any]:
     from hvdc_ident.report.page import write_report
     from hvdc_ident.study.pipeline import heading_of, run_all, write_run
 
@@ -376,7 +376,7 @@ def _run_one(
     stage: Stage,
     study: Path,
     out: Path | None,
-    options: Options,
+    options: StageOptions,
     limits: Mapping[str, float],
     *,
     budget: float | None,
@@ -387,14 +387,14 @@ def _run_one(
     """Run one stage of a study, and those it builds on, and tell how it went. budget: s, for the work."""
     from dataclasses import replace
 
+    from hvdc_ident.executor import progress_bar
     from hvdc_ident.study.pipeline import run_stage
-    from hvdc_ident.study.progress import progress
     from hvdc_ident.study.study import load_study
 
     loaded = load_study(study, trust, limits)
     folder = out or loaded.folder
     announce = _announcer(json=json, quiet=quiet)
-    with _within(budget), progress(quiet or json) as told:
+    with _within(budget), progress_bar(quiet or json) as told:
         done = run_stage(loaded, stage.name, folder, replace(options, progress=told, announce=announce))
     if json:
         _print_json(done.data)
@@ -424,7 +424,7 @@ def _add_stage(stage: Stage) -> None:
         load: Load = None,
         memory: Memory = None,
     ) -> None:
-        options = Options(workers, seed, executor=executor)
+        options = StageOptions(workers, seed, executor=executor)
         limits = _limits(deadline, load, memory)
         _run_one(stage, study, out, options, limits, budget=budget, json=json, quiet=quiet, trust=trust)
 
@@ -443,7 +443,7 @@ def _add_stage(stage: Stage) -> None:
         load: Load = None,
         memory: Memory = None,
     ) -> None:
-        options = Options(workers, seed, force=tuple(dict.fromkeys(force or ())), executor=executor)
+        options = StageOptions(workers, seed, force=tuple(dict.fromkeys(force or ())), executor=executor)
         limits = _limits(deadline, load, memory)
         _run_one(stage, study, out, options, limits, budget=budget, json=json, quiet=quiet, trust=trust)
 
@@ -472,15 +472,15 @@ def letter(
     memory: Memory = None,
 ) -> None:
     """One page for the owner of the model: what it misses, why, and what is attached."""
-    from hvdc_ident.study.letter import letter as write
-    from hvdc_ident.study.progress import progress
+    from hvdc_ident.executor import progress_bar
+    from hvdc_ident.study.export import letter as write
     from hvdc_ident.study.study import load_study
 
     loaded = load_study(study, trust, _limits(deadline, load, memory))
     folder = out or loaded.folder
-    with progress(quiet or json) as told:
+    with progress_bar(quiet or json) as told:
         announce = _announcer(json=json, quiet=quiet)
-        page, done = write(loaded, folder, Options(workers, seed, told, executor=executor, announce=announce))
+        page, done = write(loaded, folder, StageOptions(workers, seed, told, executor=executor, announce=announce))
     if json:
         _print_json({"schema": 1, "file": page.as_posix(), "verdict": done.data.get("verdict")})
     _say(f"letter: {page}", json=json, quiet=quiet)

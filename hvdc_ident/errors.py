@@ -19,7 +19,7 @@ Every message says what is wrong, where, what was expected, what was found and w
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 
 class HvdcIdentError(Exception):
@@ -121,6 +121,13 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "",
         expected=(f"one of {shown}" + (f" and {more} more" if more else "")) if names else f"no {kind}s at all",
         hint=" ".join(hints),
     )
+
+
+def require_known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str) -> None:
+    """Raise UnknownNameError for the first of the names that is not among the known ones."""
+    for name in names or ():
+        if name not in known:
+            raise unknown_name(kind, name, known, where=where)
 
 
 def _shown(names: list[str]) -> int:

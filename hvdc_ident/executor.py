@@ -1,8 +1,11 @@
-"""Where work is done and who is told of its progress: the two protocols that every verb takes."""
+"""Where work runs and where its progress is shown: the two protocols that every verb takes, and the progress bar."""
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 T = TypeVar("T")
@@ -10,6 +13,9 @@ R = TypeVar("R")
 
 Progress = Callable[[int, int, str], None]
 """Called with the number of items done, the number in all, and a line of text."""
+
+PATIENCE = 1.0
+"""Seconds after which a progress bar appears."""
 
 
 class Executor(Protocol):
@@ -54,3 +60,50 @@ def ends(executor: Executor, function: Callable[[T], R], items: Iterable[T]) -> 
     else:
         for index, value in enumerate(executor.map(function, items)):
             yield index, value, ""
+
+
+def silent(done: int, total: int, text: str) -> None:
+    """Report no progress."""
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Progress]:
+    """Yield the function to report progress to: a bar on stderr once the work has taken a second; with quiet, `silent`."""
+    if quiet:
+        yield silent
+        return
+    begun, bar = time.monotonic(), None
+
+    def show(done: int, total: int, text: str) -> None:
+        nonlocal bar
+        if bar is None:
+            if time.monotonic() - begun < PATIENCE:
+                return
+            bar = _opened_bar()
+        bar.update(bar.task_ids[0], completed=done, total=total, description=text)
+
+    try:
+        yield show
+    finally:
+        if bar is not None:
+            bar.stop()
+
+
+def _opened_bar() -> Any:
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TimeElapsedColumn(),
+        rich_progress.TextColumn("left"),
+        rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.description}", markup=False),
+    )
+    # Lines printed meanwhile go above the bar on a terminal; elsewhere stdout is left alone.
+    console = Console(file=sys.stderr)
+    bar = rich_progress.Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
+    bar.add_task("", total=None)
+    bar.start()
+    return bar

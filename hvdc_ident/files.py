@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import hashlib
+import io
 import json
 import math
 import os
@@ -80,6 +82,23 @@ def csv_cell(text: str) -> str:
     """Text for a CSV cell, no line breaks in it, with an apostrophe before what a spreadsheet would calculate."""
     flat = " ".join(text.splitlines())
     return f"'{flat}" if text.startswith(FORMULA) else flat
+
+
+def csv_text(header: list[str], rows: list[list[Any]]) -> str:
+    """Return CSV text: every digit of every number, nothing for None and NaN, no text that a spreadsheet takes for a formula."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([csv_cell(h) for h in header])
+    writer.writerows([[_csv_value(v) for v in row] for row in rows])
+    return stream.getvalue()
+
+
+def _csv_value(value: Any) -> Any:
+    if isinstance(value, str):
+        return csv_cell(value)
+    if value is None or value != value:  # None, or NaN: not recorded
+        return ""
+    return repr(value) if isinstance(value, float) else value
 
 
 def csv_name(cell: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
-from hvdc_ident.files import json_text, write_text
+from hvdc_ident.files import csv_text, json_text, write_text
 from hvdc_ident.fit import Free
 from hvdc_ident.fit.uncertainty import autocorrelation
 from hvdc_ident.identifiability import identifiability
@@ -20,9 +20,8 @@ from hvdc_ident.linearize import find_operating_point, loop, margins
 from hvdc_ident.models import load_model
 from hvdc_ident.sensitivity import SweepResult, sweep, trajectory_sensitivities
 from hvdc_ident.simulate import simulate
+from hvdc_ident.study.stages.sweep import sweep_axes
 from hvdc_ident.study.study import Study, load_study
-from hvdc_ident.study.sweeps import axes_of
-from hvdc_ident.study.tables import csv_text
 
 REFERENCE = "vsc-hvdc-avm"  # the switch: any model with the link's names
 OUTPUT = "Irorder1"
@@ -153,7 +152,7 @@ def modes(study: Study, values: list[float]) -> list[dict[str, float | None]]:
 def swept(study: Study) -> SweepResult:
     """The study's own sweep."""
     return sweep(
-        study.model, study.experiments, axes_of(study.settings.sweep, 0), values=study.values, want=("rmse", "poles")
+        study.model, study.experiments, sweep_axes(study.settings.sweep, 0), values=study.values, want=("rmse", "poles")
     )
 
 

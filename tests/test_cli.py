@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 
 from hvdc_ident.cli import app
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.study.stage import stages
+from hvdc_ident.study.stages import stages
 
 CARD = """\
 schema = 1

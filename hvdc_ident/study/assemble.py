@@ -19,8 +19,7 @@ from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.study.parse import checked, is_study
 from hvdc_ident.study.recordings import with_noise
-from hvdc_ident.study.study import Study, candidates_of, check_questions, load_study
-from hvdc_ident.study.unknowns import with_nuisances, with_unknowns
+from hvdc_ident.study.study import Study, candidates_of, check_questions, load_study, with_nuisances, with_unknowns
 
 ModelLike: TypeAlias = AnyModel | Study | str | Path
 """A model, a study's model, a shipped name, or the path of a model card, an FMU or a study."""

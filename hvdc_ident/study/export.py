@@ -1,19 +1,114 @@
-"""What `export` writes: the model itself or its linear model, in the format of the file's ending."""
+"""Which value is which: a study's given, start and fitted values, each set under its name.
+
+given: the values the model came with, the vendor's; everything is simulated with them and compared with them.
+start: where a search begins. fitted: what a fit in the folder of results estimated, with what it held.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, get_args
+from xml.sax.saxutils import quoteattr
 
-from hvdc_ident.errors import StudyError
-from hvdc_ident.model import Model
+from hvdc_ident.errors import ComputationError, StudyError
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import Model, read_card
+from hvdc_ident.report.letter import STAGE, write_letter
+from hvdc_ident.report.results import Results
+from hvdc_ident.study.pipeline import Done, have_stage
+from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
-from hvdc_ident.study.values import ValueSet, value_set
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
+    from hvdc_ident.study.study import Study
+
+
+SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
+SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+
+SetName = Literal["given", "start", "fitted"]
+SETS: tuple[SetName, ...] = get_args(SetName)
+
+NO_ESTIMATES = ("failed", "not-converged")
+"""Ends of a fit whose numbers are no estimates: they are never the fitted values."""
+NOT_BY_ITSELF = ("two-optima",)
+"""Ends of a fit that gives several answers that are as good: its best one is taken only where it is asked for."""
+
+
+@dataclass(frozen=True)
+class ValueSet:
+    """Values of a study's parameters, in their units.
+
+    name: given, start or fitted. note: what is to be said of them, in words that stand alone: where they come from, and
+    why they are not the fitted ones where those might be expected. fit: the fingerprint of the fit, of fitted ones.
+    """
+
+    name: SetName
+    values: FrozenMap[float]
+    note: str
+    fit: str = ""
+
+
+def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> ValueSet:
+    """The set of that name; None: the fitted values where a fit stands in the folder, else the given ones.
+
+    folder: of results, by default the study's own. A fit stands where it came to an end on the study, the files and the
+    software as they are now. Raises StudyError for another name, and where fitted values are asked for and none stand.
+    """
+    if wanted is not None and wanted not in SETS:
+        raise StudyError("no such set of values", where="--values", expected=", ".join(SETS), got=repr(wanted))
+    if wanted == "given":
+        return _given(study)
+    if wanted == "start":
+        return ValueSet("start", study.start, f"start values of study '{study.name}', where a search begins")
+    found, why = fitted_values(study, folder or study.folder)
+    if found is not None and (wanted == "fitted" or not why):
+        return found
+    if wanted == "fitted":
+        hint = f"hvdc-ident fit {study.path}, or --values given"
+        raise StudyError("there are no fitted values", where=study.path.name, got=why, hint=hint)
+    return _given(study, "" if why == NONE else why)
+
+
+NONE = "no fit has run"
+
+
+def fitted_values(study: Study, folder: Path) -> tuple[ValueSet | None, str]:
+    """The fitted values of the folder; and why they are not to be taken unasked, "" where they are.
+
+    None where there are none to take at all: no fit, one of another state of the study, or one that failed.
+    """
+    from hvdc_ident.study.pipeline import standing
+
+    data, why = standing(study, "fit", folder)
+    if why or data.get("status") in NO_ESTIMATES:
+        return None, why or f"the fit in {folder} ended as {data['status']}: {data.get('message', '')}"
+    values = study.given | {n: float(data["values"][n]) for n in study.candidates if n in data["values"]}
+    found = ValueSet("fitted", values, f"fitted values of study '{study.name}' ({_outcome(data)})", data["fingerprint"])
+    if data["status"] in NOT_BY_ITSELF:
+        return (
+            found,
+            f"the fit in {folder} ended as {data['status']}: {data['message']}; --values fitted takes the best",
+        )
+    return found, ""
+
+
+def _given(study: Study, why: str = "") -> ValueSet:
+    return ValueSet("given", study.given, f"given values of study '{study.name}'" + (f"; {why}" if why else ""))
+
+
+def _outcome(fit: Mapping[str, Any]) -> str:
+    """Return how a fit ended, and how far above the noise: what a reader has to know of its values."""
+    held = [n for n in fit.get("candidates", {}) if n not in (fit.get("fitted") or [])]
+    chi = fit.get("chi2_per_dof")
+    verdict = str((fit.get("adequacy") or {}).get("verdict", ""))
+    parts = [f"fit {fit['status']}", *(["the model does not fit these records"] if verdict == "does-not-fit" else [])]
+    parts += [f"chi2/dof {chi:.3g}"] if isinstance(chi, int | float) else []
+    parts += [f"held: {', '.join(held)}"] if held else []
+    return ", ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -155,7 +250,6 @@ def _modelica(source: Study | Model, chosen: ValueSet | None, path: Path, _: Fmu
 
 def _parameters(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.files import write_text
-    from hvdc_ident.study.tables import ssv
 
     model = source.model if isinstance(source, Study) else source
     values = {n: q.value for n, q in model.parameters.items()} | (dict(chosen.values) if chosen else {})
@@ -195,3 +289,38 @@ def _linear(source: Study | Model | LinearModel, chosen: ValueSet | None) -> Lin
         assert chosen is not None
         return linear_model(source, chosen)
     return linearize(source) if isinstance(source, Model) else source
+
+
+def letter(study: Study, folder: Path, options: StageOptions) -> tuple[Path, Done]:
+    """The path of the letter in the folder, and the diagnosis it tells of, which is run where the folder has none.
+
+    Raises ComputationError with the reason where the diagnosis fails.
+    """
+    done = have_stage(study, "diagnose", folder, options)
+    if done.failed:
+        raise ComputationError("there is no diagnosis to write a letter about", where="letter", got=done.failed)
+    attach(folder)
+    return write_letter(folder), done
+
+
+def attach(folder: Path) -> Path | None:
+    """The augmented model as an FMU beside its card; None where nothing was added to the model."""
+    name = Results(folder).get(STAGE).get("augmented_model")
+    card = folder / Path(str(name)).name
+    if not name or not card.is_file():
+        return None
+    return export(read_card(card), card.with_suffix(".fmu"))
+
+
+def ssv(values: Mapping[str, float], name: str, note: str = "") -> str:
+    """The values as an SSP 1.0 parameter value file (.ssv). note: its description."""
+    rows = "".join(
+        f"    <ssv:Parameter name={quoteattr(n)}><ssv:Real value={quoteattr(repr(float(v)))}/></ssv:Parameter>\n"
+        for n, v in values.items()
+    )
+    about = f" description={quoteattr(' '.join(note.split()))}" if note else ""
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<ssv:ParameterSet xmlns:ssv="{SSV}" xmlns:ssc="{SSC}" version="1.0" name={quoteattr(name)}{about}>\n'
+        f"  <ssv:Parameters>\n{rows}  </ssv:Parameters>\n</ssv:ParameterSet>\n"
+    )

@@ -18,9 +18,9 @@ from hvdc_ident.fit.tolerance import tolerance
 from hvdc_ident.fit.windowed import windowed_errors
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.model import Model
-from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
+from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
 from hvdc_ident.study.schema import FitTable
-from hvdc_ident.study.unknowns import priors
+from hvdc_ident.study.study import priors
 
 if TYPE_CHECKING:
     from hvdc_ident.executor import Executor, Progress

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
-from hvdc_ident.study.plausibility import violations
-from hvdc_ident.study.rest_levels import rest_levels
-from hvdc_ident.study.stage import Options, Outcome, Stage, stage, stages
-from hvdc_ident.study.steady_notes import steady_notes
-from hvdc_ident.study.store import exclusive, source_hash
+from hvdc_ident.study.checks import steady_notes, violations
+from hvdc_ident.study.executors import open_executor
+from hvdc_ident.study.executors.kept import KeptExecutor
+from hvdc_ident.study.quiescent_levels import rest_levels
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
+from hvdc_ident.study.store import Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.executors.dask import DaskPool
+    from hvdc_ident.study.executors.local import OpenPool
+    from hvdc_ident.study.stages import StageOptions
+    from hvdc_ident.study.study import Study
+
 
 SCHEMA = 1
 FIRST = "first-answer"
@@ -37,7 +46,7 @@ class Done:
     fresh: bool
 
 
-def run_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
+def run_stage(study: Study, name: str, folder: Path, options: StageOptions) -> Done:
     """The stage's result, written to the folder together with those of the stages it builds on.
 
     Those are kept where they stand in the folder for the same study, software and seed; the stage itself runs anew.
@@ -52,13 +61,13 @@ def run_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
         return _run(study, wanted, folder, options, earlier, rest)
 
 
-def have_stage(study: Study, name: str, folder: Path, options: Options) -> Done:
+def have_stage(study: Study, name: str, folder: Path, options: StageOptions) -> Done:
     """The stage's result, run only where the folder does not hold it for the same study, software and seed."""
     with exclusive(folder):
         return _kept_or_run(study, stage(name), folder, options, _rest_of(study, options))
 
 
-def run_all(study: Study, folder: Path, options: Options) -> list[Done]:
+def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
     """Every stage the study asks for, in order, written to the folder; those that stand there unchanged are kept.
 
     A stage that fails ends the run of those that build on it; the others run. One that the study does not fit (an
@@ -91,7 +100,7 @@ def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) ->
 Rest = Callable[[], list[dict[str, Any]]]
 
 
-def _rest_of(study: Study, options: Options) -> Rest:
+def _rest_of(study: Study, options: StageOptions) -> Rest:
     """A function that returns the recorded rest against the model's; it is compared, and announced, when first asked for.
 
     So it is told before the work of the first stage that is not kept, and once.
@@ -106,7 +115,7 @@ def _rest_of(study: Study, options: Options) -> Rest:
     return rest
 
 
-def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options, rest: Rest) -> Done:
+def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: StageOptions, rest: Rest) -> Done:
     kept = _kept(study, wanted, folder, options)
     if kept is not None:
         return Done(wanted, kept, "", fresh=False)
@@ -114,13 +123,15 @@ def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: Options, re
     return _run(study, wanted, folder, options, earlier, rest)
 
 
-def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: Mapping[str, Any], rest: Rest) -> Done:
+def _run(
+    study: Study, wanted: Stage, folder: Path, options: StageOptions, earlier: Mapping[str, Any], rest: Rest
+) -> Done:
     levels = rest()
 
     def keep(first: Mapping[str, Any]) -> None:
         """Write a first answer, marked as such, unless the folder holds the whole one from before."""
         if _kept(study, wanted, folder, options) is None:
-            _written(study, wanted, folder, options, Outcome({"status": FIRST, **first}, failed=FIRST), levels)
+            _written(study, wanted, folder, options, StageResult({"status": FIRST, **first}, failed=FIRST), levels)
 
     try:
         outcome = wanted.run(study, replace(options, folder=folder, keep=keep), earlier)
@@ -129,12 +140,12 @@ def _run(study: Study, wanted: Stage, folder: Path, options: Options, earlier: M
     return _written(study, wanted, folder, options, outcome, levels)
 
 
-def _failed(error: HvdcIdentError) -> Outcome:
-    return Outcome({"status": "failed", "message": str(error)}, failed=str(error))
+def _failed(error: HvdcIdentError) -> StageResult:
+    return StageResult({"status": "failed", "message": str(error)}, failed=str(error))
 
 
 def _written(
-    study: Study, wanted: Stage, folder: Path, options: Options, outcome: Outcome, levels: list[dict[str, Any]]
+    study: Study, wanted: Stage, folder: Path, options: StageOptions, outcome: StageResult, levels: list[dict[str, Any]]
 ) -> Done:
     heading = heading_of(study, options.seed)
     wrong = [] if outcome.failed else violations(wanted.name, plain(outcome.data))
@@ -179,7 +190,7 @@ def version() -> str:
         return "0+unknown"
 
 
-def _kept(study: Study, wanted: Stage, folder: Path, options: Options) -> dict[str, Any] | None:
+def _kept(study: Study, wanted: Stage, folder: Path, options: StageOptions) -> dict[str, Any] | None:
     """The stage's JSON in the folder, where it is whole and nothing that decides it has changed."""
     data = _read(folder / wanted.file)
     if not data.get("fingerprint") or data["fingerprint"] != _mark(study, wanted, folder, options):
@@ -204,7 +215,7 @@ def standing(study: Study, name: str, folder: Path) -> tuple[dict[str, Any], str
         return data, f"the {name} in {folder} ended as {data.get('status', 'failed')}: {end}"
     known: dict[str, Any] = data["options"] if isinstance(data.get("options"), dict) else {}
     taken: dict[str, Any] = {n: tuple(known[n]) for n in wanted.takes if isinstance(known.get(n), list)}
-    if _kept(study, wanted, folder, Options(seed=int(data.get("seed", 0)), **taken)) is None:
+    if _kept(study, wanted, folder, StageOptions(seed=int(data.get("seed", 0)), **taken)) is None:
         return data, f"the {name} in {folder} is of another version of hvdc_ident, or not whole"
     return data, ""
 
@@ -218,7 +229,7 @@ def _read(path: Path) -> dict[str, Any]:
     return data if isinstance(data, dict) else {}
 
 
-def _mark(study: Study, wanted: Stage, folder: Path, options: Options) -> str:
+def _mark(study: Study, wanted: Stage, folder: Path, options: StageOptions) -> str:
     """A hash of all that decides a stage's result: the study, its files, the seed, this software, the results it uses."""
     parts = [wanted.name, *(f"{n}={h}" for n, h in study.sources.items()), str(options.seed), version(), source_hash()]
     parts += [f"{name}={getattr(options, name)}" for name in wanted.takes if getattr(options, name)]
@@ -226,3 +237,27 @@ def _mark(study: Study, wanted: Stage, folder: Path, options: Options) -> str:
         data, why = standing(study, name, folder)
         parts.append(f"{name}={why or data['fingerprint']}")
     return digest("\n".join(parts).encode())
+
+
+@contextmanager
+def workers_of(options: StageOptions) -> Iterator[OpenPool | DaskPool | None]:
+    """The pool the options ask for; None where the work stays in this process."""
+    with open_executor(options.executor, options.workers) as pool:
+        yield pool
+
+
+@contextmanager
+def executor_of(study: Study, options: StageOptions, name: str) -> Iterator[KeptExecutor | OpenPool | DaskPool | None]:
+    """An executor for a stage's work of that name, whose finished pieces are kept where the options name a folder.
+
+    The name tells apart the kinds of work of a study; the study's files, the seed and what is forced tell apart its
+    states.
+    """
+    with ExitStack() as stack:
+        pool = stack.enter_context(workers_of(options))
+        if options.folder is None:
+            yield pool
+            return
+        store = stack.enter_context(Store(options.folder))
+        decided = json_text({"sources": dict(study.sources), "seed": options.seed, "force": list(options.force)})
+        yield KeptExecutor(store.job(name, decided), pool)

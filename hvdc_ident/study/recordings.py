@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,14 +24,21 @@ from hvdc_ident.data import (
     scaled,
     seconds_of,
 )
-from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.data.three_phase import (
+    PhaseFilter,
+    PhasorColumns,
+    PhasorSettings,
+    frequency_noise,
+    phase_quantities,
+    phasor_quantities,
+)
+from hvdc_ident.errors import InputError, StudyError, require_known
 from hvdc_ident.files import digest
 from hvdc_ident.fit.noise import FEWEST_QUIET
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
-from hvdc_ident.study.derived import raw_columns, with_derived
 
 TIME_SHIFT = "time-shift"
 MEDIAN_EFFICIENCY = 0.37
@@ -147,12 +154,12 @@ def with_noise(experiment: Experiment) -> tuple[Experiment, FrozenMap[NoiseNote]
 def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> None:
     """Raises where the table names what the model does not have."""
     signals = [*table.inputs, *table.outputs, *table.drive]
-    _known("input", table.inputs, model.inputs, f"{place}.inputs")
-    _known("output", table.outputs, model.outputs, f"{place}.outputs")
-    _known("slot", table.drive, model.slots, f"{place}.drive")
-    _known("measured output", table.noise, table.outputs, f"{place}.noise")
-    _known("measured output", table.instrument, table.outputs, f"{place}.instrument")
-    _known("signal of the experiment", table.columns, ["time", *signals], f"{place}.columns")
+    require_known("input", table.inputs, model.inputs, f"{place}.inputs")
+    require_known("output", table.outputs, model.outputs, f"{place}.outputs")
+    require_known("slot", table.drive, model.slots, f"{place}.drive")
+    require_known("measured output", table.noise, table.outputs, f"{place}.noise")
+    require_known("measured output", table.instrument, table.outputs, f"{place}.instrument")
+    require_known("signal of the experiment", table.columns, ["time", *signals], f"{place}.columns")
     if any(n in model.parameters and n not in model.inputs for n in table.values):
         raise StudyError(
             "a parameter among the inputs held constant",
@@ -160,19 +167,15 @@ def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> 
             expected="inputs",
             hint="[model.values] for parameters",
         )
-    _known("input", table.values, model.inputs, f"{place}.values")
-    _known("nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive, *model.states], f"{place}.nuisance")
+    require_known("input", table.values, model.inputs, f"{place}.values")
+    require_known(
+        "nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive, *model.states], f"{place}.nuisance"
+    )
     if isinstance(table.interpolation, dict):
-        _known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
+        require_known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
     for kind, names in (("values", table.values), ("drive", table.drive)):
         if both := [n for n in names if n in table.inputs]:
             raise StudyError(f"'{both[0]}' stands in inputs and in {kind}", where=place, expected="one of them")
-
-
-def _known(kind: str, names: Iterable[str], known: Collection[str], where: str) -> None:
-    for name in names:
-        if name not in known:
-            raise unknown_name(kind, name, known, where=where)
 
 
 def _channels(table: schema.ExperimentTable) -> list[tuple[str, str]]:
@@ -463,3 +466,76 @@ def _noise_dof(time: Array, event: float | None) -> float:
 
 def _instrument(line: schema.InstrumentTable) -> FrozenMap[float]:
     return FrozenMap({k: float(v) for k, v in line.model_dump(by_alias=True, exclude_none=True).items()})
+
+
+def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[str]:
+    """The columns to be read from the file where these are wanted, some of them made of phases or phasors."""
+    made = {*(n for line in table.phases for n in line.gives), *(n for line in table.phasors for n in line.gives)}
+    phases = [name for line in table.phases for name in (*line.voltage, *(line.current or ()))]
+    phasors = [n for line in table.phasors for p in (line.voltage, line.current) if p for n in (*p.magnitude, *p.angle)]
+    references = [line.reference for line in table.phasors if line.reference not in (None, "start")]
+    return list(dict.fromkeys([*(c for c in columns if c not in made), *phases, *phasors, *map(str, references)]))
+
+
+def with_derived(table: schema.ExperimentTable, data: Trajectory, place: str) -> Trajectory:
+    """The recording with the columns its phases and phasors give; the same object where none are asked for."""
+    found = data
+    for number, line in enumerate(table.phases, 1):
+        found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"))
+    for number, phasors in enumerate(table.phasors, 1):
+        made = _of_phasors(phasors, data, f"{place}.phasors, line {number}")
+        found = _added(found, phasors.gives, made)
+    return found
+
+
+def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajectory:
+    _check_new(line.gives, data, where)
+    window = line.window if line.window is not None else 1.0 / line.frequency  # one cycle
+    try:
+        return phase_quantities(
+            data,
+            line.voltage,
+            line.current,
+            list(line.gives.values()),
+            frequency=line.frequency,
+            smoothing=PhaseFilter(line.filter, window),
+        )
+    except InputError as e:
+        raise e.at(where) from None
+
+
+def _of_phasors(line: schema.PhasorsTable, data: Trajectory, where: str) -> Trajectory:
+    _check_new(line.gives, data, where)
+    how = PhasorSettings(line.frequency, line.window, line.magnitudes or "", line.reference or "")
+    current = _columns(line.current) if line.current is not None else None
+    try:
+        made = phasor_quantities(data, _columns(line.voltage), current, list(line.gives.values()), how)
+    except InputError as e:
+        raise e.at(where) from None
+    told = tuple(
+        f"{name}: mean frequency over the last {line.window:g} s, from the angle; noise of 1 deg in it is "
+        f"{frequency_noise(np.pi / 180.0, line.window):.3g} Hz here"
+        for name, quantity in line.gives.items()
+        if quantity == "f"
+    )
+    return replace(made, origin=replace(made.origin, converted=told))
+
+
+def _columns(phasor: schema.PhasorTable) -> PhasorColumns:
+    return PhasorColumns(tuple(phasor.magnitude), tuple(phasor.angle), phasor.unit or "")
+
+
+def _check_new(gives: Mapping[str, str], data: Trajectory, where: str) -> None:
+    taken = [name for name in gives if name in data]
+    if taken:
+        raise StudyError(f"a column '{taken[0]}' is already there", where=where, expected="a new name in gives")
+
+
+def _added(found: Trajectory, gives: Mapping[str, str], made: Trajectory) -> Trajectory:
+    return Trajectory(
+        found.time,
+        np.column_stack([found.values, made.values]),
+        (*found.names, *gives),
+        (*found.units, *made.units),
+        replace(found.origin, converted=(*found.origin.converted, *made.origin.converted)),
+    )

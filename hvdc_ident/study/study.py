@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
-from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
+from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
@@ -19,11 +20,13 @@ from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
-from hvdc_ident.study.linear_analysis import check_linear
+from hvdc_ident.study.linear_analysis import check_linear, read_responses
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
-from hvdc_ident.study.responses import read_responses
-from hvdc_ident.study.unknowns import free_of, with_nuisances, with_unknowns
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.prior import Prior
+    from hvdc_ident.model import AnyModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -101,6 +104,21 @@ class Study(Shown):
     def _listed(self) -> dict[str, schema.ParameterTable]:
         """The lines of [parameters] that have a value of their own: all but ties."""
         return {n: line for n, line in self.settings.parameters.items() if line.tie is None}
+
+
+def candidate_lines(study: Study) -> dict[str, dict[str, Any]]:
+    """By candidate its given value, where the search begins, its bounds, where starts are drawn from, its unit."""
+    return {
+        n: {
+            "given": f.given,
+            "start": f.start,
+            "min": f.min,
+            "max": f.max,
+            "searched": f.drawn,
+            "unit": study.model.parameters[n].unit,
+        }
+        for n, f in study.candidates.items()
+    }
 
 
 def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float] | None = None) -> Study:
@@ -223,9 +241,9 @@ def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, st
 
 def _compared_with(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyModel | None, dict[str, str]]:
     """The other model that sweeps are compared with, where they are, and its file's hash."""
-    from hvdc_ident.study.sweeps import against_of
+    from hvdc_ident.study.stages.sweep import sweep_reference
 
-    name = against_of(settings.sweep, f"{file.name}, sweep")
+    name = sweep_reference(settings.sweep, f"{file.name}, sweep")
     if name in ("data", "base"):
         return None, {}
     return _other_model(name, settings, file, "sweep.against", trust)
@@ -291,17 +309,17 @@ def check_questions(study: Study, where: str) -> None:
     names = [e.name for e in study.experiments]
     measured = list(dict.fromkeys(o for e in study.experiments for o in e.outputs))
     if s.linearize:
-        _all_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
-        _all_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
+        require_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
+        require_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
         check_linear(study, where)
     for line in s.sweep:
         _free_line(line.parameter, s.parameters, f"{where}, sweep", own=True)
-        _all_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
+        require_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
     if s.sweep:
-        from hvdc_ident.study.sweeps import axes_of
+        from hvdc_ident.study.stages.sweep import sweep_axes
 
-        axes_of(s.sweep, 0, f"{where}, sweep")
+        sweep_axes(s.sweep, 0, f"{where}, sweep")
     if s.screening:
         _all_candidates(s.screening.parameters, study, f"{where}, screening.parameters")
     if s.identifiability:
@@ -309,8 +327,8 @@ def check_questions(study: Study, where: str) -> None:
     for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
         place = f"{where}, fit.groups number {number}"
         _all_candidates(group.parameters, study, f"{place}.parameters")
-        _all_known("measured output", group.outputs, measured, f"{place}.outputs")
-        _all_known(
+        require_known("measured output", group.outputs, measured, f"{place}.outputs")
+        require_known(
             "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
         )
     if s.fit:
@@ -318,22 +336,22 @@ def check_questions(study: Study, where: str) -> None:
         from hvdc_ident.fit.optimisers import catalogue, need
         from hvdc_ident.fit.tolerance import tolerance
 
-        _all_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
+        require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
         try:
             need(s.fit.optimiser)
         except InputError as e:
             raise e.at(where) from None
-        _all_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
+        require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
         try:
             tolerance(s.fit.tolerance, study.path.parent)
         except InputError as e:
             raise e.at(f"{where}, fit.tolerance") from None
     if s.diagnose:
-        _all_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
+        require_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
         if s.diagnose.effects != "all":
             from hvdc_ident.effects import effects
 
-            _all_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
+            require_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
 
 
 def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
@@ -354,7 +372,7 @@ def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> No
     """Raise where a name is no candidate, with the reason where it stands in [parameters] all the same."""
     for name in names or ():
         _free_line(name, study.settings.parameters, where)
-        _all_known("candidate", [name], study.candidates, where)
+        require_known("candidate", [name], study.candidates, where)
 
 
 def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, own: bool = False) -> None:
@@ -373,7 +391,95 @@ def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str
     )
 
 
-def _all_known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str) -> None:
-    for name in names or ():
-        if name not in known:
-            raise unknown_name(kind, name, known, where=where)
+def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
+    """The model with its ties and its given values.
+
+    Raises StudyError or UnknownNameError for a tie, or a parameter of each experiment, that does not fit the model.
+    """
+    for name, line in settings.parameters.items():
+        if line.given is not None and name in model.parameters:
+            try:
+                model = model.with_values({name: line.given})
+            except InputError as e:
+                raise e.at(f"{where}, parameters.{name}.given") from None
+    ties = {n: line.tie for n, line in settings.parameters.items() if line.tie is not None}
+    own = [n for n, line in settings.parameters.items() if line.per_experiment]
+    for name in (*ties, *own):
+        if name not in model.parameters:
+            raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
+    if not ties and not own:
+        return model
+    if not isinstance(model, Model):
+        first = next(iter((*ties, *own)))
+        raise StudyError(
+            f"'{first}' cannot be tied or given to each experiment",
+            where=f"{where}, parameters.{first}",
+            expected="a model with equations",
+            got="an FMU",
+        )
+    if not ties:
+        return model
+    expressions = {}
+    for name, tie in ties.items():
+        try:
+            expressions[name] = parse(tie)
+        except InputError as e:
+            raise e.at(f"{where}, parameters.{name}.tie") from None
+    try:
+        return model.tied(expressions)
+    except InputError as e:
+        raise e.at(f"{where}, parameters") from None
+
+
+def with_nuisances(
+    settings: schema.StudyFile,
+    model: AnyModel,
+    experiments: Sequence[Experiment],
+    candidates: Sequence[str],
+    where: str,
+) -> tuple[Experiment, ...]:
+    """The experiments with the parameters each has for itself: those asked for, and the free starts of states.
+
+    A start that is "free" is unknown: it is estimated in every experiment unless it is a candidate, one for all. Raises StudyError
+    where the bounds of one do not hold its start.
+    """
+    own = [n for n, line in settings.parameters.items() if line.per_experiment]
+    if isinstance(model, Model):
+        free = [f"{n}_start" for n, s in model.states.items() if s.start == "free"]
+        own += [n for n in free if n not in candidates and n not in own]
+    if not own:
+        return tuple(experiments)
+    search = {}
+    for name in (n for n in own if n in settings.parameters):
+        try:
+            found = free_of(name, settings.parameters[name], model)
+        except InputError as e:
+            raise e.at(f"{where}, parameters.{name}") from None
+        search[name] = (found.start, found.min, found.max)
+    return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own))), search=search) for e in experiments)
+
+
+def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> Free:
+    """The unknown of a fit that a line of [parameters] describes; what it leaves out is the model's, its given value too.
+
+    Raises StudyError where the bounds do not hold the start.
+    """
+    stated = {k: v for k in ("start", "min", "max") if (v := getattr(line, k)) is not None}
+    return Free.of(name, model.parameters[name], **stated)
+
+
+def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> FrozenMap[Prior]:
+    """The priors by unknown of a fit; one of a parameter that each experiment has for itself holds in every experiment."""
+    from hvdc_ident.fit.nuisance import unknown_of
+    from hvdc_ident.fit.prior import Prior
+
+    found: dict[str, Prior] = {}
+    for name, line in settings.parameters.items():
+        if line.prior is None:
+            continue
+        prior = Prior(line.prior.mean, line.prior.std)
+        if line.per_experiment:
+            found |= {unknown_of(e.name, name): prior for e in experiments if e.role == "fit"}
+        else:
+            found[name] = prior
+    return FrozenMap(found)

@@ -8,14 +8,13 @@ from html import escape
 from typing import Any
 
 from hvdc_ident.data import Experiment, recording_lines
+from hvdc_ident.study.checks import steady_notes
+from hvdc_ident.study.linear_analysis import described
 from hvdc_ident.study.pipeline import heading_of
+from hvdc_ident.study.quiescent_levels import rest_levels
 from hvdc_ident.study.recordings import noise_line
-from hvdc_ident.study.responses import described
-from hvdc_ident.study.rest_levels import rest_levels
-from hvdc_ident.study.stage import stages
-from hvdc_ident.study.steady_notes import steady_notes
-from hvdc_ident.study.study import Study
-from hvdc_ident.study.tables import candidate_lines
+from hvdc_ident.study.stages import stages
+from hvdc_ident.study.study import Study, candidate_lines
 
 
 @dataclass(frozen=True, eq=False)

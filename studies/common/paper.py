@@ -20,8 +20,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.study.simulator import ModelSimulator
-from hvdc_ident.study.waveforms import Campaign, Noise, recorded
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.study.examples import Campaign, Noise, recorded
 
 REFERENCE = "vsc-hvdc-avm"  # stands in for EMTP-RV: the average-value link with 140 Hz filters on P, Q and Vdc
 LINK = "vsc-hvdc-link"  # what is calibrated

@@ -18,12 +18,11 @@ sys.path.insert(0, str(HERE.parent))
 from common import ending, paper  # noqa: E402
 from common.ending import markdown, number  # noqa: E402
 
-from hvdc_ident.files import write_text  # noqa: E402
+from hvdc_ident.files import csv_text, write_text  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402
 from hvdc_ident.study.pipeline import run_stage  # noqa: E402
-from hvdc_ident.study.stage import Options  # noqa: E402
+from hvdc_ident.study.stages import StageOptions  # noqa: E402
 from hvdc_ident.study.study import load_study  # noqa: E402
-from hvdc_ident.study.tables import csv_text  # noqa: E402
 
 SETUPS = {"P": "p.toml", "Q": "q.toml", "Vdc": "vdc.toml", "all three": "simultaneous.toml"}
 WHY = {
@@ -49,7 +48,7 @@ def main(setups: Sequence[str] = tuple(SETUPS)) -> dict[str, Any]:
     for setup in setups:
         study = load_study(HERE / SETUPS[setup])
         with tempfile.TemporaryDirectory() as folder:
-            fit = run_stage(study, "fit", Path(folder), Options()).data
+            fit = run_stage(study, "fit", Path(folder), StageOptions()).data
         found[setup] = {
             "status": fit["status"],
             "played in": sorted({n for e in study.experiments for n in e.inputs}),

@@ -18,7 +18,7 @@ from common.ending import markdown, number  # noqa: E402
 from hvdc_ident.data import Experiment  # noqa: E402
 from hvdc_ident.models import load_model  # noqa: E402
 from hvdc_ident.simulate import simulate  # noqa: E402
-from hvdc_ident.study.waveforms import Campaign, Noise, recorded  # noqa: E402
+from hvdc_ident.study.examples import Campaign, Noise, recorded  # noqa: E402
 
 SETS = ("upper", "lower", "test")
 SHOWN = 450.0  # ms of the record drawn

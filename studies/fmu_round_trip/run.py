@@ -22,16 +22,15 @@ import numpy as np
 
 from hvdc_ident.data import Experiment, InputSignal, experiment
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.files import json_text, write_text
+from hvdc_ident.files import csv_text, json_text, write_text
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.linearize import linearize
 from hvdc_ident.model import Model, save_card
 from hvdc_ident.models import load_model, shipped_models
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.pipeline import run_stage
-from hvdc_ident.study.stage import Options
+from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import load_study
-from hvdc_ident.study.tables import csv_text
 
 HERE = Path(__file__).resolve().parent
 KINDS = {"ME": "model-exchange", "CS": "co-simulation"}
@@ -141,7 +140,7 @@ def full_study(chosen: Case, folder: Path, kinds: Mapping[str, str]) -> dict[str
         path = folder / f"{label}.toml"
         write_text(path, _study_text(chosen, source, kind))
         done = run_stage(
-            load_study(path), "fit", folder / f"{label}-results", Options(folder=folder / f"{label}-results")
+            load_study(path), "fit", folder / f"{label}-results", StageOptions(folder=folder / f"{label}-results")
         )
         if done.failed:
             raise SystemExit(f"{path}: {done.failed}")

@@ -14,7 +14,7 @@ from hvdc_ident.data import Experiment, InputSignal, experiment
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.study.simulator import ModelSimulator
+from hvdc_ident.simulate.model_simulator import ModelSimulator
 
 HERE = Path(__file__).resolve().parent
 EVENT, END, SAMPLE = 0.1, 0.9, 5e-4  # s

@@ -12,8 +12,8 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.fit.tolerance import WINDOWS
 from hvdc_ident.report.sections import errors, gains, residuals
 from hvdc_ident.study import fitting
-from hvdc_ident.study.stage import Options, stage
-from hvdc_ident.study.starter import write_starter
+from hvdc_ident.study.examples import write_starter
+from hvdc_ident.study.stages import StageOptions, stage
 from hvdc_ident.study.study import load_study
 
 GAIN = "KIVDC = {start = 650, min = 550, max = 950}"
@@ -37,8 +37,8 @@ def study(folder: Path, name: str, *edits: tuple[str, str]):
 
 
 def fitted(made) -> tuple[dict, dict[str, str]]:
-    report = stage("identify").run(made, Options(), {})
-    outcome = stage("fit").run(made, Options(), {"identify": json.loads(json.dumps(report.data))})
+    report = stage("identify").run(made, StageOptions(), {})
+    outcome = stage("fit").run(made, StageOptions(), {"identify": json.loads(json.dumps(report.data))})
     assert not outcome.failed, outcome.failed
     return json.loads(json.dumps(outcome.data, allow_nan=False)), dict(outcome.files)
 

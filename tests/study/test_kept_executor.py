@@ -20,7 +20,7 @@ from hvdc_ident.fit.profile import profiles
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.executors import LocalPool
 from hvdc_ident.study.executors.kept import KeptExecutor
-from hvdc_ident.study.packing import packed, unpacked
+from hvdc_ident.study.store import packed, unpacked
 
 
 class Shelf(dict):
@@ -100,7 +100,7 @@ def test_arrays_and_results_come_back_bit_for_bit():
 
 @pytest.mark.parametrize(
     "name",
-    ["os:system", "hvdc_ident.study.packing:json", "subprocess:Popen", "hvdc_ident:os", "hvdc_ident.moved.away:Refit"],
+    ["os:system", "hvdc_ident.study.store:json", "subprocess:Popen", "hvdc_ident:os", "hvdc_ident.moved.away:Refit"],
 )
 def test_only_dataclasses_of_the_package_are_made(name):
     content = json.dumps({"!": "o", "of": name, "v": {}}).encode()

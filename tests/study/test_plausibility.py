@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from hvdc_ident.study import pipeline
+from hvdc_ident.study.checks import violations
 from hvdc_ident.study.pipeline import run_stage
-from hvdc_ident.study.plausibility import violations
-from hvdc_ident.study.stage import Options, stage
+from hvdc_ident.study.stages import StageOptions, stage
 from hvdc_ident.study.study import load_study
 
 
@@ -44,7 +44,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(study: Path) -> dict[str, dict[str, Any]]:
     """The JSON of each stage of the study."""
     loaded = load_study(study)
-    return {n: dict(run_stage(loaded, n, loaded.folder, Options()).data) for n in ("linearize", "identify", "fit")}
+    return {n: dict(run_stage(loaded, n, loaded.folder, StageOptions()).data) for n in ("linearize", "identify", "fit")}
 
 
 def test_a_right_result_passes(results):
@@ -121,7 +121,7 @@ def test_a_violation_makes_the_stage_fail_and_keeps_what_it_found(study, tmp_pat
 
     monkeypatch.setattr(pipeline, "stage", lambda name: replace(real, run=wrong) if name == "fit" else stage(name))
     loaded = load_study(study)
-    done = run_stage(loaded, "fit", tmp_path, Options())
+    done = run_stage(loaded, "fit", tmp_path, StageOptions())
     assert "not plausible" in done.failed and "a start reached a cost" in done.failed
     written = json.loads((tmp_path / "fit.json").read_text())
     assert written["implausible"] and written["fingerprint"] == "" and "T" in written["estimates"]

@@ -14,9 +14,9 @@ from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.fit import FitResult, Problem, fit
 from hvdc_ident.report.page import write_report
 from hvdc_ident.report.results import Results
+from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.pipeline import run_stage
-from hvdc_ident.study.simulator import ModelSimulator
-from hvdc_ident.study.stage import Options
+from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.summary import summary, summary_text
 
@@ -97,8 +97,8 @@ def test_gaps_of_outputs_are_not_compared_and_said(tmp_path: Path) -> None:
 def test_gaps_reach_every_file_and_the_page(tmp_path: Path) -> None:
     study = load_study(write(tmp_path, holed()))
     folder = tmp_path / "out"
-    run_stage(study, "fit", folder, Options(folder=folder))
-    done = run_stage(study, "simulate", folder, Options(folder=folder))
+    run_stage(study, "fit", folder, StageOptions(folder=folder))
+    done = run_stage(study, "simulate", folder, StageOptions(folder=folder))
     assert done.data["experiments"]["d"]["recording"]["not_recorded"] == {"w": 10, "i": 3}
     _, w, _ = exact(TIME)
     table = Results(folder).table("fit.d.csv")

@@ -14,8 +14,8 @@ from hvdc_ident.cli import app
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.study.conversions import conversions
-from hvdc_ident.study.rest_levels import RestLevels, compare_rest
+from hvdc_ident.study.level_comparison import conversions
+from hvdc_ident.study.quiescent_levels import RestLevels, compare_rest
 
 CARD = """schema = 1
 name = "lag"

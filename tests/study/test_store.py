@@ -46,7 +46,7 @@ import os, signal, sys, threading
 from pathlib import Path
 from hvdc_ident.sensitivity import sweep_points
 from hvdc_ident.study.pipeline import run_stage
-from hvdc_ident.study.stage import Options
+from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import load_study
 study, points, delay = load_study(sys.argv[1]), int(sys.argv[3]), float(sys.argv[4])
 run, done = sweep_points.PointTask.__call__, []
@@ -60,7 +60,7 @@ def counted(self, p):
 
 
 sweep_points.PointTask.__call__ = counted
-run_stage(study, "sweep", Path(sys.argv[2]), Options())
+run_stage(study, "sweep", Path(sys.argv[2]), StageOptions())
 """
 HOLD = "import sys; from pathlib import Path; from hvdc_ident.study.store import exclusive\n"
 HOLD += "with exclusive(Path(sys.argv[1])):\n print('held', flush=True); sys.stdin.read()"

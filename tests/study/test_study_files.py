@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.files import json_text, write_text
-from hvdc_ident.study.demo import write_demo
+from hvdc_ident.files import csv_text, json_text, write_text
+from hvdc_ident.study.examples import write_demo
+from hvdc_ident.study.export import SSV, ssv
+from hvdc_ident.study.stages.fit import values_csv
 from hvdc_ident.study.study import load_study
-from hvdc_ident.study.tables import SSV, csv_text, ssv, values_csv
 
 
 def test_json_keeps_every_digit_and_has_no_infinity() -> None:

@@ -7,8 +7,9 @@ import io
 
 import numpy as np
 
+from hvdc_ident.files import csv_text
 from hvdc_ident.report.results import Results
-from hvdc_ident.study.tables import csv_text, values_csv
+from hvdc_ident.study.stages.fit import values_csv
 
 
 def test_no_cell_of_the_fitted_values_is_a_formula():

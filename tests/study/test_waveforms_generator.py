@@ -9,8 +9,8 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.simulate import simulate
+from hvdc_ident.study.examples import MOVED, Campaign, Noise, experiments, recorded, write_waveforms
 from hvdc_ident.study.study import load_study
-from hvdc_ident.study.waveforms import MOVED, Campaign, Noise, experiments, recorded, write_waveforms
 
 SMALL = Campaign(count=2, holdout=1, noise=Noise(1e-4))
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.files import digest
 from hvdc_ident.study.executors.ended import Ended, in_order
-from hvdc_ident.study.packing import packed, unpacked
+from hvdc_ident.study.store import packed, unpacked
 
 
 class Shelf(Protocol):

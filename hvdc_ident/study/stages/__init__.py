@@ -1,1 +1,110 @@
-"""The stages, one file each; see `hvdc_ident.study.stage` for what a file supplies."""
+"""What a stage is: a question a study can ask, answered by one JSON and some files. A stage is one file in `stages/`.
+
+A stage's file has `STAGE = Stage(...)` and imports numpy and the like inside its functions, for the command line
+lists the stages before it knows which one will run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hvdc_ident.errors import unknown_name
+from hvdc_ident.executor import Progress, silent
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+
+def unkept(data: Mapping[str, Any]) -> None:
+    """Drop a first answer, where nothing is written."""
+
+
+def unheard(lines: Sequence[str]) -> None:
+    """Drop lines that nobody reads."""
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """How stages run. workers: processes; seed: of every random number; progress: who is told.
+
+    announce: who is told, in lines, what to know before the work begins, or while a long one goes on.
+    keep: who writes a first answer, so that it stands where the work is interrupted; the stage runner sets it.
+    force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
+    None: nothing is kept. executor: where the work is done, "" for this machine.
+    """
+
+    workers: int = 1
+    seed: int = 0
+    progress: Progress = silent
+    force: tuple[str, ...] = ()
+    folder: Path | None = None
+    executor: str = ""
+    announce: Callable[[Sequence[str]], None] = unheard
+    keep: Callable[[Mapping[str, Any]], None] = unkept
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """What a stage found. data: the JSON without its heading. files: text by name, written beside it.
+
+    failed: why the work did not come to an end, empty where it did; what there is, is kept all the same.
+    """
+
+    data: Mapping[str, Any]
+    files: Mapping[str, str] = field(default_factory=dict)
+    failed: str = ""
+
+
+def no_lines(data: Mapping[str, Any]) -> Sequence[str]:
+    """Nothing: a result that is told by where it stands."""
+    return ()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage.
+
+    name: its command. file: its JSON in DIR. run: the work, given the study, the options and the data of the stages it
+    builds on, by name; what the study lacks for it is a StudyError. wanted: whether `run STUDY` includes it.
+    after: the stages it builds on; they run first. order: place among the stages of a run.
+    uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
+    takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
+    from its JSON. searches: whether it also runs at the start values, where a search begins; all run at the given ones.
+    """
+
+    name: str
+    file: str
+    summary: str
+    run: Callable[[Study, StageOptions, Mapping[str, Any]], StageResult]
+    wanted: Callable[[Study], bool]
+    order: int
+    after: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
+    tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
+    searches: bool = False
+
+
+@cache
+def stages() -> tuple[Stage, ...]:
+    """Every stage, in the order of a run, found by walking `stages/`."""
+    from hvdc_ident.study import stages as folder
+
+    found = [
+        importlib.import_module(f"{folder.__name__}.{m.name}").STAGE for m in pkgutil.iter_modules(folder.__path__)
+    ]
+    return tuple(sorted(found, key=lambda s: (s.order, s.name)))
+
+
+def stage(name: str) -> Stage:
+    """The stage of that name. Raises UnknownNameError."""
+    for found in stages():
+        if found.name == name:
+            return found
+    raise unknown_name("stage", name, [s.name for s in stages()])

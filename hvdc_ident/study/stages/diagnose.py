@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 from hvdc_ident.text import form_of
 
 if TYPE_CHECKING:
@@ -20,28 +20,28 @@ class NothingIdentified(ComputationError):
     """The data identify none of the parameters."""
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.discrepancy.findings.sizes import size_curves
     from hvdc_ident.model import Model
-    from hvdc_ident.study.at_work import executor_of
+    from hvdc_ident.study.pipeline import executor_of
 
     _need(study)
     report = earlier["identify"]
     if "parameters" not in report:
         why = f"nothing can be diagnosed before the stage identify has run: {report.get('message', 'it failed')}"
-        return Outcome({"status": "failed", "message": why}, failed=why)
+        return StageResult({"status": "failed", "message": why}, failed=why)
     with executor_of(study, options, "diagnose") as executor:
         try:
             found = diagnosed(study, report, seed=options.seed, executor=executor, progress=options.progress)
         except NothingIdentified as e:
-            return Outcome({"status": "failed", "message": str(e)}, failed=str(e))
+            return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
-    return Outcome({**found.to_dict(), "sizes": sizes}, found.files)
+    return StageResult({**found.to_dict(), "sizes": sizes}, found.files)
 
 
 def _need(study: Study) -> None:
-    from hvdc_ident.study.needs import need_candidates, need_experiments, need_start
+    from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
 
     need_experiments(study, "diagnose", role="fit")
     need_candidates(study, "diagnose")

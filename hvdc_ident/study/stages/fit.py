@@ -6,26 +6,27 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
+    from hvdc_ident.data import Experiment
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.fit.assessment import Curve
     from hvdc_ident.study.study import Study
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
     from hvdc_ident.identifiability.gate import gate, gated
     from hvdc_ident.study import fitting
-    from hvdc_ident.study.at_work import executor_of
-    from hvdc_ident.study.responses import compared
+    from hvdc_ident.study.linear_analysis import compared
+    from hvdc_ident.study.pipeline import executor_of
 
     fitting.need(study, "fit")
     report = earlier["identify"]
     if "parameters" not in report:
         why = f"nothing can be fitted before the stage identify has run: {report.get('message', 'it failed')}"
-        return Outcome({"status": "failed", "message": why}, failed=why)
+        return StageResult({"status": "failed", "message": why}, failed=why)
     with executor_of(study, options, "fit") as executor:
         result = fitting.estimated(
             study, report, force=options.force, seed=options.seed, executor=executor, progress=options.progress
@@ -33,7 +34,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     problem = fitting.problem_of(study)
     data = {**result.to_dict(), **_context(study, problem, options, report, result)}
     if result.status == "failed":
-        return Outcome(data, failed=result.message)
+        return StageResult(data, failed=result.message)
     through = fitting.with_settings(study, gated(problem, gate(report, options.force)))
     curves = fitting.curves_of(through, result)
     data["windowed_errors"] = fitting.errors_in_windows(study, curves)
@@ -41,15 +42,15 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     if study.responses:
         data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
     files = _files(study, result, data, curves)
-    return Outcome(data, files, failed=result.message if result.status == "not-converged" else "")
+    return StageResult(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
 def _context(
-    study: Study, problem: Problem, options: Options, report: Mapping[str, Any], result: FitResult
+    study: Study, problem: Problem, options: StageOptions, report: Mapping[str, Any], result: FitResult
 ) -> dict[str, Any]:
     """What a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
     from hvdc_ident.study.recordings import noise_line
-    from hvdc_ident.study.tables import candidate_lines
+    from hvdc_ident.study.study import candidate_lines
 
     return {
         "forced": [n for n in options.force if n in result.fitted and n not in report["identifiable"]],
@@ -68,7 +69,7 @@ def _files(
     study: Study, result: FitResult, data: Mapping[str, Any], curves: Mapping[str, Mapping[str, Curve]]
 ) -> dict[str, str]:
     """The values to paste, and the waveforms at the estimates; of an experiment that fails there is none."""
-    from hvdc_ident.study.tables import curves_csv, ssv, values_csv
+    from hvdc_ident.study.export import ssv
 
     values = {n: float(result.values[n]) for n in study.candidates if n in result.values}
     units = {n: study.model.parameters[n].unit for n in values}
@@ -78,7 +79,40 @@ def _files(
         "fitted-values.csv": values_csv(values, units, data["estimates"], result.held),
         "fitted-values.ssv": ssv(values, study.name, f"fitted values of study '{study.name}' (fit {result.status})"),
     }
-    return files | {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
+    return files | {f"fit.{e.name}.csv": _curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
+
+
+def _curves_csv(experiment: Experiment, curves: Mapping[str, Curve]) -> str:
+    """CSV text: time, then for each measured output OUTPUT, OUTPUT.measured and the ends of the 95 % band of a sample.
+
+    The columns OUTPUT.low and OUTPUT.high are left out where no estimate has a standard deviation.
+    """
+    import numpy as np
+
+    from hvdc_ident.files import csv_text
+
+    header, columns = ["time"], [experiment.time]
+    for output, c in curves.items():
+        header += [output, f"{output}.measured"]
+        columns += [c.model, c.measured]
+        if c.band is not None:
+            header += [f"{output}.low", f"{output}.high"]
+            columns += [c.model - c.band, c.model + c.band]
+    return csv_text(header, np.column_stack(columns).tolist())
+
+
+def values_csv(
+    values: Mapping[str, float], units: Mapping[str, str], estimates: Mapping[str, Any], held: Mapping[str, str]
+) -> str:
+    """CSV text with a row for each fitted or held parameter: value, unit, std, interval, and why it is held."""
+    from hvdc_ident.files import csv_text
+
+    rows: list[list[Any]] = []
+    for name, value in values.items():
+        e = estimates.get(name) or {}
+        low, high = e.get("ci95") or (None, None)
+        rows.append([name, value, units.get(name, ""), e.get("std"), low, high, held.get(name, "")])
+    return csv_text(["parameter", "value", "unit", "std", "ci95_low", "ci95_high", "held"], rows)
 
 
 def _head(study: Study, values: Mapping[str, float]) -> str:
@@ -100,7 +134,7 @@ def told(data: Mapping[str, Any]) -> list[str]:
     lines += [f"{FIT_WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
     lines += [f"Next: {judged['next']}"] if judged.get("next") else []
     lines += [f"{data['roughness']['text']}."] if data.get("roughness") else []
-    from hvdc_ident.study.responses import response_lines
+    from hvdc_ident.study.linear_analysis import response_lines
 
     beside = _beside(data)
     for name, e in data["estimates"].items():

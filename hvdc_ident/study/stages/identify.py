@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.executor import Executor, Progress
@@ -21,17 +21,17 @@ SOON = 60.0
 """Seconds of a search from which on a first answer is given before it."""
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return a verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
-    from hvdc_ident.study.at_work import executor_of
     from hvdc_ident.study.fitting import need
-    from hvdc_ident.study.tables import candidate_lines
+    from hvdc_ident.study.pipeline import executor_of
+    from hvdc_ident.study.study import candidate_lines
 
     need(study, "identify")
     _first_answer(study, options, _starts(study))
     with executor_of(study, options, "identify") as executor:
         report = judged(study, seed=options.seed, executor=executor, progress=options.progress)
-    return Outcome({**report.to_dict(), "candidates": candidate_lines(study)})
+    return StageResult({**report.to_dict(), "candidates": candidate_lines(study)})
 
 
 def judged(
@@ -61,13 +61,13 @@ def _starts(study: Study) -> int:
     return max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
 
 
-def _first_answer(study: Study, options: Options, starts: int) -> None:
+def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     """Tell and keep the local analysis at the given values, where the search will take longer than `SOON`."""
     from hvdc_ident.errors import SimulationError
     from hvdc_ident.fit import Problem
     from hvdc_ident.fit.frequency_data import with_responses
     from hvdc_ident.identifiability.first_look import first_look
-    from hvdc_ident.study.tables import candidate_lines
+    from hvdc_ident.study.study import candidate_lines
     from hvdc_ident.text import duration
 
     simulator, experiments = with_responses(study.model, study.experiments, study.responses)

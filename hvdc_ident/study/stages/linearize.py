@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
+    from hvdc_ident.study.export import ValueSet
     from hvdc_ident.study.study import Study
-    from hvdc_ident.study.values import ValueSet
 
 CHECKS = {
     "symbolic": "complex step of 1e-30 through the equations, relative to each row's largest entry",
@@ -22,14 +22,14 @@ MOST_DRAWN = 12
 """Channels up to which the frequency response is written too, for the report to draw."""
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for.
 
     All of it at the given values, and under `fitted` at the fitted ones where a fit stands in the folder.
     """
     from hvdc_ident.errors import HvdcIdentError
-    from hvdc_ident.study.needs import at_given
-    from hvdc_ident.study.values import fitted_values, value_set
+    from hvdc_ident.study.checks import at_given
+    from hvdc_ident.study.export import fitted_values, value_set
 
     given = value_set(study, "given")
     with at_given(study):
@@ -37,22 +37,21 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
     data, files = _described(study, model, given, options)
     found, why = (None, "") if options.folder is None else fitted_values(study, options.folder)
     if found is None or why:
-        return Outcome({**data, "fitted_note": why}, files)
+        return StageResult({**data, "fitted_note": why}, files)
     try:
         other, more = _described(study, linear_model(study, found), found, options, like=data["modes"])
     except HvdcIdentError as e:  # the given model is the answer all the same
         other, more = {"values": found.name, "parameters": dict(found.values), "message": f"no linear model: {e}"}, {}
     files |= {f"fitted.{name}": text for name, text in more.items()}
-    return Outcome({**data, "fitted": {**other, "fit": found.fit}, "fitted_note": found.note}, files)
+    return StageResult({**data, "fitted": {**other, "fit": found.fit}, "fitted_note": found.note}, files)
 
 
 def _described(
-    study: Study, model: LinearModel, chosen: ValueSet, options: Options, like: Sequence[Mapping[str, Any]] = ()
+    study: Study, model: LinearModel, chosen: ValueSet, options: StageOptions, like: Sequence[Mapping[str, Any]] = ()
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
-    from hvdc_ident.study.linear_analysis import analyses, modes_of
-    from hvdc_ident.study.responses import compared
+    from hvdc_ident.study.linear_analysis import analyses, compared, modes_of
 
     point = model.point
     assert point is not None
@@ -115,8 +114,7 @@ def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
 
 def told(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
-    from hvdc_ident.study.linear_analysis import lines
-    from hvdc_ident.study.responses import response_lines
+    from hvdc_ident.study.linear_analysis import lines, response_lines
 
     def described(found: Mapping[str, Any], of: str) -> list[str]:
         return lines(found) + response_lines(found.get("responses", ()), of)

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Morris' elementary effects or Sobol's indices of each output's RMSE in each experiment."""
     import math
 
     from hvdc_ident.errors import StudyError
     from hvdc_ident.sensitivity import morris, sobol
-    from hvdc_ident.study.at_work import workers_of
-    from hvdc_ident.study.needs import need_candidates, need_experiments
+    from hvdc_ident.study.checks import need_candidates, need_experiments
+    from hvdc_ident.study.pipeline import workers_of
     from hvdc_ident.study.schema import ScreeningTable
 
     need_experiments(study, "screen")
@@ -53,7 +53,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         "ranges": {n: list(r) for n, r in ranges.items()},
         "units": {o: study.model.outputs[o].unit for o, _ in found.series},
     }
-    return Outcome(data)
+    return StageResult(data)
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:

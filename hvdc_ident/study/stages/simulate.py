@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
-    from hvdc_ident.data import Experiment
+    from hvdc_ident.data import Experiment, Trajectory
     from hvdc_ident.study.study import Study
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """The RMSE of each output in each experiment, and a CSV of measured and simulated outputs for each experiment."""
     from hvdc_ident.errors import ComputationError
     from hvdc_ident.simulate import simulate
-    from hvdc_ident.study.needs import at_given, need_experiments
-    from hvdc_ident.study.tables import comparison_csv, rmse
+    from hvdc_ident.study.checks import at_given, need_experiments
 
     need_experiments(study, "simulate")
     table: dict[str, dict[str, float | None]] = {}
@@ -39,8 +38,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             experiment = _until(experiment, simulated.time.size)
         for output in experiment.outputs:
             told = not ended or _comparable(experiment, output)
-            table.setdefault(output, {})[experiment.name] = rmse(experiment, simulated, output) if told else None
-        files[f"simulation.{experiment.name}.csv"] = comparison_csv(experiment, simulated)
+            table.setdefault(output, {})[experiment.name] = _rmse(experiment, simulated, output) if told else None
+        files[f"simulation.{experiment.name}.csv"] = _comparison_csv(experiment, simulated)
     failed = [name for name, s in status.items() if s["status"] != "converged"]
     data = {
         "values": {**study.model.values, **study.given},
@@ -51,7 +50,7 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
             for e in study.experiments
         },
     }
-    return Outcome(data, files, failed=status[failed[0]]["reason"] if failed else "")
+    return StageResult(data, files, failed=status[failed[0]]["reason"] if failed else "")
 
 
 def _until(experiment: Experiment, rows: int) -> Experiment:
@@ -74,6 +73,35 @@ def _comparable(experiment: Experiment, output: str) -> bool:
 
     assert experiment.measured is not None
     return bool(np.isfinite(experiment.measured[output][experiment.compared]).any())
+
+
+def _rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
+    """The root mean square of measured - simulated over the rows that are compared, in the output's unit.
+
+    Raises StudyError where there is none.
+    """
+    import numpy as np
+
+    from hvdc_ident.fit.residual import compared_rows
+
+    rows = compared_rows(experiment, output)
+    assert experiment.measured is not None
+    difference = experiment.measured[output][rows] - simulated[output][rows]
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
+    """CSV text: time, then for each measured output the simulated column OUTPUT and the recorded OUTPUT.measured."""
+    import numpy as np
+
+    from hvdc_ident.files import csv_text
+
+    assert experiment.measured is not None
+    header, columns = ["time"], [experiment.time]
+    for output in experiment.outputs:
+        header += [output, f"{output}.measured"]
+        columns += [simulated[output], experiment.measured[output]]
+    return csv_text(header, np.column_stack(columns).tolist())
 
 
 STAGE = Stage(

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from hvdc_ident.study.stage import Options, Outcome, Stage
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
+    from hvdc_ident.sensitivity import Samples
+    from hvdc_ident.study import schema
     from hvdc_ident.study.study import Study
 
 
-def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
+def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """A row for each point, as JSON and as CSV; finished points are kept in the folder and not run again."""
     from hvdc_ident.errors import StudyError
     from hvdc_ident.files import Rows
     from hvdc_ident.sensitivity import sweep
-    from hvdc_ident.study.at_work import workers_of
-    from hvdc_ident.study.needs import need_experiments
+    from hvdc_ident.study.checks import need_experiments
+    from hvdc_ident.study.pipeline import workers_of
     from hvdc_ident.study.store import Store
-    from hvdc_ident.study.sweeps import against_of, axes_of, wanted
 
     tables = study.settings.sweep
     if not tables:
         hint = '[[sweep]] with parameter = "NAME", min, max and points'
         raise StudyError("sweep needs a parameter and the study names none", where=study.path.name, hint=hint)
-    want = wanted(tables)
+    want = sweep_quantities(tables)
     if "rmse" in want:
         need_experiments(study, "sweep")
     linear = study.settings.linearize
@@ -37,8 +38,8 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         result = sweep(
             study.model,
             study.experiments,
-            axes_of(tables, options.seed),
-            against=study.against or ("base" if against_of(tables) == "base" else "data"),
+            sweep_axes(tables, options.seed),
+            against=study.against or ("base" if sweep_reference(tables) == "base" else "data"),
             values=study.given,
             want=want,
             linear=(linear.inputs or list(study.model.inputs), linear.outputs or list(study.model.outputs))
@@ -50,7 +51,61 @@ def run(study: Study, options: Options, earlier: Mapping[str, Any]) -> Outcome:
         )
     data = {**result.summary(), "points": Rows(result.rows, len(result))}
     reason = f"every point failed; the first: {result.failed[0]}" if len(result.failed) == len(result) else ""
-    return Outcome(data, {"sweep.csv": result.to_csv()}, failed=reason)
+    return StageResult(data, {"sweep.csv": result.to_csv()}, failed=reason)
+
+
+def sweep_axes(tables: Sequence[schema.SweepTable], seed: int, where: str = "sweep") -> tuple[Samples, ...]:
+    """One axis for each table; those sampled by a Latin hypercube together are one. Their product is the sweep."""
+    from hvdc_ident.sensitivity import Points, grid, listed, log_grid
+
+    axes: list[Samples] = []
+    cube = [t for t in tables if t.sampling == "latin-hypercube"]
+    for table in tables:
+        if table in cube:
+            if table is cube[0]:
+                axes.append(_cube(cube, seed, where))
+        elif table.values is not None:
+            axes.append(listed(table.parameter, table.values))
+        else:
+            assert table.min is not None and table.max is not None and table.points is not None
+            make = log_grid if table.scale == "log" else grid
+            axes.append(make(table.parameter, table.min, table.max, table.points))
+    Points(tuple(axes))  # refuses a parameter that stands twice, and too many points
+    return tuple(axes)
+
+
+def _cube(tables: Sequence[schema.SweepTable], seed: int, where: str) -> Samples:
+    from hvdc_ident.errors import StudyError
+    from hvdc_ident.sensitivity import latin_hypercube
+
+    points = {t.points for t in tables}
+    if len(points) != 1 or None in points:
+        raise StudyError(
+            "the axes of a Latin hypercube have different numbers of points",
+            where=where,
+            expected="one number of points for all tables of sampling 'latin-hypercube'",
+            got=", ".join(f"{t.parameter} {t.points}" for t in tables),
+        )
+    bounds = {t.parameter: (float(t.min or 0.0), float(t.max or 0.0)) for t in tables}
+    logs = [t.parameter for t in tables if t.scale == "log"]
+    return latin_hypercube(bounds, int(tables[0].points or 0), seed=seed, log=logs)
+
+
+def sweep_reference(tables: Sequence[schema.SweepTable], where: str = "sweep") -> str:
+    """What the sweep is compared with, "data", "base" or a model's name: every table that says so says the same."""
+    from hvdc_ident.errors import StudyError
+
+    said = {t.against for t in tables if t.against is not None}
+    if len(said) > 1:
+        raise StudyError("the sweep tables do not agree on `against`", where=where, got=" and ".join(sorted(said)))
+    return said.pop() if said else "data"
+
+
+def sweep_quantities(tables: Sequence[schema.SweepTable]) -> tuple[Literal["rmse", "poles", "bode"], ...]:
+    """What any of the tables wants at each point, in a fixed order."""
+    asked = {w for t in tables for w in t.want}
+    kinds: tuple[Literal["rmse", "poles", "bode"], ...] = ("rmse", "poles", "bode")
+    return tuple(k for k in kinds if k in asked)
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:

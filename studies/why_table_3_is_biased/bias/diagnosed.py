@@ -16,8 +16,8 @@ from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.models import load_model
-from hvdc_ident.study.simulator import ModelSimulator
-from hvdc_ident.study.waveforms import Campaign, Noise, recorded
+from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.study.examples import Campaign, Noise, recorded
 
 NOISE = 5e-4
 """Standard deviation of every record, pu: a twentieth of a per cent of the rating; far below the paper's own residuals."""

@@ -15,7 +15,7 @@ from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.models import load_model, vsc_hvdc_avm
 from hvdc_ident.simulate import simulate
-from hvdc_ident.study.waveforms import Campaign, experiments
+from hvdc_ident.study.examples import Campaign, experiments
 
 RUNS = 6  # experiments of each controller, every other a ramp; as many simultaneous fits as Table III's intervals tell
 CURRENTS = ["Ir1", "Ii1", "Ir2", "Ii2"]

@@ -1,15 +1,121 @@
-"""The one place that decides whether what a stage found may be told as a result; the stage runner asks it of every stage.
-
-It looks at the JSON that the stage is about to write, so that what is checked is what is told. A violation is a bug of the
-package or a case that it does not see through: the stage then counts as failed, with the violation as its message, and what
-it found is kept beside it under `implausible`.
-"""
+"""What a stage needs of a study, or the message that says it is missing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
+
+from hvdc_ident.data import Experiment
+from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError, SteadyStateError, StudyError
+from hvdc_ident.model import Model
+from hvdc_ident.study.study import Study
+
+
+def need_experiments(study: Study, stage: str, role: str | None = None, *, responses: bool = False) -> None:
+    """Raise StudyError where the study has no experiment, or none of the role.
+
+    responses: whether a measured frequency response does instead.
+    """
+    if responses and any(r.role == role for r in study.responses):
+        return
+    if not study.experiments:
+        hint = '[[experiment]] with name, data = "file.csv", inputs and outputs'
+        raise StudyError(f"{stage} needs an experiment and the study has none", where=study.path.name, hint=hint)
+    if role is not None and not any(e.role == role for e in study.experiments):
+        hint = f'role = "{role}" for at least one'
+        raise StudyError(
+            f"{stage} needs an experiment of role '{role}'", where=study.path.name, got="held-out ones only", hint=hint
+        )
+
+
+def need_candidates(study: Study, stage: str) -> None:
+    """Raises StudyError where the study names no parameter to estimate."""
+    if not study.candidates:
+        known = ", ".join(list(study.model.parameters)[:8])
+        hint = f"[parameters] with lines like NAME = {{given = 1, min = 0, max = 10}}; the model has {known}"
+        raise StudyError(
+            f"{stage} needs parameters to estimate and the study names none", where=study.path.name, hint=hint
+        )
+
+
+def need_start(study: Study) -> None:
+    """Raise SteadyStateError where an experiment has no steady state at the start values: the study is then wrong.
+
+    LinearizationError where a measured response has no counterpart there.
+    """
+    from contextlib import suppress
+
+    from hvdc_ident.errors import SimulationError
+    from hvdc_ident.simulate import simulate
+
+    for experiment in study.experiments:
+        with suppress(SimulationError):
+            simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
+    for response in study.responses:
+        try:
+            response.of_model(study.model, study.start)
+        except InputError as e:
+            raise e.at(f"response '{response.name}'") from None
+
+
+@contextmanager
+def at_given(study: Study) -> Iterator[None]:
+    """Run what is inside at the given values.
+
+    A model that has no steady state there is wrong input (SteadyStateError). Where the study's search begins elsewhere it
+    is a finding about the vendor's values, a ComputationError, which ends this stage and not those that fit.
+    """
+    try:
+        yield
+    except SteadyStateError as e:
+        if study.start == study.given:
+            raise
+        raise ComputationError(
+            f"at the given values {e.what}",
+            where=e.where,
+            expected=e.expected,
+            got=e.got,
+            hint="given = ... in [parameters] states the vendor's value; a fit begins at `start` and is not touched",
+        ) from None
+
+
+def steady_notes(study: Study, *, searches: bool = False) -> list[str]:
+    """Return a sentence for each start, of the model and of each experiment, that is unstable, off its branch or far out.
+
+    The model stands at its own inputs, an experiment at the first values of its; parameters at the given values, which
+    every stage runs at. searches: also at the start values, where they differ, for a search begins there.
+    Empty where every start is the model's own stable steady state, and for an FMU, which begins where it says.
+    """
+    model = study.model
+    if not isinstance(model, Model) or any(s.start is not None for s in model.states.values()):
+        return []
+    begins = {"model": (), **{f"experiment {e.name}": _first(e) for e in study.experiments if not e.drive}}
+    at_given = {where: _notes(model, study.given, inputs) for where, inputs in begins.items()}
+    found = [f"{where}: {note}" for where, notes in at_given.items() for note in notes]
+    if searches and study.start != study.given:
+        for where, inputs in begins.items():
+            notes = _notes(model, study.start, inputs)
+            found += [f"{where}, at the start values: {note}" for note in notes if note not in at_given[where]]
+    return found
+
+
+def _first(e: Experiment) -> tuple[tuple[str, float], ...]:
+    """The inputs before anything happens, by name."""
+    return (*e.values.items(), *((n, float(signal.values[0])) for n, signal in e.inputs.items()))
+
+
+def _notes(model: Model, values: Mapping[str, float], inputs: Iterable[tuple[str, float]]) -> tuple[str, ...]:
+    from hvdc_ident.linearize import find_operating_point
+
+    fixed = {**values, **dict(inputs)}
+    known = {n: v for n, v in fixed.items() if n in model.parameters or n in model.inputs}
+    try:
+        return find_operating_point(model, known).notes
+    except HvdcIdentError as error:  # the stage that needs a steady state ends with it
+        return (str(error),)
+
 
 Check = Callable[[Mapping[str, Any]], Iterator[str]]
 """From a stage's JSON to the violations in it, in words."""
