@@ -44,20 +44,23 @@ def zoomable(
     return f'<figure data-zoom="{text(label)}">{drawn}{script}</figure>'
 
 
-def scripts(body: str) -> tuple[str, str]:
-    """The scripts a page with this body needs, as HTML, and the part of its policy that allows them and no others."""
+def scripts(body: str) -> tuple[str, str, str]:
+    """Return the page's script and the drawing library that this body needs, and the policy that allows them alone.
+
+    Each is "" where the body needs none.
+    """
     zooms, moves = "data-zoom=" in body, "data-sizes=" in body
     if not (zooms or moves):
-        return "", ""
-    code = _asset("page.js")
+        return "", "", ""
+    code = asset("page.js")
     mark = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
-    library = f'<script type="application/gzip" id="plotly">{_library()}</script>\n' if zooms else ""
-    return f"{library}<script>{code}</script>\n", f"script-src 'sha256-{mark}' blob:"
+    return code, _library() if zooms else "", f"script-src 'sha256-{mark}' blob:"
 
 
 @cache
-def _asset(name: str) -> str:
-    return resources.files("hvdc_ident.report").joinpath("assets", name).read_text(encoding="utf-8")
+def asset(name: str) -> str:
+    """Return the text of a file in `templates/`."""
+    return resources.files("hvdc_ident.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 @cache
