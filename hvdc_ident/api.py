@@ -470,9 +470,9 @@ def check(model: ModelLike, data: DataLike | None = None, parameters: Parameters
     6
     """
     from hvdc_ident.study.assemble import study_of
-    from hvdc_ident.study.summary import Summary, summary
+    from hvdc_ident.study.summary import Summary
 
-    return Summary(summary(study_of(model, data, parameters)))
+    return Summary.of(study_of(model, data, parameters))
 
 
 def export(

@@ -274,12 +274,12 @@ def check(
     if find or all_ or build:
         raise InputError("--find, --all and --compile are about an FMU", where=str(study), expected="a path to an .fmu")
     from hvdc_ident.study.study import load_study
-    from hvdc_ident.study.summary import summary, summary_text
+    from hvdc_ident.study.summary import Summary
 
-    found = summary(load_study(study, trust, _limits(deadline, load, memory)), seed)
+    found = Summary.of(load_study(study, trust, _limits(deadline, load, memory)), seed)
     if json:
-        _print_json(found)
-    _say(summary_text(found), json=json, quiet=quiet)
+        _print_json(found.to_dict())
+    _say(str(found), json=json, quiet=quiet)
 
 
 def _check_fmu(

@@ -164,7 +164,7 @@ NONE = Conversion("", 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class RecordedOutput:
     """One recorded output. before, after: (n,) rows of the level and of the movement. noise: std of a single row;
     deterministic: whether that is not known, so that the misfit stands in for it."""
 
@@ -178,7 +178,7 @@ class Record:
     deterministic: bool
 
     @classmethod
-    def of(cls, e: Experiment, output: str, unit: str, experiments: Sequence[Experiment]) -> Record:
+    def of(cls, e: Experiment, output: str, unit: str, experiments: Sequence[Experiment]) -> RecordedOutput:
         assert e.measured is not None
         values = e.measured[output]
         there = np.isfinite(values)
@@ -205,7 +205,7 @@ class Comparison:
     """A record against the model. simulated: (n,) at the given values. recorded, error: level and standard error, None
     where there is no level. model: at the given values. levels: of all runs; movements: of all runs in which both move."""
 
-    record: Record
+    record: RecordedOutput
     simulated: Array
     recorded: float | None
     error: float
@@ -216,7 +216,7 @@ class Comparison:
     size: float
 
     @classmethod
-    def of(cls, record: Record, simulated: Array) -> Comparison:
+    def of(cls, record: RecordedOutput, simulated: Array) -> Comparison:
         movement = _movement(record, simulated)
         misfit = movement.misfit if movement else 0.0
         noise = max(record.noise, misfit) if record.deterministic else record.noise
@@ -307,7 +307,7 @@ def apart(a: float, b: float, zero: float) -> float:
     return abs(math.asinh(a / zero) - math.asinh(b / zero))
 
 
-def _movement(record: Record, simulated: Array) -> Movement | None:
+def _movement(record: RecordedOutput, simulated: Array) -> Movement | None:
     """None where the record shows nothing but noise, or the model stands still."""
     if not record.after.any():
         return None

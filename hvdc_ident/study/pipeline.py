@@ -16,7 +16,7 @@ from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.checks import steady_notes, violations
 from hvdc_ident.study.executors import open_executor
 from hvdc_ident.study.executors.kept import KeptExecutor
-from hvdc_ident.study.quiescent_levels import rest_levels
+from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
 from hvdc_ident.study.store import Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
@@ -108,7 +108,7 @@ def _rest_of(study: Study, options: StageOptions) -> Rest:
 
     @cache
     def rest() -> list[dict[str, Any]]:
-        found = rest_levels(study)
+        found = quiescent_levels(study)
         options.announce(found.lines)
         return found.to_list()
 

@@ -38,7 +38,7 @@ from hvdc_ident.study.level_comparison import (
     NONE,
     Comparison,
     Conversion,
-    Record,
+    RecordedOutput,
     apart,
     conversions,
     freed,
@@ -60,7 +60,7 @@ FALSE_ALARMS = 1e-3
 
 
 @dataclass(frozen=True)
-class RestLevel:
+class QuiescentLevel:
     """One output of one experiment before the event, in the output's unit; None where it is not known.
 
     recorded: the mean of the recorded rows before the event; error: its standard error. model: the model's at its given
@@ -88,17 +88,17 @@ class RestLevel:
 
 
 @dataclass(frozen=True)
-class RestLevels:
+class QuiescentLevels:
     """The comparison of every recording with the model. remarks: what could not be compared, and why."""
 
-    levels: tuple[RestLevel, ...]
+    levels: tuple[QuiescentLevel, ...]
     remarks: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
 
     @property
     def lines(self) -> list[str]:
         """Sentences to be read before anything is fitted; what several experiments show alike is told once."""
-        groups: dict[tuple[str, str | None, str], list[RestLevel]] = {}
+        groups: dict[tuple[str, str | None, str], list[QuiescentLevel]] = {}
         for level in self.levels:
             if level.text:
                 named = level.suggestion if level.suggestion not in PLAIN else ""
@@ -111,31 +111,33 @@ class RestLevels:
         return [*(asdict(level) for level in self.levels), *failed]
 
 
-def _line(alike: Sequence[RestLevel]) -> str:
+def _line(alike: Sequence[QuiescentLevel]) -> str:
     first = max(alike, key=lambda level: abs(level.noise_units or 0.0))
     others = list(dict.fromkeys(level.experiment for level in alike if level.experiment != first.experiment))
     shown = listed(others[:3]) if len(others) <= 3 else f"{len(others)} more experiments"
     return f"{first.experiment}: {first.text}" + (f" (and so in {shown})" if others else "")
 
 
-def rest_levels(study: Study) -> RestLevels:
+def quiescent_levels(study: Study) -> QuiescentLevels:
     """The comparison for a study at its given values."""
-    return compare_rest(study.model, study.experiments, tuple(study.candidates.values()))
+    return compare_levels(study.model, study.experiments, tuple(study.candidates.values()))
 
 
-def compare_rest(model: AnyModel, experiments: Sequence[Experiment], candidates: Sequence[Free] = ()) -> RestLevels:
+def compare_levels(
+    model: AnyModel, experiments: Sequence[Experiment], candidates: Sequence[Free] = ()
+) -> QuiescentLevels:
     """The recorded levels and movements of every experiment against the model's, at the model's own values.
 
     candidates: what may be estimated; what they can move within their bounds is no evidence against a recording. Runs
     every experiment once, and where a recording differs some more times.
     """
     simulator = ModelSimulator(model)
-    levels: dict[tuple[str, str], RestLevel] = {}
+    levels: dict[tuple[str, str], QuiescentLevel] = {}
     remarks: list[str] = []
     failures: list[str] = []
     comparisons: list[Comparison] = []
     for e in (e for e in experiments if e.outputs):
-        records = [Record.of(e, o, model.outputs[o].unit, experiments) for o in e.outputs]
+        records = [RecordedOutput.of(e, o, model.outputs[o].unit, experiments) for o in e.outputs]
         levels |= {(e.name, r.output): _recorded(r) for r in records}
         if not records[0].before.any():
             when = "its event is not known" if e.event is None else "no row stands before its event"
@@ -147,7 +149,7 @@ def compare_rest(model: AnyModel, experiments: Sequence[Experiment], candidates:
             continue
         comparisons += [Comparison.of(r, run[r.output]) for r in records]
     if not comparisons:
-        return RestLevels(tuple(levels.values()), tuple(remarks), tuple(failures))
+        return QuiescentLevels(tuple(levels.values()), tuple(remarks), tuple(failures))
     sure = float(norm.isf(FALSE_ALARMS / 2.0 / len(comparisons)))
     by_experiment = {e.name: e for e in experiments}
     doubted = {c.record.experiment for c in comparisons if c.differs(sure) or c.is_moved_otherwise(sure)}
@@ -157,7 +159,7 @@ def compare_rest(model: AnyModel, experiments: Sequence[Experiment], candidates:
         judged += freed(simulator, by_experiment[name], candidates, own) if name in doubted else own
     for level in _judged(simulator, by_experiment, candidates, judged, sure):
         levels[level.experiment, level.output] = level
-    return RestLevels(tuple(levels.values()), tuple(remarks), tuple(failures))
+    return QuiescentLevels(tuple(levels.values()), tuple(remarks), tuple(failures))
 
 
 def _judged(
@@ -166,7 +168,7 @@ def _judged(
     candidates: Sequence[Free],
     comparisons: Sequence[Comparison],
     sure: float,
-) -> list[RestLevel]:
+) -> list[QuiescentLevel]:
     """Every level with what it suggests."""
     model = simulator.model
     named: dict[int, tuple[Conversion, float]] = {}
@@ -226,7 +228,7 @@ def _free_factor(c: Comparison) -> list[Conversion]:
     return [replace(chosen, name=name, prior=prior, gain=True)]
 
 
-def _told(c: Comparison, conversion: Conversion | None, cause: Cause | None, sure: float) -> RestLevel:
+def _told(c: Comparison, conversion: Conversion | None, cause: Cause | None, sure: float) -> QuiescentLevel:
     """The level with what is said of it: the conversion, the common cause, or the plain difference."""
     first = c.movements[0] if c.movements else None
     level = replace(_recorded(c.record), slope=first.slope if first else None)
@@ -270,10 +272,10 @@ def _reading(c: Comparison, conversion: Conversion) -> str:
     return f"{o} moves {slope:.3g} times as far as the model does"
 
 
-def _recorded(record: Record) -> RestLevel:
+def _recorded(record: RecordedOutput) -> QuiescentLevel:
     """Return the levels as far as they are known without the model."""
     mean = float(record.values[record.before].mean()) if record.before.any() else None
-    return RestLevel(record.experiment, record.output, record.unit, recorded=mean)
+    return QuiescentLevel(record.experiment, record.output, record.unit, recorded=mean)
 
 
 def _digits(value: float, difference: float) -> int:

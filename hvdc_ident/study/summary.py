@@ -1,4 +1,4 @@
-"""What `check` tells about a study: what it found, and whether recordings and model begin at the same levels."""
+"""The summary of a study that `check` prints: what it holds, and whether recordings and model begin at the same levels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.linear_analysis import described
 from hvdc_ident.study.pipeline import heading_of
-from hvdc_ident.study.quiescent_levels import rest_levels
+from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.recordings import noise_line
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
@@ -19,75 +19,67 @@ from hvdc_ident.study.study import Study, candidate_lines
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What `check` found. data: as `check --json` prints it."""
+    """A study in numbers and lines. data: as `check --json` prints it."""
 
     data: Mapping[str, Any]
 
+    @classmethod
+    def of(cls, study: Study, seed: int = 0) -> Summary:
+        """Return the summary of a study. The model is run, for its levels before each event against the recorded ones."""
+        model, levels = study.model, quiescent_levels(study)
+        sizes = {n: len(getattr(model, n)) for n in ("states", "parameters", "inputs", "outputs")}
+        return cls(
+            {
+                **heading_of(study, seed),
+                "sizes": sizes,
+                "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
+                "experiments": {e.name: _experiment(e, study) for e in study.experiments},
+                "steady_state": steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages())),
+                "responses": {r.name: described(r) for r in study.responses},
+                "stages": [s.name for s in stages() if s.wanted(study)],
+                "rest_levels": levels.to_list(),
+                "rest_lines": [*levels.lines, *levels.remarks],
+            }
+        )
+
     def to_dict(self) -> dict[str, Any]:
-        """Return the findings as JSON has them."""
+        """Return the summary as JSON has it."""
         return dict(self.data)
 
     def __str__(self) -> str:
-        return summary_text(self.to_dict())
+        found = self.data
+        sizes = ", ".join(f"{n} {k}" for k, n in found["sizes"].items())
+        lines = [f"study {found['study']}: good", f"model {found['model']}: {sizes}"]
+        for name, c in found["candidates"].items():
+            unit = f" {c['unit']}" if c["unit"] else ""
+            given = f"given {c['given']:g}{unit} ({c['given_by']})"
+            lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}; {given}")
+        for name, e in found["experiments"].items():
+            event = f"event at {e['event']:g} s" if e["event"] is not None else "no event"
+            noise = ", ".join(_noise(o, n) for o, n in e["noise"].items())
+            start, end = e["time"]
+            lines.append(
+                f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
+            )
+            lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
+        lines += found["rest_lines"]
+        lines += [f"steady state, {line}" for line in found["steady_state"]]
+        for name, r in found["responses"].items():
+            low, high = r["band_hz"]
+            share, source = r["relative_noise"], r["noise_source"]
+            noise = "not given" if share is None else f"{100 * share:.3g} % ({source})"
+            unit = f" in {r['unit']}" if r["unit"] else ""
+            lines.append(
+                f"response {name} ({r['role']}): {r['kind']}{unit}, {', '.join(r['channels'])}; {r['points']} "
+                f"frequencies, {low:.4g} to {high:.4g} Hz; noise {noise}"
+            )
+        lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
+        return "\n".join(lines)
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"
-
-
-def summary(study: Study, seed: int = 0) -> dict[str, Any]:
-    """The study in numbers: model, candidates, experiments with rows, event and noise, the stages it asks for, and the
-    recorded rest against the model's, for which the model is run."""
-    model, rest = study.model, rest_levels(study)
-    return {
-        **heading_of(study, seed),
-        "sizes": {
-            "states": len(model.states),
-            "parameters": len(model.parameters),
-            "inputs": len(model.inputs),
-            "outputs": len(model.outputs),
-        },
-        "candidates": {n: {**c, "given_by": _given_by(study, n)} for n, c in candidate_lines(study).items()},
-        "experiments": {e.name: _experiment(e, study) for e in study.experiments},
-        "steady_state": steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages())),
-        "responses": {r.name: described(r) for r in study.responses},
-        "stages": [s.name for s in stages() if s.wanted(study)],
-        "rest_levels": rest.to_list(),
-        "rest_lines": [*rest.lines, *rest.remarks],
-    }
-
-
-def summary_text(found: dict[str, Any]) -> str:
-    """The same for people, in a few lines."""
-    sizes = ", ".join(f"{n} {k}" for k, n in found["sizes"].items())
-    lines = [f"study {found['study']}: good", f"model {found['model']}: {sizes}"]
-    for name, c in found["candidates"].items():
-        unit = f" {c['unit']}" if c["unit"] else ""
-        given = f"given {c['given']:g}{unit} ({c['given_by']})"
-        lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}; {given}")
-    for name, e in found["experiments"].items():
-        event = f"event at {e['event']:g} s" if e["event"] is not None else "no event"
-        noise = ", ".join(_noise(o, n) for o, n in e["noise"].items())
-        start, end = e["time"]
-        lines.append(
-            f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
-        )
-        lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
-    lines += found["rest_lines"]
-    lines += [f"steady state, {line}" for line in found["steady_state"]]
-    for name, r in found["responses"].items():
-        low, high = r["band_hz"]
-        noise = (
-            "not given" if r["relative_noise"] is None else f"{100 * r['relative_noise']:.3g} % ({r['noise_source']})"
-        )
-        unit = f" in {r['unit']}" if r["unit"] else ""
-        lines.append(
-            f"response {name} ({r['role']}): {r['kind']}{unit}, {', '.join(r['channels'])}; {r['points']} frequencies, "
-            f"{low:.4g} to {high:.4g} Hz; noise {noise}"
-        )
-    lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
-    return "\n".join(lines)
 
 
 def _noise(output: str, note: dict[str, Any]) -> str:

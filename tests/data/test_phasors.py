@@ -19,7 +19,7 @@ from hvdc_ident.data.three_phase import (
 from hvdc_ident.errors import InputError, UnknownNameError, WaveformError
 from hvdc_ident.formats import write_csv
 from hvdc_ident.study.study import load_study
-from hvdc_ident.study.summary import summary, summary_text
+from hvdc_ident.study.summary import Summary
 
 TIME = np.arange(101) * 0.02
 VOLTAGE, CURRENT = PhasorColumns(("U",), ("U ang",)), PhasorColumns(("I",), ("I ang",))
@@ -174,8 +174,8 @@ def test_a_study_plays_phasors_in(tmp_path: Path) -> None:
     np.testing.assert_allclose(e.inputs["f"](TIME), 50.1, rtol=1e-9)
     assert e.measured is not None
     np.testing.assert_allclose(e.measured["P"], 600.0, rtol=1e-9)
-    assert "F1: mean frequency over the last 0.2 s, from the angle; noise of 1 deg in it is 0.0196 Hz" in summary_text(
-        summary(study)
+    assert "F1: mean frequency over the last 0.2 s, from the angle; noise of 1 deg in it is 0.0196 Hz" in str(
+        Summary.of(study)
     )
     (tmp_path / "s.toml").write_text(STUDY.replace('angle = "U ang"', 'angle = ["U ang", "I ang"]'))
     with pytest.raises(InputError, match="one column's name, or a list of three"):

@@ -11,7 +11,7 @@ from hvdc_ident.data import conversion, same_unit
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.study import recordings
 from hvdc_ident.study.study import Study, load_study
-from hvdc_ident.study.summary import summary, summary_text
+from hvdc_ident.study.summary import Summary
 
 TIME = np.arange(101) * 0.01
 
@@ -108,7 +108,7 @@ def test_without_quiet_rows_before_an_event_the_noise_is_left_to_the_residual(tm
     for place in ("event = 0.0", "event = 0.05"):
         study = loaded(tmp_path, place, Irorder2=noisy)
         assert study.noise["d"]["Irorder2"].source == "residual" and not study.experiments[0].noise
-        assert "from the residual of the fit" in summary_text(summary(study))
+        assert "from the residual of the fit" in str(Summary.of(study))
 
 
 def test_drive_instrument_interpolation_and_role(tmp_path: Path) -> None:

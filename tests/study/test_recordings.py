@@ -18,7 +18,7 @@ from hvdc_ident.simulate.model_simulator import ModelSimulator
 from hvdc_ident.study.pipeline import run_stage
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
-from hvdc_ident.study.summary import summary, summary_text
+from hvdc_ident.study.summary import Summary
 
 CARD = """schema = 1
 name = "motor"
@@ -80,7 +80,7 @@ def fitted(study: Study) -> FitResult:
 
 
 def told(study: Study) -> str:
-    return summary_text(summary(study))
+    return str(Summary.of(study))
 
 
 def test_gaps_of_outputs_are_not_compared_and_said(tmp_path: Path) -> None:

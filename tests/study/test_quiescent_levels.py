@@ -15,7 +15,7 @@ from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajecto
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.level_comparison import conversions
-from hvdc_ident.study.quiescent_levels import RestLevels, compare_rest
+from hvdc_ident.study.quiescent_levels import QuiescentLevels, compare_levels
 
 CARD = """schema = 1
 name = "lag"
@@ -67,14 +67,14 @@ def record(
     )
 
 
-def only(found: RestLevels) -> str:
+def only(found: QuiescentLevels) -> str:
     (line,) = found.lines
     return line
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_nothing_is_said_where_nothing_is_wrong(tmp_path: Path, seed: int) -> None:
-    found = compare_rest(card(tmp_path), [record(seed=seed), record(seed=seed + 100, name="b")], CANDIDATES)
+    found = compare_levels(card(tmp_path), [record(seed=seed), record(seed=seed + 100, name="b")], CANDIDATES)
     assert found.lines == [] and found.remarks == ()
     level = found.levels[0]
     assert level.recorded == pytest.approx(1.02, abs=5e-4) and level.model == pytest.approx(1.02, abs=1e-9)
@@ -99,7 +99,7 @@ def test_nothing_is_said_where_nothing_is_wrong(tmp_path: Path, seed: int) -> No
     ],
 )
 def test_a_factor_is_named_by_what_it_is(tmp_path: Path, unit: str, factor: float, words: str) -> None:
-    found = compare_rest(
+    found = compare_levels(
         card(tmp_path, unit), [record(factor), record(factor, levels=(0.9, 0.7), name="b")], CANDIDATES
     )
     assert words in only(found)
@@ -109,13 +109,13 @@ def test_a_factor_is_named_by_what_it_is(tmp_path: Path, unit: str, factor: floa
 
 
 def test_a_base_of_no_known_factor_scales_level_and_movement(tmp_path: Path) -> None:
-    found = compare_rest(card(tmp_path), [record(5.54)], CANDIDATES)
+    found = compare_levels(card(tmp_path), [record(5.54)], CANDIDATES)
     assert "a factor of 5.5" in only(found) and "level and movement" in only(found)
     assert found.levels[0].factor == pytest.approx(5.54, rel=2e-3)
 
 
 def test_an_offset_moves_the_level_and_not_the_movement(tmp_path: Path) -> None:
-    found = compare_rest(card(tmp_path), [record(shift=0.05)], CANDIDATES)
+    found = compare_levels(card(tmp_path), [record(shift=0.05)], CANDIDATES)
     assert "offset" in only(found) and found.levels[0].suggestion == "offset"
     assert found.levels[0].difference == pytest.approx(0.05, abs=5e-4)
     assert found.levels[0].noise_units == pytest.approx(50.0, rel=0.02)
@@ -123,12 +123,12 @@ def test_an_offset_moves_the_level_and_not_the_movement(tmp_path: Path) -> None:
 
 
 def test_degrees_celsius_are_an_offset_with_a_name(tmp_path: Path) -> None:
-    found = compare_rest(card(tmp_path, "K"), [record(1.0, -273.15, levels=(300.0, 310.0))], CANDIDATES)
+    found = compare_levels(card(tmp_path, "K"), [record(1.0, -273.15, levels=(300.0, 310.0))], CANDIDATES)
     assert "in degC?" in only(found)
 
 
 def test_where_the_level_is_0_the_movement_tells(tmp_path: Path) -> None:
-    found = compare_rest(card(tmp_path, zero=1.02), [record(-1.0, zero=1.02)], CANDIDATES)
+    found = compare_levels(card(tmp_path, zero=1.02), [record(-1.0, zero=1.02)], CANDIDATES)
     assert "y moves -" in only(found) and only(found).endswith("sign?")
     assert found.levels[0].model == pytest.approx(0.0, abs=1e-9)
 
@@ -136,15 +136,15 @@ def test_where_the_level_is_0_the_movement_tells(tmp_path: Path) -> None:
 def test_what_a_candidate_can_make_good_is_no_evidence(tmp_path: Path) -> None:
     gain = (*CANDIDATES, Free("k", 1.0, 0.5, 3000.0))
     model = card(tmp_path, "MW")
-    assert compare_rest(model, [record(1e3)], gain).lines == []
-    assert compare_rest(model, [record(1.4)], gain).lines == []
-    assert "sign?" in only(compare_rest(model, [record(-1.0)], gain))  # no bound of k reaches that
-    level = compare_rest(model, [record(1e3)], gain).levels[0]
+    assert compare_levels(model, [record(1e3)], gain).lines == []
+    assert compare_levels(model, [record(1.4)], gain).lines == []
+    assert "sign?" in only(compare_levels(model, [record(-1.0)], gain))  # no bound of k reaches that
+    level = compare_levels(model, [record(1e3)], gain).levels[0]
     assert level.low == pytest.approx(0.5 * 1.02) and level.high == pytest.approx(3000 * 1.02)
 
 
 def test_an_input_in_per_cent_is_told_of_the_input(tmp_path: Path) -> None:
-    found = compare_rest(card(tmp_path), [record(units=100.0)], CANDIDATES)
+    found = compare_levels(card(tmp_path), [record(units=100.0)], CANDIDATES)
     assert "input u reads 102 before the event, the model's value is 1.02: in per cent?" in only(found)
     assert found.levels[0].channel == "input u"
 
@@ -152,11 +152,11 @@ def test_an_input_in_per_cent_is_told_of_the_input(tmp_path: Path) -> None:
 def test_another_operating_point_is_no_mistake(tmp_path: Path) -> None:
     model = card(tmp_path)
     for levels in ((0.0102, 0.02), (102.0, 110.0), (-1.02, -1.1)):  # the record follows the input as it stands
-        assert compare_rest(model, [record(levels=levels)], CANDIDATES).lines == []
+        assert compare_levels(model, [record(levels=levels)], CANDIDATES).lines == []
 
 
 def test_a_time_in_ms_is_told(tmp_path: Path) -> None:
-    found = compare_rest(card(tmp_path), [record(seconds=1e3)], CANDIDATES)
+    found = compare_levels(card(tmp_path), [record(seconds=1e3)], CANDIDATES)
     assert "is the time in ms?" in only(found) and found.levels[0].channel == "time"
 
 
@@ -165,15 +165,15 @@ def test_a_slow_record_of_a_fast_model_is_no_mistake(tmp_path: Path) -> None:
     u = InputSignal.step(3000.0, 1.02, 1.1)
     y = response(1.02, 1.1, time, event=3000.0) + 1e-3 * np.random.default_rng(0).standard_normal(time.size)
     e = experiment("slow", time, {"u": u}, measured=trajectory(time, {"y": y}), noise={"y": 1e-3}, event=3000.0)
-    assert compare_rest(card(tmp_path), [e], CANDIDATES).lines == []
+    assert compare_levels(card(tmp_path), [e], CANDIDATES).lines == []
 
 
 def test_a_record_without_rows_before_its_event_says_so(tmp_path: Path) -> None:
     e = record().with_(event=0.0)
-    found = compare_rest(card(tmp_path), [e], CANDIDATES)
+    found = compare_levels(card(tmp_path), [e], CANDIDATES)
     assert found.lines == [] and "no row stands before its event" in found.remarks[0]
     assert found.levels[0].recorded is None
-    free = compare_rest(card(tmp_path), [e.with_(event=None)], CANDIDATES)
+    free = compare_levels(card(tmp_path), [e.with_(event=None)], CANDIDATES)
     assert "its event is not known" in free.remarks[0]
 
 
@@ -181,9 +181,9 @@ def test_rows_that_are_not_recorded_are_left_out(tmp_path: Path) -> None:
     e = record(-1.0)
     assert e.measured is not None
     y = np.where(np.arange(TIME.size) % 3 == 0, np.nan, e.measured["y"])
-    assert "sign?" in only(compare_rest(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES))
+    assert "sign?" in only(compare_levels(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES))
     nothing = e.with_(measured=trajectory(TIME, {"y": np.full(TIME.size, np.nan)}))
-    assert compare_rest(card(tmp_path), [nothing], CANDIDATES).lines == []
+    assert compare_levels(card(tmp_path), [nothing], CANDIDATES).lines == []
 
 
 def test_a_model_without_a_rest_is_reported_with_its_reason(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_model_without_a_rest_is_reported_with_its_reason(tmp_path: Path) -> N
         'schema = 1\nname = "m"\n[inputs]\nu = {value = 1.0}\n'
         '[states]\nx = {derivative = "u + x**2 + 1"}\n[outputs]\ny = "x"\n'
     )
-    found = compare_rest(load_model(tmp_path / "m.toml"), [record()], ())
+    found = compare_levels(load_model(tmp_path / "m.toml"), [record()], ())
     assert "not compared with the model's rest" in only(found) and "no steady state was found" in only(found)
     assert found.levels[0].model is None and found.levels[0].recorded == pytest.approx(1.02, abs=5e-4)
 
@@ -207,15 +207,15 @@ def test_coloured_noise_alone_is_no_difference(tmp_path: Path) -> None:
         e = record(noise=0.0)
         y = response(1.02, 1.1) + noise
         told += len(
-            compare_rest(model, [e.with_(measured=trajectory(TIME, {"y": y}), noise=FrozenMap({"y": 1e-3}))]).lines
+            compare_levels(model, [e.with_(measured=trajectory(TIME, {"y": y}), noise=FrozenMap({"y": 1e-3}))]).lines
         )
     assert told == 0
 
 
 def test_a_record_without_noise_is_judged_by_the_misfit(tmp_path: Path) -> None:
     model = card(tmp_path)
-    assert compare_rest(model, [record(noise=0.0)], CANDIDATES).lines == []
-    assert "sign?" in only(compare_rest(model, [record(-1.0, noise=0.0)], CANDIDATES))
+    assert compare_levels(model, [record(noise=0.0)], CANDIDATES).lines == []
+    assert "sign?" in only(compare_levels(model, [record(-1.0, noise=0.0)], CANDIDATES))
 
 
 def test_priors_of_the_conversions_add_up() -> None:
@@ -282,7 +282,7 @@ z = "5 - k*x"
 """
 
 
-def two(folder: Path, first: str, second: str, slope: float = 3.0) -> RestLevels:
+def two(folder: Path, first: str, second: str, slope: float = 3.0) -> QuiescentLevels:
     """The comparison for a plant of y = x, z = 5 - slope x, its columns recorded under the names `first` and `second`."""
     (folder / "two.toml").write_text(TWO)
     random = np.random.default_rng(5)
@@ -291,7 +291,7 @@ def two(folder: Path, first: str, second: str, slope: float = 3.0) -> RestLevels
     u = {"u": InputSignal.step(1.0, 1.02, 1.1)}
     std = FrozenMap({"y": 1e-3, "z": 1e-3})
     seen = trajectory(TIME, {first: y, second: z})
-    return compare_rest(
+    return compare_levels(
         load_model(folder / "two.toml"), (experiment("step", TIME, u, measured=seen, noise=std, event=1.0),), CANDIDATES
     )
 
