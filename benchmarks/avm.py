@@ -14,8 +14,7 @@ import numpy as np
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.engine import Engine
+from hvdc_ident.simulate import Engine, simulate
 
 GAINS = ("KPVDC", "KIVDC", "KPP", "KIP", "KPQ", "KIQ", "KPQ2", "KIQ2")
 NAMES = ("vsc-hvdc-avm", "vsc-hvdc-avm-unfiltered", "vsc-hvdc-avm-authors")

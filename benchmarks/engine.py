@@ -23,9 +23,7 @@ from numba import njit
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate.call import call
-from hvdc_ident.simulate.engine import Tolerance, engine, simulate
-from hvdc_ident.simulate.structure import NAMES
+from hvdc_ident.simulate import NAMES, Tolerance, call, engine_of, simulate
 
 GAINS = ("KPVDC", "KIVDC", "KPP", "KIP", "KPQ", "KIQ", "KPQ2", "KIQ2")
 STEPS = {"Vdcref1": (0.1, 1.0, 1.019), "Pref2": (0.5, 0.4, 0.5), "Qref1": (0.9, 0.0, 0.1)}
@@ -69,7 +67,7 @@ def floor(model, sensitivities, statistics):
 
     A generated solve is the stage's whole linear system: sums, second derivatives and substitution.
     """
-    code = engine(model, sensitivities)
+    code = engine_of(model, sensitivities)
     rhs = cost(code, "fs" if sensitivities else "f")
     if statistics.method == "explicit":
         return (statistics.accepted * 6 * rhs,) * 2
@@ -88,7 +86,7 @@ def casadi_run(model, sensitivities, rtol):
     """A function that runs CasADi's cvodes or idas on the same equations from the same start, and its last output."""
     import casadi as ca
 
-    code = engine(model, ())
+    code = engine_of(model, ())
     s = code.structure
     values = {n: ca.SX.sym(n) for n in (*s.states, *s.unknowns, *model.parameters, *model.inputs)}
     rules = {
@@ -97,12 +95,12 @@ def casadi_run(model, sensitivities, rtol):
         "Min": lambda *a: _fold(ca.fmin, a),
         "sqrt": ca.sqrt,
     }
-    from hvdc_ident.simulate.structure import _ordered
+    from hvdc_ident.model import dependency_order
 
     definitions = {n: g.value for n, g in model.signals.items()} | {
         n: model.algebraic[n].equation for n in model.algebraic if n not in s.unknowns
     }
-    for name in _ordered(definitions, model.name):
+    for name in dependency_order(model, definitions):
         values[name] = _casadi(definitions[name], values, rules)
     ode = ca.vertcat(*(_casadi(x.derivative, values, rules) for x in model.states.values()))
     x, p = ca.vertcat(*(values[n] for n in s.states)), ca.vertcat(*(values[n] for n in model.parameters))
@@ -141,12 +139,15 @@ def casadi_run(model, sensitivities, rtol):
                 grid.size,
             )
         )
-    start_rows = engine(model, sensitivities).start(p0, u0)[0] if columns else None
+    start_rows = engine_of(model, sensitivities).start(p0, u0)[0] if columns else None
 
     def run():
         x0, level = y[: len(s.states)], u0.copy()
         z0 = y[len(s.states) :]
-        n, width = len(s.states) + len(s.unknowns), engine(model, sensitivities).structure.sizes.width if columns else 0
+        n, width = (
+            len(s.states) + len(s.unknowns),
+            engine_of(model, sensitivities).structure.sizes.width if columns else 0,
+        )
         fx = start_rows[n:].reshape(n, width)[: len(s.states), : len(columns)] if columns else None
         fp = np.zeros((len(p0) + len(u0), len(columns)))
         for k, c in enumerate(columns):

@@ -23,7 +23,7 @@ from scipy.optimize import fsolve
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import ModelError, SteadyStateError
 from hvdc_ident.model import parse_card
-from hvdc_ident.simulate.steady_state import equilibria
+from hvdc_ident.simulate import equilibria
 
 PARAMETERS = {"H": 4.0, "K": 100.0, "TA": 0.02, "TC": 1.0, "KS": 8.0, "R": 0.05}
 RANGES = {"H": (2, 8), "K": (20, 300), "TA": (0.005, 0.2), "TC": (0.2, 5), "KS": (0, 20), "R": (0.02, 0.1)}

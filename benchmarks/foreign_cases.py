@@ -23,7 +23,7 @@ from fmpy.simulation import instantiate_fmu, simulate_fmu
 
 from hvdc_ident.data import Experiment, InputSignal
 from hvdc_ident.fmu.model import FmuModel, read_fmu
-from hvdc_ident.simulate.engine import Tolerance
+from hvdc_ident.simulate import Tolerance
 
 REAL = ("Real", "Float64", "Float32")
 WHOLE = ("Integer", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64")

@@ -18,7 +18,7 @@ from hvdc_ident.linearize import find_operating_point, linearize, root_locus
 from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.system import CompiledSystem, system
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate.structure import torn
+from hvdc_ident.simulate import torn
 
 
 def best(run: Callable[[], object], repetitions: int) -> float:

@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     from hvdc_ident.models import load_model
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.sensitivity import SweepResult, linear_sensitivities, morris, sobol
-    from hvdc_ident.simulate.result import Simulation
+    from hvdc_ident.simulate import Simulation
     from hvdc_ident.study.study import Study, load_study
 
     __version__: str
@@ -148,11 +148,11 @@ _imported = offered(
         "linearize": "LinearModel MeasuredResponse OperatingPoint Port balanced compare continuation gap h2_norm hinf_norm "
         "linf_norm loop loop_margins margins ncf_margin nu_gap one_sided plant_and_controller point_at port_admittance "
         "port_impedance read_response response_at_tones response_from_record root_locus simulated_response symbolic_transfer",
-        "model.definition": "Model",
+        "model": "Model",
         "models": "load_model",
         "parameters": "Input Parameter",
         "sensitivity": "SweepResult linear_sensitivities morris sobol",
-        "simulate.result": "Simulation",
+        "simulate": "Simulation",
         "study.study": "Study load_study",
     },
 )

@@ -70,7 +70,7 @@ def simulate(
     """
     from hvdc_ident.data import Experiment
     from hvdc_ident.model import Model
-    from hvdc_ident.simulate.engine import simulate as run
+    from hvdc_ident.simulate import simulate as run
 
     plant: Any = model
     experiment, values, columns, rows = data, parameters, sensitivities or (), outputs

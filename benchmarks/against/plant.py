@@ -12,10 +12,7 @@ from numba import njit
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate.call import call
-from hvdc_ident.simulate.engine import engine, simulate
-from hvdc_ident.simulate.model_simulator import ModelSimulator
-from hvdc_ident.simulate.structure import NAMES
+from hvdc_ident.simulate import NAMES, ModelSimulator, call, engine_of, simulate
 
 RTOL = 1e-6
 STEP = (0.1, 1.0, 1.019)
@@ -51,7 +48,7 @@ class Plant:
 
     def __init__(self) -> None:
         self.model = link_bench.smooth(load_model("vsc-hvdc-link"))
-        self.code = engine(self.model, ())
+        self.code = engine_of(self.model, ())
         s = self.code.structure.sizes
         assert s.nz == 0, "a peer could not integrate it"
         self.names = list(self.code.structure.states)

@@ -29,7 +29,7 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Free, Simulator
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 CLOSED = (
     "The model is closed inside: effects were tried at its inputs and outputs only; its signals, states and loops were "

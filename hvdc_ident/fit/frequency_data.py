@@ -14,7 +14,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, State
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 
 def frequency_experiment(response: MeasuredResponse) -> Experiment:

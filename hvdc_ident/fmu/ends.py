@@ -24,10 +24,8 @@ from hvdc_ident.fmu.grid import joined, kept_rows, refined, signal_of
 from hvdc_ident.fmu.passage import ALONG, added, entrance, exit_
 from hvdc_ident.fmu.run import Direction, bare, changed, inputs_of
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.engine import simulate as engine_run
-from hvdc_ident.simulate.recording import chains_of
-from hvdc_ident.simulate.result import Simulation
+from hvdc_ident.simulate import Simulation, Tolerance, chains_of
+from hvdc_ident.simulate import simulate as engine_run
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel

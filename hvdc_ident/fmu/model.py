@@ -23,8 +23,7 @@ from hvdc_ident.fmu.host import Host, Limits
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Output
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.result import Simulation
+from hvdc_ident.simulate import Simulation, Tolerance
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.capabilities import Capabilities

@@ -12,8 +12,7 @@ from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, unknown_name
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.result import Simulation, Statistics
+from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel

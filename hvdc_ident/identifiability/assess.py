@@ -28,7 +28,7 @@ from hvdc_ident.identifiability.structure import structure as structure_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 ENOUGH = 5
 """From so many experiments on they are drawn anew: five give 126 different samples, four only 35."""

@@ -18,7 +18,7 @@ from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structure import Structure
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 
 def identifiability_by_group(

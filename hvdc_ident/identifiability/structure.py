@@ -21,7 +21,7 @@ from hvdc_ident.sensitivity import (
     identifiable_subset,
     structural_identifiability,
 )
-from hvdc_ident.simulate.structure import Structure as Equations
+from hvdc_ident.simulate import ModelEquations as Equations
 
 SECONDS = 10.0
 """How long the symbolic test may compute; the shipped link takes 3."""

@@ -11,7 +11,7 @@ import sympy as sp
 from numpy.typing import NDArray
 
 from hvdc_ident.expression import symbol, to_text
-from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.simulate import ModelEquations
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Limit:
         }
 
 
-def conditions(structure: Structure) -> tuple[Condition, ...]:
+def conditions(structure: ModelEquations) -> tuple[Condition, ...]:
     """Return the meaning of every switch of a structure, in the order of the switches; made before its code is compiled."""
     g = structure.graph
     memo: dict[sp.Basic, int] = {}
@@ -108,7 +108,7 @@ def _text(e: Any) -> str:
 
 
 def _extremum(
-    e: sp.Expr, name: str, structure: Structure, limiters: frozenset[sp.Basic], node: Node, note: Note
+    e: sp.Expr, name: str, structure: ModelEquations, limiters: frozenset[sp.Basic], node: Node, note: Note
 ) -> None:
     """Note the pairwise comparisons of a min or max; a min with a max inside (or the reverse) is a limiter's two ends.
 
@@ -144,7 +144,7 @@ def _limiters(definition: sp.Basic) -> frozenset[sp.Basic]:
     return frozenset(found)
 
 
-def _definitions(structure: Structure) -> dict[str, sp.Basic]:
+def _definitions(structure: ModelEquations) -> dict[str, sp.Basic]:
     m = structure.model
     found: dict[str, sp.Basic] = {n: s.value for n, s in m.signals.items()}
     found |= {n: a.equation for n, a in m.algebraic.items()}
@@ -155,7 +155,7 @@ def _definitions(structure: Structure) -> dict[str, sp.Basic]:
     return found
 
 
-def limits(structure: Structure, known: tuple[Condition, ...], values: NDArray[np.float64]) -> tuple[Limit, ...]:
+def limits(structure: ModelEquations, known: tuple[Condition, ...], values: NDArray[np.float64]) -> tuple[Limit, ...]:
     """Return every limiter that matters at a point, with its margin, from the switches' values.
 
     A limiter inside a branch that another condition has switched off does not matter and is left out; conditions that
@@ -171,22 +171,24 @@ def limits(structure: Structure, known: tuple[Condition, ...], values: NDArray[n
     return tuple(found)
 
 
-def structure_roots(structure: Structure) -> list[int]:
+def structure_roots(structure: ModelEquations) -> list[int]:
     """The nodes whose values the model shows or integrates."""
     return [*structure.rhs, *structure.sources, *structure.observed]
 
 
-def in_use(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
+def in_use(structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
     """The switches that decide a branch which the roots' values come from; negative: the switches' modes."""
     return _walk(structure, roots, negative)[1]
 
 
-def nodes_in_use(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
+def nodes_in_use(structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
     """The nodes which the roots' values come from, branches that are switched off left out."""
     return _walk(structure, roots, negative)[0]
 
 
-def _walk(structure: Structure, roots: list[int], negative: NDArray[np.bool_]) -> tuple[frozenset[int], frozenset[int]]:
+def _walk(
+    structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]
+) -> tuple[frozenset[int], frozenset[int]]:
     """(nodes, switches) in use."""
     nodes = structure.graph.nodes
     used: set[int] = set()

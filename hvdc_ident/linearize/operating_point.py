@@ -17,7 +17,7 @@ from hvdc_ident.linearize.equilibrium import ACCURACY, At, EquilibriumSearch, Ro
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting
+from hvdc_ident.simulate import Equilibria, equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]
@@ -193,7 +193,7 @@ def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
             got=e.got,
             hint=f"{e.hint}; states that need not rest can be named in `moving`",
         ) from None
-    v = at.unknowns(found)
+    v = found.v
     with np.errstate(all="ignore"):
         r, jac = search.equations(v)
         shares = np.abs(r) / weights(jac, v)
@@ -205,7 +205,7 @@ def _own(model: Model, search: EquilibriumSearch) -> Array | None:
     free = model if search.at == "start" else resting(model)
     at = equilibria(free)
     try:
-        return at.unknowns(at.start(free, search.p, search.u, search.time))
+        return at.start(free, search.p, search.u, search.time).v
     except SteadyStateError:
         return None
 
@@ -361,7 +361,7 @@ def _notes(point: OperatingPoint) -> tuple[str, ...]:
             "Followed from the model's own values, its steady state ends at a jump before these: this one is from a new search."
         )
     if point.branch == "other":
-        own = at.unknowns(at.start(model, point.p, point.w[1 : 1 + len(point.inputs)], point.time))
+        own = at.start(model, point.p, point.w[1 : 1 + len(point.inputs)], point.time).v
         found.append(f"This is not the model's own steady state, which stands at {at.text(own)}.")
     far = at.far(v)
     if far:
@@ -411,7 +411,7 @@ def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
     u = point.w[1 : 1 + len(point.inputs)]
     others = at.neighbours(point.p, u, point.time, v, direction)
     with suppress(SteadyStateError):  # then the guesses offer none
-        others.append(at.unknowns(at.search(point.p, u, point.time)))
+        others.append(at.search(point.p, u, point.time).v)
     stable = [
         x for x in others if not np.allclose(x, v, rtol=1e-6, atol=1e-6) and _stable(point, *_split(at, point, x))
     ]

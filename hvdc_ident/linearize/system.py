@@ -18,10 +18,7 @@ from hvdc_ident.errors import ModelError
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.model import Model
-from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.kept import by_structure
-from hvdc_ident.simulate.machine import Code, Function
-from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.simulate import Code, Function, Graph, ModelEquations, by_structure
 
 Array = NDArray[Any]
 
@@ -129,7 +126,7 @@ class CompiledSystem:
     """Compiled values and derivatives of one model structure for one list of outputs; reusable for any values."""
 
     def __init__(self, model: Model, outputs: Sequence[str]) -> None:
-        self.structure = s = Structure(model, (), outputs)
+        self.structure = s = ModelEquations(model, (), outputs)
         g, m = s.graph, model
         self.outputs = s.outputs
         self.states, self.unknowns = s.states, s.unknowns

@@ -1,7 +1,7 @@
 """Models, their text form, and models made from models."""
 
 from hvdc_ident.model.card import parse_card, read_card, save_card, write_card
-from hvdc_ident.model.check import coerced, ordered_signals
+from hvdc_ident.model.check import coerced, dependency_order, ordered_signals
 from hvdc_ident.model.definition import (
     Algebraic,
     AnyModel,
@@ -32,6 +32,7 @@ __all__ = [
     "State",
     "blended",
     "coerced",
+    "dependency_order",
     "driven",
     "fresh",
     "insertion_point",

@@ -346,12 +346,16 @@ def _check_parameterisation(model: Model, name: str, parameterisation: Parameter
 
 
 def ordered_signals(model: Model) -> tuple[str, ...]:
-    """The names of the signals, each after the signals it uses, otherwise as they were defined.
+    """Return the names of the signals, each after the signals it uses, otherwise as they were defined.
 
     Raises ModelError with the circle where signals use each other in one.
     """
-    signals = model.signals
-    uses = {n: [s for s in sorted(_used(signal.value)) if s in signals] for n, signal in signals.items()}
+    return dependency_order(model, {n: s.value for n, s in model.signals.items()})
+
+
+def dependency_order(model: Model, definitions: Mapping[str, sp.Expr]) -> tuple[str, ...]:
+    """Return the defined names of a model, each after those it uses, else in their order. Raises ModelError with a circle."""
+    uses = {n: [s for s in sorted(_used(e)) if s in definitions] for n, e in definitions.items()}
     order: list[str] = []
     done: set[str] = set()
     for first in uses:

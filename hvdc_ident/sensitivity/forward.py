@@ -16,7 +16,7 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import LinearizationError, StudyError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
-from hvdc_ident.simulate.engine import simulate
+from hvdc_ident.simulate import simulate
 
 if TYPE_CHECKING:
     import xarray

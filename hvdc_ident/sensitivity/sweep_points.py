@@ -24,7 +24,7 @@ from hvdc_ident.errors import (
 )
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate.engine import Method, simulate
+from hvdc_ident.simulate import Method, simulate
 
 MOST = 10_000_000
 

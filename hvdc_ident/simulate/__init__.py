@@ -5,9 +5,57 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
-    from hvdc_ident.simulate.engine import Engine, Tolerance, simulate
-    from hvdc_ident.simulate.result import Simulation, Statistics
+    from hvdc_ident.simulate.codegen import NAMES, Elimination, Function
+    from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
+    from hvdc_ident.simulate.equations import ACCURACY, ModelEquations, by_structure, torn
+    from hvdc_ident.simulate.graph import Graph
+    from hvdc_ident.simulate.native import call, lu, solve
+    from hvdc_ident.simulate.object_code import Code, evaluate
+    from hvdc_ident.simulate.run import ModelSimulator, chains_of, simulate, with_recording
+    from hvdc_ident.simulate.simulation import Simulation, Statistics
+    from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting, with_guesses
 else:
-    __getattr__ = offered(__name__, {"engine": "Engine Tolerance simulate", "result": "Simulation Statistics"})
+    __getattr__ = offered(
+        __name__,
+        {
+            "codegen": "NAMES Elimination Function",
+            "engine": "Engine Method Tolerance engine_of",
+            "equations": "ACCURACY ModelEquations by_structure torn",
+            "graph": "Graph",
+            "native": "call lu solve",
+            "object_code": "Code evaluate",
+            "run": "ModelSimulator chains_of simulate with_recording",
+            "simulation": "Simulation Statistics",
+            "steady_state": "Equilibria equilibria resting with_guesses",
+        },
+    )
 
-__all__ = ["Engine", "Simulation", "Statistics", "Tolerance", "simulate"]
+__all__ = [
+    "ACCURACY",
+    "NAMES",
+    "Code",
+    "Elimination",
+    "Engine",
+    "Equilibria",
+    "Function",
+    "Graph",
+    "Method",
+    "ModelEquations",
+    "ModelSimulator",
+    "Simulation",
+    "Statistics",
+    "Tolerance",
+    "by_structure",
+    "call",
+    "chains_of",
+    "engine_of",
+    "equilibria",
+    "evaluate",
+    "lu",
+    "resting",
+    "simulate",
+    "solve",
+    "torn",
+    "with_guesses",
+    "with_recording",
+]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -11,18 +10,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
-from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate.integrators import integrators
-from hvdc_ident.simulate.kept import by_structure
-from hvdc_ident.simulate.machine import Code, evaluate
-from hvdc_ident.simulate.result import Simulation, Statistics
-from hvdc_ident.simulate.status import HINTS
-from hvdc_ident.simulate.status import NAMES as STATUS
+from hvdc_ident.data import Array, InputSignal
+from hvdc_ident.errors import ModelError, SimulationError
+from hvdc_ident.model import Model
+from hvdc_ident.simulate.codegen import NAMES
+from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
+from hvdc_ident.simulate.object_code import Code, entry, evaluate
+from hvdc_ident.simulate.run_state import COUNTED, RUN, place
+from hvdc_ident.simulate.simulation import HINTS, STATUSES, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
-from hvdc_ident.simulate.structure import NAMES, Structure, padded
 
 Method = Literal["auto", "explicit", "rosenbrock"]
 
@@ -44,15 +40,14 @@ class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
     def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
-        self._integrators = integrators()
-        self.structure = Structure(model, sensitivities, outputs)
+        self._integrate, self._room = entry("integrate"), entry("room")
+        self.structure = ModelEquations(model, sensitivities, outputs)
         self._code = self.structure.compile()
         self._late: Code | None = None
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
         self._equilibria = Equilibria(self.structure, self._address)
         second = self.structure.second
-        self._hess_row = np.array([i for i, _, _ in second], dtype=np.int64)
-        self._hess_column = np.array([j for _, j, _ in second], dtype=np.int64)
+        self._hess = [np.array([entry[k] for entry in second], dtype=np.int64) for k in (0, 1)]
         self._explicit: bool | None = None
         self._lock = Lock()
         self._states: dict[bool, tuple[Any, int]] = {}
@@ -129,23 +124,22 @@ class Engine:
         while True:
             state, work = self._state(not explicit)
             span = np.array([begin, end])
-            answer = self._integrators.integrate(
-                state, work, span, allowed, tolerance.max_steps, y, w, p, constants, *tables,
-                t_out, out, sizes, self._hess_row, self._hess_column,
-            )  # fmt: skip
-            status = _status(answer)
-            if STATUS[status] == "stiff" and method == "auto":
+            state[self._max_steps] = tolerance.max_steps
+            status = self._integrate(
+                state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, *self._hess
+            )
+            if STATUSES[status] == "stiff" and method == "auto":
                 self._explicit = explicit = False
                 continue
             break
         counts = state[self._counted].tolist()
-        statistics = Statistics(STATUS[status], "explicit" if explicit else "rosenbrock", *counts)
+        statistics = Statistics(STATUSES[status], "explicit" if explicit else "rosenbrock", *counts)
         if status:
             raise SimulationError(
-                f"the simulation of model '{self.structure.model.name}' stopped: {STATUS[status]}",
+                f"the simulation of model '{self.structure.model.name}' stopped: {STATUSES[status]}",
                 where=f"t = {span[0]:.6g} s",
                 got=f"{statistics.accepted} steps accepted, {statistics.rejected} rejected, {statistics.events} switches",
-                hint=HINTS[STATUS[status]],
+                hint=HINTS[STATUSES[status]],
             )
         return out, statistics
 
@@ -167,8 +161,6 @@ class Engine:
 
     def _template(self, rosenbrock: bool) -> tuple[Any, int]:
         """The record before a run, and how many doubles of workspace a run takes."""
-        from hvdc_ident.simulate.state import COUNTED, RUN, place
-
         s = self.structure.sizes
         n, address = s.nx + s.nz, dict(zip(NAMES, self._address.tolist(), strict=True))
         given = {k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")} | {
@@ -188,8 +180,8 @@ class Engine:
         state = np.zeros(len(RUN.fields or ()), dtype=np.int64)
         for name, value in given.items():
             state[place(name)] = value
-        self._counted = [place(name) for name in COUNTED]
-        return state, self._integrators.room(state.copy())
+        self._counted, self._max_steps = [place(name) for name in COUNTED], place("max_steps")
+        return state, self._room(state.copy())
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """True where the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
@@ -222,13 +214,6 @@ class Engine:
         return jac
 
 
-def _status(answer: int) -> int:
-    """The status in what one of the integrators answered."""
-    if answer == 0:
-        raise MemoryError
-    return answer - 1
-
-
 @lru_cache(maxsize=64)
 def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Any, ...]:
     """Return the tables that an integration reads of its inputs: start values, breaks, then the pieces of all of them and their points."""
@@ -250,97 +235,6 @@ ROOM = 128
 _engine = by_structure(Engine, room=ROOM)
 
 
-def engine(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
+def engine_of(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
     """The engine of a model's structure, compiled at the first call and kept for later ones (the last `ROOM`)."""
     return _engine(model, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs))
-
-
-@lru_cache(maxsize=256)
-def _constant(value: float) -> InputSignal:
-    return InputSignal.constant(value)
-
-
-def simulate(
-    model: AnyModel,
-    experiment: Experiment,
-    values: Mapping[str, float] | None = None,
-    sensitivities: Sequence[str] = (),
-    *,
-    outputs: Sequence[str] | None = None,
-    tolerance: Tolerance | None = None,
-    rtol: float | None = None,
-    method: Method = "auto",
-    partial: bool = False,
-) -> Simulation:
-    """The model's outputs at the experiment's times and, exactly, their derivatives by the named parameters.
-
-    values: parameters (and constant inputs) that differ from the model's. outputs: names of outputs or signals (default:
-    all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
-    the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
-    The name of an input among the sensitivities asks for the derivative by a constant added to that input all along,
-    that of a state for the derivative by its start, which is then no longer the steady one.
-    A model that is external (an FMU) runs itself, from its own start; `method` is then its own. It may ask for the end
-    of its run: partial gives the rows up to there, with status "ended" and the instant in the notes; else that has failed.
-
-    Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
-    """
-    from hvdc_ident.simulate.recording import with_own, with_recording
-
-    if not isinstance(model, Model):
-        chosen = tuple(model.outputs) if outputs is None else outputs
-        tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
-        ending = {"partial": True} if partial else {}
-        found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
-        return found
-    plant = with_recording(model, experiment)
-    given = {**experiment.values, **(values or {})}
-    names = [*plant.parameters, *plant.inputs]
-    for name in (*given, *experiment.inputs):
-        if name not in plant.parameters and name not in plant.inputs:
-            raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
-    for name in experiment.offsets:
-        if name not in plant.inputs:
-            raise unknown_name("input", name, plant.inputs, where=f"experiment '{experiment.name}'")
-    for name in experiment.starts:
-        if name not in plant.states:
-            raise unknown_name("state", name, plant.states, where=f"experiment '{experiment.name}'")
-    own = {**experiment.offsets, **experiment.starts}
-    plant, parameter = with_own(plant, [n for n in (*plant.inputs, *plant.states) if n in own or n in sensitivities])
-    given |= {parameter[n]: v for n, v in own.items()}
-    code = engine(plant, [parameter.get(n, n) for n in sensitivities], outputs)
-    p = [float(given.get(n, q.value)) for n, q in plant.parameters.items()]
-    if not all(map(math.isfinite, p)):
-        bad = [n for n, v in zip(plant.parameters, p, strict=True) if not math.isfinite(v)]
-        raise ModelError(
-            f"the value of parameter '{bad[0]}' is not finite",
-            where=f"model '{model.name}'",
-            hint="an effect at an infinite neutral value is left out: do not set it",
-        )
-    signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
-    tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
-    scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities]) if sensitivities else None
-    try:
-        out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale, model=plant)
-    except (SimulationError, SteadyStateError) as e:
-        raise e.at(f"experiment '{experiment.name}'") from None
-    return _simulation(plant, code, experiment, out, statistics, tuple(sensitivities))
-
-
-def _simulation(
-    model: Model, code: Engine, experiment: Experiment, out: Array, statistics: Statistics, asked: tuple[str, ...]
-) -> Simulation:
-    s = code.structure.sizes
-    names = code.structure.outputs
-    units = tuple(model.outputs[n].unit if n in model.outputs else "" for n in names)
-    gradient = (
-        out[:, s.no :].reshape(experiment.time.size, s.no, s.width)[:, :, : s.np]
-        if s.width
-        else np.zeros((experiment.time.size, s.no, 0))
-    )
-    return Simulation(
-        Trajectory(experiment.time, out[:, : s.no], names, units),
-        asked,
-        gradient,
-        statistics,
-        FrozenMap(),
-    )

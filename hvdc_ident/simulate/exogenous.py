@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hvdc_ident.simulate.kernel import kernel
-from hvdc_ident.simulate.memory import indices, table, vector
-from hvdc_ident.simulate.state import NODES
+from hvdc_ident.simulate.native import indices, kernel, table, vector
+from hvdc_ident.simulate.run_state import NODES
 
 
 @kernel()

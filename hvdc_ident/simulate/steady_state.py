@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,9 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, blended
-from hvdc_ident.simulate.integrators import entry
-from hvdc_ident.simulate.kept import by_structure
-from hvdc_ident.simulate.machine import Code, evaluate
-from hvdc_ident.simulate.structure import ACCURACY, NAMES, TINY, Structure
+from hvdc_ident.simulate.codegen import NAMES
+from hvdc_ident.simulate.equations import ACCURACY, SHORTEST, TINY, ModelEquations, by_structure
+from hvdc_ident.simulate.object_code import Code, entry, evaluate
 
 Branch = Literal["own", "unconnected"]
 
@@ -51,24 +50,27 @@ class Anchor:
 class SteadyState:
     """Flat vectors y and w with their rows over the parameters, as the integrators take them.
 
+    v: the unknowns [x, z, delayed, sampled values]. sign: of the Jacobian's determinant, 0 where it is singular.
     branch: "own" where it is connected with the steady state that the model has at its own values, or that one is not
     known; "unconnected" where following it ended at a jump and this one was found by a new search.
     """
 
     y: Array
     w: Array
+    v: Array
+    sign: float = 0.0
     branch: Branch = "own"
 
 
 class Equilibria:
     """The steady states of one model structure; its machine code stays with whoever made it, as long as this is used."""
 
-    def __init__(self, structure: Structure, address: NDArray[np.int64], code: Code | None = None) -> None:
+    def __init__(self, structure: ModelEquations, address: NDArray[np.int64], code: Code | None = None) -> None:
         self.structure, self._address, self._code = structure, address, code
         s = structure.sizes
         self.n, self.extra = s.nx + s.nz, s.nd + s.nq
-        self._dims = np.array([s.nx, s.nz, s.nu, s.nd, s.nq, s.ns, s.no, s.np, s.width], dtype=np.int64)
-        self._rest, _ = entry("rest")
+        self._sizes = np.array([s.nx, self.n, 1 + s.nu, self.n + self.extra, s.width], dtype=np.int64)
+        self._solve = entry("newton")
         self._anchors: dict[tuple[Model, bytes], Anchor | None] = {}
         self.names = (*structure.states, *structure.unknowns, *structure.model.delays, *structure.model.sampled)
 
@@ -86,18 +88,17 @@ class Equilibria:
             return self.search(p, u, time, None if anchor is None else anchor.v, search=search)
         found = self._directly(anchor, p, u, time)
         if found is not None:
-            return SteadyState(*found[:2])
+            return found
         path = self._connected(model, anchor, p, u, time, search)
         if path.ends == "arrived":
             found = self._newton(path.v, p, u, time)
             if found is not None:
-                return SteadyState(*found[:2])
+                return found
         if not search:
             raise self._not_at_once()
         if path.ends == "fold":
             raise self._lost(path, p, u, time)
-        other = self.search(p, u, time)
-        return SteadyState(other.y, other.w, "unconnected")
+        return replace(self.search(p, u, time), branch="unconnected")
 
     def search(
         self, p: Array, u: Array, time: float = 0.0, first: Array | None = None, *, search: bool = True
@@ -108,8 +109,8 @@ class Equilibria:
         begins = self._begins(p, u, time)
         for begin in begins if first is None else (first, *begins):
             found = self._newton(begin, p, u, time)
-            if found is not None and (np.abs(found[0][: self.n]) <= limit[: self.n]).all():
-                return SteadyState(*found[:2])
+            if found is not None and (np.abs(found.y[: self.n]) <= limit[: self.n]).all():
+                return found
             if not search:
                 raise self._not_at_once()
         return self._slowly(p, u, self._filled(self._guesses[0], p, u, time) if first is None else first, time)
@@ -142,10 +143,9 @@ class Equilibria:
         given = [(k, s.guess) for k, s in enumerate(model.states.values()) if s.guess is not None]
         if not given:
             try:
-                found = self.search(p, u)
+                return self._anchored(p, u, self.search(p, u).v)
             except SteadyStateError:
                 return None
-            return self._anchored(p, u, self._unknowns(found.y, found.w))
         places, guesses = [k for k, _ in given], np.array([g for _, g in given])
 
         def moved(v: Array) -> Array:
@@ -153,11 +153,10 @@ class Equilibria:
             return np.abs(v[places] - guesses) / (1.0 + np.abs(guesses))
 
         begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))
-        ends = [self._unknowns(found[0], found[1]) for found in begun if found is not None]
-        ends = [v for v in ends if (np.abs(v) <= self._region.limit).all()]
+        ends = [found.v for found in begun if found is not None and (np.abs(found.v) <= self._region.limit).all()]
         if not any(moved(v).max() <= 1.0 for v in ends):
             slow = self._slow_ends(p, u, self._filled(self._guesses[0], p, u, 0.0), 0.0)
-            ends += [v for v, _, _, shares in slow if self._region.is_rest(shares, v)]
+            ends += [v for v, _, _, shares in slow if self._region.holds(shares, v)]
         if not ends:
             return None
         # Ends that rounding alone sets apart are one: the first of them stands for all.
@@ -182,13 +181,16 @@ class Equilibria:
         begun: Anchor | None = self._anchored(p_root, u_root, v)
         _, _, shares = self._judged(v, p_root, u_root, 0.0)
         if not (shares < ACCURACY).all():
-            begun = self._with_effects(model, p_root, u_root, known) if _has_effects(model) else None
+            path = (
+                self._blend(model, known, (p_root, u_root, 0.0), (p_root, u_root, 0.0)) if _has_effects(model) else None
+            )
+            begun = self._anchored(p_root, u_root, path.v) if path is not None and path.ends == "arrived" else None
         if begun is None or not begun.sign or (np.array_equal(p_root, p_own) and np.array_equal(u_root, u_own)):
             return begun
         found = self._directly(begun, p_own, u_own, 0.0)
         if found is not None:
-            return Anchor(p_own, u_own, self._unknowns(found[0], found[1]), found[2])
-        path = self._follow_any(_ways(begun, p_own, u_own, 0.0), begun)
+            return Anchor(p_own, u_own, found.v, found.sign)
+        path = self._follow_first(_ways(begun, p_own, u_own, 0.0), begun.v, begun.sign)
         return Anchor(p_own, u_own, path.v, begun.sign) if path.ends == "arrived" else begun
 
     def _of_root(self, model: Model, root: Model) -> dict[str, float] | None:
@@ -198,14 +200,9 @@ class Equilibria:
         anchor = at.anchor(root, np.array([i.value for i in root.inputs.values()]))
         return None if anchor is None else dict(zip(at.names, anchor.v.tolist(), strict=True))
 
-    def _with_effects(self, model: Model, p: Array, u: Array, known: dict[str, float]) -> Anchor | None:
-        """The steady state at p and u, the effects put in by and by from the one without them, known by name."""
-        path = self._blend(model, known, (p, u, 0.0), (p, u, 0.0))
-        return self._anchored(p, u, path.v) if path.ends == "arrived" else None
-
     def _anchored(self, p: Array, u: Array, v: Array) -> Anchor:
         found = self._newton(v, p, u, 0.0, HALVES)
-        return Anchor(p, u, v, 0.0 if found is None else found[2])
+        return Anchor(p, u, v, 0.0 if found is None else found.sign)
 
     # --- paths ---
 
@@ -215,7 +212,7 @@ class Equilibria:
         search: whether more ways than the straight one are tried.
         """
         ways = _ways(anchor, p, u, time)
-        path = self._follow_any(ways if search else ways[:1], anchor)
+        path = self._follow_first(ways if search else ways[:1], anchor.v, anchor.sign)
         root = model.origin.root if model.origin else model
         if path.ends == "arrived" or not search or not _has_effects(model):
             return path
@@ -235,20 +232,14 @@ class Equilibria:
         p0, p1 = np.append(a[0], 0.0), np.append(b[0], 0.0)
         v = at._filled(np.array([known.get(n, np.nan) for n in at.names]), p0, a[1], a[2])
         begun = at._newton(v, p0, a[1], a[2], HALVES)
+        place = {n: k for k, n in enumerate(at.names)}
+        named = [place[n] for n in self.names]
         if begun is None:
-            return Path(self._by_name(at, v), 0.0, "no start")
-        begin = (at._unknowns(begun[0], begun[1]), begun[2])
+            return Path(v[named], 0.0, "no start")
         full = np.append(b[0], 1.0)
         first, between, last = (p0, a[1], a[2]), (p1, b[1], b[2]), (full, b[1], b[2])
-        path = at._follow_first(([first, between, last], [first, last]), *begin)
-        return Path(self._by_name(at, path.v), path.share, path.ends, path.at)
-
-    def _by_name(self, at: Equilibria, v: Array) -> Array:
-        place = {n: k for k, n in enumerate(at.names)}
-        return np.array([v[place[n]] for n in self.names])
-
-    def _follow_any(self, ways: tuple[list[_Values], ...], anchor: Anchor) -> Path:
-        return self._follow_first(ways, anchor.v, anchor.sign)
+        path = at._follow_first(([first, between, last], [first, last]), begun.v, begun.sign)
+        return replace(path, v=path.v[named])
 
     def _follow_first(self, ways: tuple[list[_Values], ...], v: Array, sign: float) -> Path:
         """The first of the ways that arrives, else the first."""
@@ -262,18 +253,16 @@ class Equilibria:
 
     def _along(self, way: list[_Values], v: Array, sign: float) -> Path:
         """From v, a steady state at the way's first values with that sign of the determinant, from values to values."""
-        from hvdc_ident.simulate.patient import trace
-
-        s, v, legs = self.structure.sizes, v.copy(), len(way) - 1
-        y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
+        v, legs = v.copy(), len(way) - 1
         for k, (a, b) in enumerate(pairwise(way)):
             ends_p, ends_w = np.array([a[0], b[0]]), np.array([[a[2], *a[1]], [b[2], *b[1]]])
-            work = ends_p[0].copy()
-            share = trace(self._address, self.n, s.nu, y, w, work, m, ends_p, ends_w, v, sign)
-            if share < 1.0:
-                at = (work, w[1 : 1 + s.nu].copy(), float(w[0]))
+            equations, reached = self._equations(a[0].copy(), a[1], a[2]), np.array([sign, 0.0])
+            entry("trace")(*equations, ends_p, ends_w, v, reached)
+            if reached[0] < 1.0:
+                w, p = equations[3], equations[5]
+                at = (p, w[1 : ends_w.shape[1]].copy(), float(w[0]))
                 turned = self._turns(v, at, ends_p, ends_w)
-                return Path(v, (k + share) / legs, "fold" if turned else "jump", at)
+                return Path(v, (k + float(reached[0])) / legs, "fold" if turned else "jump", at)
         return Path(v, 1.0, "arrived")
 
     def _turns(self, v: Array, at: _Values, ends_p: Array, ends_w: Array) -> bool:
@@ -284,8 +273,6 @@ class Equilibria:
         the shortest step h of v the values go d <= h more to the fold; there they fall as c s^2 with the length s, so
         that v lies at s = 2 t d before it with the slope t = 1 / (2 c s), and 8 t h on they are at least 8 h back.
         """
-        from hvdc_ident.simulate.patient import SHORTEST
-
         extent = np.maximum(np.abs(v), TINY)
         dp, dw = ends_p[1] - ends_p[0], ends_w[1] - ends_w[0]
 
@@ -339,21 +326,26 @@ class Equilibria:
 
     def _newton(
         self, v: Array, p: Array, u: Array, time: float, contraction: float = np.inf, sign: float = 0.0
-    ) -> tuple[Array, Array, float] | None:
-        """(y, w, sign of the determinant) of the solution that Newton's method finds from v; arguments as in `rest`."""
-        s, n = self.structure.sizes, self.n
-        y, w = np.zeros(n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
-        y[:n], w[0], w[1 : 1 + s.nu], w[1 + s.nu : 1 + s.nu + self.extra] = v[:n], time, u, v[n:]
-        rule, worst, m = np.array([contraction, sign]), np.zeros(2), np.zeros(max(s.ns, 1))
-        jac = np.zeros((n + self.extra, n + self.extra))
-        p = np.ascontiguousarray(p, dtype=float)
-        answer = self._rest(self._address, self._dims, p, y, w, np.zeros_like(w), m, jac, worst, rule)
-        if answer == 0:
-            raise MemoryError
-        return (y, w, float(rule[1])) if answer == 1 else None
+    ) -> SteadyState | None:
+        """Solution that Newton's method finds from v; None where it finds none. contraction, sign: the rule of `newton`."""
+        equations, rule = self._equations(p, u, time, v), np.array([contraction, sign])
+        if not self._solve(*equations, rule):
+            return None
+        y, w, first = equations[2], equations[3], 1 + self.structure.sizes.nu
+        return SteadyState(y, w, np.concatenate([y[: self.n], w[first : first + self.extra]]), float(rule[1]))
 
-    def _directly(self, anchor: Anchor, p: Array, u: Array, time: float) -> tuple[Array, Array, float] | None:
-        """(y, w, sign) of the solution at other values that Newton's method finds from a known one, and leads back from.
+    def _equations(self, p: Array, u: Array, time: float, v: Array | None = None) -> tuple[Any, ...]:
+        """Arguments that every compiled function of steady states begins with: addresses, sizes, y, w, its rate, p and modes."""
+        s = self.structure.sizes
+        y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
+        w[0], w[1 : 1 + s.nu] = time, u
+        if v is not None:
+            y[: self.n], w[1 + s.nu : 1 + s.nu + self.extra] = v[: self.n], v[self.n :]
+        p = np.ascontiguousarray(p, dtype=float)
+        return self._address, self._sizes, y, w, np.zeros_like(w), p, np.zeros(max(s.ns, 1))
+
+    def _directly(self, anchor: Anchor, p: Array, u: Array, time: float) -> SteadyState | None:
+        """Solution at other values that Newton's method finds from a known one, and leads back from.
 
         Corrections that halve are Kantorovich's condition as far as their own direction shows it: with an exponential rate
         they also halve on the way to another branch. From that one the way back ends elsewhere.
@@ -361,27 +353,14 @@ class Equilibria:
         found = self._newton(anchor.v, p, u, time, HALVES, anchor.sign)
         if found is None:
             return None
-        back = self._newton(self._unknowns(found[0], found[1]), anchor.p, anchor.u, 0.0, HALVES, anchor.sign)
-        return found if back is not None and _alike(self._unknowns(back[0], back[1]), anchor.v) else None
-
-    def unknowns(self, found: SteadyState) -> Array:
-        """[x, z, delayed, sampled values] of a steady state, as `names` names them."""
-        return self._unknowns(found.y, found.w)
-
-    def _unknowns(self, y: Array, w: Array) -> Array:
-        first = 1 + self.structure.sizes.nu
-        return np.concatenate([y[: self.n], w[first : first + self.extra]])
+        back = self._newton(found.v, anchor.p, anchor.u, 0.0, HALVES, anchor.sign)
+        return found if back is not None and _alike(back.v, anchor.v) else None
 
     def _judged(self, v: Array, p: Array, u: Array, time: float) -> tuple[Array, Array, Array]:
         """(residual, Jacobian, scaled residuals) of the rest equations at v."""
-        from hvdc_ident.simulate.patient import judge
-
-        s, n = self.structure.sizes, self.n + self.extra
-        y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
-        w[0], w[1 : 1 + s.nu] = time, u
+        n = self.n + self.extra
         r, jac, shares = np.zeros(n), np.zeros((n, n)), np.zeros(n)
-        p = np.ascontiguousarray(p, dtype=float)
-        judge(self._address, self.n, s.nu, y, w, p, m, self._region.size, v, r, jac, shares)
+        entry("judge")(*self._equations(p, u, time), self._region.size, v, r, jac, shares)
         return r, jac, shares
 
     # --- where a search begins ---
@@ -453,30 +432,22 @@ class Equilibria:
 
         What follows the model takes one Newton step for each in time and may leap over the nearest one.
         """
-        from hvdc_ident.simulate.patient import follow, nearest
-
-        s = self.structure.sizes
-        y, w, m = np.zeros(self.n), np.zeros(1 + s.nu + self.extra), np.zeros(max(s.ns, 1))
-        w[0], w[1 : 1 + s.nu] = time, u
-        values, rest = (self._address, self.n, s.nu), (np.ascontiguousarray(p, dtype=float), m, self._region.size)
+        nx = self.structure.sizes.nx
         ends: list[Array] = []
         for sign in (1.0, -1.0):
             x = v.copy()
-            x[: s.nx] += sign * along
-            with np.errstate(all="ignore"):
-                follow(*values, s.nx, y, w, *rest, x)
-                nearest(*values, y, w, *rest, x)
+            x[:nx] += sign * along
+            self._move(("follow", "nearest"), x, p, u, time)
             ends.append(x)
             for far in 2.0 ** np.arange(DOUBLINGS):
                 begin = v.copy()
-                begin[: s.nx] += sign * far * along
+                begin[:nx] += sign * far * along
                 solved = self._newton(begin, p, u, time)
-                ends += [] if solved is None else [self._unknowns(solved[0], solved[1])]
+                ends += [] if solved is None else [solved.v]
         found: list[Array] = []
         for x in ends:
-            with np.errstate(all="ignore"):
-                _, _, shares = self._judged(x, p, u, time)
-            if self._region.is_rest(shares, x) and not _alike(x, v) and not any(_alike(x, k) for k in found):
+            _, _, shares = self._judged(x, p, u, time)
+            if self._region.holds(shares, x) and not _alike(x, v) and not any(_alike(x, k) for k in found):
                 found.append(x)
         return found
 
@@ -492,57 +463,37 @@ class Equilibria:
 
     def _slowly(self, p: Array, u: Array, begin: Array, time: float) -> SteadyState:
         """The steady state by steps of least norm, or by following the model; SteadyStateError with the worst equation."""
-        from hvdc_ident.simulate.rest import REST_P
-
         tried: list[tuple[Array, Array, Array, Array]] = []
         # The rest next to the guess comes first; where there are several, following the model may end at a far one.
         for end in self._slow_ends(p, u, begin, time):
             tried.append(end)
-            if self._region.is_rest(end[3], end[0]):
+            if self._region.holds(end[3], end[0]):
                 break
         else:
             v, r, _, shares = tried[1]  # where the model went is what tells most
             raise self._refused(r, shares, v)
         v, _, jac, _ = tried[-1]
         s, n = self.structure.sizes, self.n + self.extra
-        y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
-        first, m = 1 + s.nu, np.zeros(max(s.ns, 1))
-        w[0], w[1:first] = time, u
-        y[: self.n], w[first : first + self.extra] = v[: self.n], v[self.n :]
+        _, _, y, w, _, p, m = self._equations(p, u, time, v)
         if s.width:
             rows = np.zeros(n * s.width)
             evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
-            evaluate(self._address[REST_P], y, w, p, m, rows)
+            evaluate(self._address[NAMES.index("rest_p")], y, w, p, m, rows)
             slope = np.linalg.lstsq(jac, -rows.reshape(n, s.width), rcond=1e-12)[0]
-            y[self.n :], w[first + self.extra :] = slope[: self.n].ravel(), slope[self.n :].ravel()
-        return SteadyState(y, w)
+            y[self.n :], w[1 + s.nu + self.extra :] = slope[: self.n].ravel(), slope[self.n :].ravel()
+        return SteadyState(y, w, v)
 
     def _slow_ends(self, p: Array, u: Array, begin: Array, time: float) -> Iterator[tuple[Array, Array, Array, Array]]:
         """(v, residual, Jacobian, scaled residuals) where each slow way ends: least norm, following the model, sliding."""
-        from hvdc_ident.simulate.patient import follow, nearest, slide
-
-        s = self.structure.sizes
-        y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
-        w[0], w[1 : 1 + s.nu], m = time, u, np.zeros(max(s.ns, 1))
-        values = (y, w, p, m, self._region.size)
-
-        def closest(v: Array) -> None:
-            nearest(self._address, self.n, s.nu, *values, v)
-
-        def followed(v: Array) -> None:
-            follow(self._address, self.n, s.nu, s.nx, *values, v)
-            closest(v)
-
-        def slid(v: Array) -> None:
-            slide(self._address, self.n, s.nu, s.nx, *values, v)
-
-        ways: tuple[Callable[[Array], None], ...] = (closest, followed, slid)
-        for way in ways:
+        for ways in (("nearest",), ("follow", "nearest"), ("slide",)):
             v = begin.copy()
-            with np.errstate(all="ignore"):
-                way(v)
-                judged = self._judged(v, p, u, time)
-            yield v, *judged
+            self._move(ways, v, p, u, time)
+            yield v, *self._judged(v, p, u, time)
+
+    def _move(self, ways: tuple[str, ...], v: Array, p: Array, u: Array, time: float) -> None:
+        """Move v by slow ways, one after the other."""
+        for way in ways:
+            entry(way)(*self._equations(p, u, time), self._region.size, v)
 
     # --- what is told where there is none ---
 
@@ -560,7 +511,7 @@ class Equilibria:
         except SteadyStateError:
             offered = "no other steady state was found either"
         else:
-            offered = f"another steady state exists, at {self.text(self._unknowns(other.y, other.w))}"
+            offered = f"another steady state exists, at {self.text(other.v)}"
         return SteadyStateError(
             "the model's own steady state ends on the way to these values",
             where=f"model '{self.structure.model.name}'",
@@ -630,7 +581,7 @@ class _Region:
     limit: Array
 
     @classmethod
-    def of(cls, structure: Structure, guess: Array, extra: int) -> _Region:
+    def of(cls, structure: ModelEquations, guess: Array, extra: int) -> _Region:
         given = [s.guess for s in structure.model.states.values()]
         sizes = [1 / CLOSE if g is None else max(abs(g), 1.0) for g in given]
         limits = [max(abs(g) / CLOSE, 1.0) if g else np.inf for g in given]
@@ -638,7 +589,7 @@ class _Region:
         unknown = np.full(rest.size + extra, np.inf)
         return cls(np.concatenate([sizes, rest, np.full(extra, 1 / CLOSE)]), np.concatenate([limits, unknown]))
 
-    def is_rest(self, shares: Array, v: Array) -> bool:
+    def holds(self, shares: Array, v: Array) -> bool:
         """Return whether v solves the equations, by the scaled residuals there, within the limits."""
         return bool((shares < ACCURACY).all() and (np.abs(v) <= self.limit).all())
 
@@ -659,7 +610,7 @@ def with_guesses(model: Model) -> Model:
     Written to a card it keeps its branch, for a card says nothing of where a model comes from. Raises SteadyStateError.
     """
     at = equilibria(model)
-    found = dict(zip(at.names, at.unknowns(at.start(model, *_values(model))).tolist(), strict=True))
+    found = dict(zip(at.names, at.start(model, *_values(model)).v.tolist(), strict=True))
     # What rounding leaves of 0 is no guess: it would tell the state's size.
     place = {n: 0.0 if abs(v) < ACCURACY else v for n, v in found.items()}
     states = {n: replace(s, guess=place[n]) for n, s in model.states.items()}
@@ -688,7 +639,7 @@ def _ways(anchor: Anchor, p: Array, u: Array, time: float) -> tuple[list[_Values
 
 
 def _made(model: Model) -> Equilibria:
-    structure = Structure(model, (), ())
+    structure = ModelEquations(model, (), ())
     code = structure.compile_rest()
     return Equilibria(structure, np.array([code.address.get(n, 0) for n in NAMES], dtype=np.int64), code)
 

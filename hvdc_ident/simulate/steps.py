@@ -1,26 +1,121 @@
-"""One step of each integrator over states and sensitivities as one flat vector, with its error and its dense output."""
+"""One step of each integrator over states and sensitivities as one flat vector, with its error and its dense output.
+
+RODAS5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the Julia
+Differential Equations package, BIT 63 (2023): order 5, stiffly accurate, L-stable, for index-1 DAEs, dense output of
+order 4. In the transformed form: stage i at y + sum a_ij k_j, right-hand side f + M sum c_ij k_j / h + h d_i f_t.
+
+DOPRI5: Dormand and Prince 1980 with the dense output of Hairer, Norsett and Wanner, Solving ODEs I, II.6.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hvdc_ident.simulate.call import call
 from hvdc_ident.simulate.exogenous import outside
-from hvdc_ident.simulate.kernel import kernel
-from hvdc_ident.simulate.lanes import column_sums, elementwise, weighted
-from hvdc_ident.simulate.linear import lu, solve, solve_rows
-from hvdc_ident.simulate.memory import indices, table, vector
-from hvdc_ident.simulate.tableaus import (
-    DOPRI_A,
-    DOPRI_DENSE,
-    DOPRI_E,
-    DOPRI_TIME,
-    RODAS_A,
-    RODAS_C,
-    RODAS_D,
-    RODAS_GAMMA,
-    RODAS_H,
-    RODAS_TIME,
+from hvdc_ident.simulate.native import call, indices, kernel, lu, solve, solve_rows, table, vector
+from hvdc_ident.simulate.simd import column_sums, elementwise, weighted
+
+RODAS_GAMMA = 0.21193756319429014
+RODAS_A = np.zeros((8, 8))
+RODAS_A[1, :1] = 3.0
+RODAS_A[2, :2] = 2.849394379747939, 0.45842242204463923
+RODAS_A[3, :3] = -6.954028509809101, 2.489845061869568, -10.358996098473584
+RODAS_A[4, :4] = 2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641
+RODAS_A[5, :5] = -7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946
+RODAS_A[6, :6] = *RODAS_A[5, :5], 1.0
+RODAS_A[7, :7] = *RODAS_A[5, :5], 1.0, 1.0
+RODAS_C = np.zeros((8, 8))
+RODAS_C[1, :1] = -14.155112264123755
+RODAS_C[2, :2] = -17.97296035885952, -2.859693295451294
+RODAS_C[3, :3] = 147.12150275711716, -1.41221402718213, 71.68940251302358
+RODAS_C[4, :4] = 165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306
+RODAS_C[5, :5] = 24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471
+RODAS_C[6, :6] = (
+    30.91273214028599,
+    -3.1208243349937974,
+    77.79954646070892,
+    34.28646028294783,
+    -19.097331116725623,
+    -28.087943162872662,
+)
+RODAS_C[7, :7] = (
+    37.80277123390563,
+    -3.2571969029072276,
+    112.26918849496327,
+    66.9347231244047,
+    -40.06618937091002,
+    -54.66780262877968,
+    -9.48861652309627,
+)
+RODAS_TIME = np.array(
+    [0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0]
+)
+RODAS_D = np.array(
+    [
+        0.21193756319429014,
+        -0.42387512638858027,
+        -0.3384627126235924,
+        1.8046452872882734,
+        2.325825639765069,
+        0.0,
+        0.0,
+        0.0,
+    ]
+)
+RODAS_H = np.array(
+    [
+        [
+            25.948786856663858,
+            -2.5579724845846235,
+            10.433815404888879,
+            -2.3679251022685204,
+            0.524948541321073,
+            1.1241088310450404,
+            0.4272876194431874,
+            -0.17202221070155493,
+        ],
+        [
+            -9.91568850695171,
+            -0.9689944594115154,
+            3.0438037242978453,
+            -24.495224566215796,
+            20.176138334709044,
+            15.98066361424651,
+            -6.789040303419874,
+            -6.710236069923372,
+        ],
+        [
+            11.419903575922262,
+            2.8879645146136994,
+            72.92137995996029,
+            80.12511834622643,
+            -52.072871366152654,
+            -59.78993625266729,
+            -0.15582684282751913,
+            4.883087185713722,
+        ],
+    ]
+)
+
+DOPRI_A = np.zeros((7, 7))
+DOPRI_A[1, :1] = 1 / 5
+DOPRI_A[2, :2] = 3 / 40, 9 / 40
+DOPRI_A[3, :3] = 44 / 45, -56 / 15, 32 / 9
+DOPRI_A[4, :4] = 19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729
+DOPRI_A[5, :5] = 9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656
+DOPRI_A[6, :6] = 35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84
+DOPRI_TIME = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
+DOPRI_E = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+DOPRI_DENSE = np.array(
+    [
+        -12715105075 / 11282082432,
+        0,
+        87487479700 / 32700410799,
+        -10690763975 / 1880347072,
+        701980252875 / 199316789632,
+        -1453857185 / 822651844,
+        69997945 / 29380423,
+    ]
 )
 
 # --- both methods ---

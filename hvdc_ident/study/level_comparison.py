@@ -28,7 +28,7 @@ from hvdc_ident.fit.noise import MISFIT, source_of
 from hvdc_ident.fit.nuisance import observe, unknowns
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 SIGN_SHARE, OTHER_SHARE, BOTH_SHARE = 0.5, 0.4, 0.1
 """Prior probabilities, given that a channel is wrong: its sign (the commonest mistake), one of the other known

@@ -29,8 +29,7 @@ from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fit.unknown import Free
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate.engine import engine
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator, engine_of
 from hvdc_ident.study.level_comparison import (
     EXCHANGE_SHARE,
     FINEST,
@@ -484,7 +483,7 @@ def _time_constants(model: AnyModel, e: Experiment) -> Array:
     """(k,) 1/|eigenvalue| of the model at its rest before the event, s; those of integrators are left out."""
     if not isinstance(model, Model) or not model.states or e.drive:
         return np.empty(0)
-    code = engine(model, (), e.outputs)
+    code = engine_of(model, (), e.outputs)
     given = {n: e.values.get(n, i.value) for n, i in model.inputs.items()}
     u = np.array([float(e.inputs[n].values[0]) if n in e.inputs else v for n, v in given.items()])
     p = np.array([q.value for q in model.parameters.values()])

@@ -19,8 +19,7 @@ from hvdc_ident.fit.per_experiment import half_width, spread
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator, simulate
 from hvdc_ident.study.examples import Campaign, Noise, recorded
 
 REFERENCE = "vsc-hvdc-avm"  # stands in for EMTP-RV: the average-value link with 140 Hz filters on P, Q and Vdc

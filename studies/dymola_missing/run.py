@@ -28,7 +28,7 @@ from hvdc_ident.data import Experiment, Trajectory  # noqa: E402
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
 from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
-from hvdc_ident.simulate.model_simulator import ModelSimulator  # noqa: E402
+from hvdc_ident.simulate import ModelSimulator  # noqa: E402
 
 STUDY = HERE.parent / "dymola_waveform" / "study.toml"
 DATA = HERE / "../../../shared/data/dymola/TwoNodePowerSystem.mat"

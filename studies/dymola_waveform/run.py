@@ -15,7 +15,7 @@ import numpy as np
 
 from hvdc_ident import load_study, simulate
 from hvdc_ident.fit import Free, Problem, fit
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 HERE = Path(__file__).parent
 DATA = HERE / "../../../shared/data/dymola/TwoNodePowerSystem.mat"

@@ -19,7 +19,7 @@ from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.fit.optimisers import catalogue, is_global, optimiser
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 TRUE = {"KIP": 30.0, "KPP": 0.0, "KIQ": 30.0, "KPQ": 0.0, "KPVDC": 24.0, "KIVDC": 734.7}
 FREE = (

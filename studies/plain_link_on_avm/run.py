@@ -13,8 +13,7 @@ import numpy as np
 from hvdc_ident.data import Experiment, InputSignal, experiment
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator, simulate
 
 HERE = Path(__file__).resolve().parent
 EVENT, END, SAMPLE = 0.1, 0.9, 5e-4  # s

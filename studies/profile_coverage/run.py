@@ -23,7 +23,7 @@ from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.identifiability.evidence import thresholds
 from hvdc_ident.identifiability.pilot import pilot
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 TRUE = {"KPVDC": 24.0, "KIVDC": 734.7}
 FREE = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950))

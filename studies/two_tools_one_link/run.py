@@ -29,8 +29,7 @@ from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.formats import read_waveforms  # noqa: E402
 from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model, read_card  # noqa: E402
-from hvdc_ident.simulate import simulate  # noqa: E402
-from hvdc_ident.simulate.model_simulator import ModelSimulator  # noqa: E402
+from hvdc_ident.simulate import ModelSimulator, simulate  # noqa: E402
 
 DATA = HERE / "../../../shared/data/dynawo"
 EUROSTAG = {  # output of the card: file, column, by what it is divided to be per unit of 1000 MVA

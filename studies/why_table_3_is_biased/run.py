@@ -27,8 +27,7 @@ from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
 from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.models import load_model, vsc_hvdc_avm  # noqa: E402
-from hvdc_ident.simulate import simulate  # noqa: E402
-from hvdc_ident.simulate.model_simulator import ModelSimulator  # noqa: E402
+from hvdc_ident.simulate import ModelSimulator, simulate  # noqa: E402
 
 LAG = 1.6e-3  # s, planted
 LAGGED = {"effect": "lag", "at": ["Ir1", "Ii1", "Ir2", "Ii2"], "parameters": {"T": LAG}}

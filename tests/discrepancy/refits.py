@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, judged
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 
 def plain(records: Sequence[Experiment]) -> Refit:

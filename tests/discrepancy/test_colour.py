@@ -110,7 +110,7 @@ def test_outputs_that_agree_are_told_together_and_others_apart() -> None:
 def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
     from cases import FREE, experiments, model
 
-    from hvdc_ident.simulate.model_simulator import ModelSimulator
+    from hvdc_ident.simulate import ModelSimulator
 
     problem = Problem(ModelSimulator(model()), experiments(), FREE, rho=FrozenMap({"w": 0.9, "torque": 0.9}))
     blocks = problem.blocks(problem.start, derivatives=False)

@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.race import Race
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 SEARCH = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), 0)
 

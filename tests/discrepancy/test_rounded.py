@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.refits.refit import METHOD
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 LAG = 0.03
 STEP = {n: 8.0 * s for n, s in SIGMA.items()}

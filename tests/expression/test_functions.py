@@ -13,7 +13,7 @@ import hvdc_ident as hi
 from hvdc_ident.expression import FUNCTIONS, GrammarFunction, functions, parse, symbol, to_text
 from hvdc_ident.fmu.export.modelica_text import Printer
 from hvdc_ident.linearize.system import evaluate
-from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate import Graph
 
 ELEMENTARY = [f for f in FUNCTIONS.values() if f.slopes is not None]
 AT = (0.37, 0.81)

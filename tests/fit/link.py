@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import Experiment, InputSignal, experiment, trajectory
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 TRUTH = {"KIP": 30.0, "KPP": 0.0, "KIQ": 30.0, "KPQ": 0.0, "KPVDC": 24.0, "KIVDC": 734.7}
 TIME = np.round(np.arange(0, 0.6001, 2e-3), 9)

@@ -13,7 +13,7 @@ from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.fit import Free, Problem, fit, fit_each
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from tests.fit.link import STEPS, TIME, TRUTH, link, step
 
 TABLES = Path(__file__).resolve().parents[3] / "shared" / "data" / "paper" / "tables.toml"

@@ -102,7 +102,7 @@ CERTIFIED = {
 @pytest.mark.parametrize("name", MODELS)
 def test_as_a_study_without_noise_or_bounds(name, start, x, tmp_path):
     """The predictor is the time, or an input recorded by rows; the model has no states."""
-    from hvdc_ident.simulate.model_simulator import ModelSimulator
+    from hvdc_ident.simulate import ModelSimulator
     from hvdc_ident.study.study import load_study
 
     xs, ys, formula, starts = MODELS[name]

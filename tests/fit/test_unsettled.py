@@ -13,7 +13,7 @@ from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.fit.unsettled import recentred
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 TIME = np.linspace(0.0, 3.0, 61)
 SPRING = Model(

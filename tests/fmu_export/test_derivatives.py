@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.linearize import linearize
-from hvdc_ident.simulate.engine import engine
+from hvdc_ident.simulate import engine_of
 from tests.fmu_export.driver import rate_names, state_names
 
 
@@ -73,7 +73,7 @@ def test_the_start_has_exact_derivatives_too(fmu, name, version):
     """During initialisation states and outputs follow inputs and parameters through the steady start."""
     f = fmu(name, version)
     parameters = list(f.model.parameters)
-    code = engine(f.model, parameters)
+    code = engine_of(f.model, parameters)
     s = code.structure.sizes
     p = np.array([q.value for q in f.model.parameters.values()])
     u = np.array([i.value for i in f.model.inputs.values()])

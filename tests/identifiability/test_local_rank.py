@@ -19,7 +19,7 @@ from hvdc_ident.identifiability.local_rank import local_rank
 from hvdc_ident.identifiability.structure import numerical_structure, structure
 from hvdc_ident.model import Delay, Model, Sampled
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from tests.fit.simulators import Closed, Run
 from tests.identifiability.cases import STEPS, closed, measured, on_model, pi_loop, product
 

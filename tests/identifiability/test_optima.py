@@ -12,7 +12,7 @@ from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.identifiability import gated_fit, identifiability
 from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from tests.fit.simulators import recorded
 from tests.identifiability.cases import closed
 

@@ -16,7 +16,7 @@ from hvdc_ident.identifiability.pilot import pilot
 from hvdc_ident.identifiability.recommend import recommend
 from hvdc_ident.identifiability.trial import Move, Trial, double_trials, single_trials
 from hvdc_ident.model import Model
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from tests.fit.simulators import line
 from tests.identifiability.cases import closed, measured, on_model, pi_loop
 

@@ -9,8 +9,7 @@ from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import UnknownNameError
 from hvdc_ident.models import load_model
 from hvdc_ident.models.vsc_hvdc_avm import RATINGS, VARIANTS, model
-from hvdc_ident.simulate import Tolerance, simulate
-from hvdc_ident.simulate.engine import engine
+from hvdc_ident.simulate import Tolerance, engine_of, simulate
 
 NAMES = ("vsc-hvdc-avm", *VARIANTS)
 FINE = Tolerance(1e-12, 1e-15)
@@ -47,7 +46,7 @@ def test_powers_balance_at_rest(name):
 @pytest.mark.parametrize("rating", RATINGS)
 def test_the_guesses_are_near_the_steady_state(rating):
     link = model(rating=rating)
-    code = engine(link)
+    code = engine_of(link)
     y, _ = code.start(np.array(list(link.values.values())), np.array([i.value for i in link.inputs.values()]))
     for (name, state), value in zip(link.states.items(), y, strict=True):
         assert state.guess == pytest.approx(value, abs=0.01), name

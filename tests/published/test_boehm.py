@@ -15,7 +15,7 @@ import pytest
 from hvdc_ident import Model
 from hvdc_ident.data import experiment, trajectory
 from hvdc_ident.fit import Free, Problem, fit
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 OPTIMUM = 138.22199693517703
 

@@ -16,7 +16,7 @@ from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.linearize import linearize
 from hvdc_ident.model import parse_card, write_card
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate.steady_state import equilibria, with_guesses
+from hvdc_ident.simulate import equilibria, with_guesses
 
 # A load that raises its conductance until it has its power, behind a reactance: it has none above E^2 / 2X, and below it
 # two conductances, of which the larger one is unstable (voltage collapse).

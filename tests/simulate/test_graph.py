@@ -5,8 +5,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.expression import parse
-from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.machine import Code, Function, evaluate
+from hvdc_ident.simulate import Code, Function, Graph, evaluate
 
 NAMES = ("a", "b", "c")
 TEXTS = (

@@ -13,8 +13,8 @@ import pytest
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import Engine, Tolerance, entries, machine, objects, simulate
-from hvdc_ident.simulate.integrators import integrators
+from hvdc_ident.simulate import Engine, Tolerance, native, object_code, simulate
+from hvdc_ident.simulate.object_code import entry
 
 CARD = """
 schema = 1
@@ -37,7 +37,8 @@ PUSH = experiment("push", np.linspace(0.0, 2.0, 201), {"torque": InputSignal.ste
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """An empty folder for object code; the integrators are in memory already."""
-    integrators()
+    for name in ("integrate", "room", "newton"):
+        entry(name)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "code"))
     return tmp_path / "code"
 
@@ -61,7 +62,7 @@ def made_by_nobody():
 @pytest.mark.parametrize("method", ["explicit", "rosenbrock"])
 def test_code_from_disk_gives_the_same_bits_and_is_not_compiled(folder, monkeypatch, method):
     first, made = run(method=method), files(folder)
-    monkeypatch.setattr(machine, "compiled", lambda *a, **k: made_by_nobody())
+    monkeypatch.setattr(object_code, "compiled", lambda *a, **k: made_by_nobody())
     assert np.array_equal(run(method=method), first)
     assert files(folder) == made
 
@@ -125,10 +126,10 @@ def test_a_folder_that_can_only_be_read_is_read(folder, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     with monkeypatch.context() as m:
-        m.setattr(objects.Path, "write_bytes", refuse)
+        m.setattr(object_code.Path, "write_bytes", refuse)
         m.setattr(os, "utime", refuse)
         run(CARD.replace("c*speed", "2*c*speed"))
-        m.setattr(machine, "compiled", lambda *a, **k: made_by_nobody())
+        m.setattr(object_code, "compiled", lambda *a, **k: made_by_nobody())
         assert np.array_equal(run(), first)
     assert files(folder) == made
 
@@ -136,46 +137,46 @@ def test_a_folder_that_can_only_be_read_is_read(folder, monkeypatch):
 def test_beside_a_folder_of_no_use_the_users_caches_serve(folder, monkeypatch, tmp_path):
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    beside, own = objects.folders()
+    beside, own = object_code.folders()
     assert beside.name == "__pycache__" and own == tmp_path / "home" / "hvdc_ident"
     (tmp_path / "file").touch()
-    monkeypatch.setattr(objects, "folders", lambda: iter([tmp_path / "file" / "code", own]))
-    assert objects.kept("facts", lambda: b"code") == b"code"
-    assert objects.kept("facts", made_by_nobody) == b"code"
+    monkeypatch.setattr(object_code, "folders", lambda: iter([tmp_path / "file" / "code", own]))
+    assert object_code.kept("facts", lambda: b"code") == b"code"
+    assert object_code.kept("facts", made_by_nobody) == b"code"
     assert len(files(own)) == 1
 
 
 def test_of_too_much_code_what_was_not_used_for_longest_goes(folder, monkeypatch):
-    monkeypatch.setattr(objects, "ROOM", 3500)
-    monkeypatch.setattr(objects, "LOOK", 1)
+    monkeypatch.setattr(object_code, "ROOM", 3500)
+    monkeypatch.setattr(object_code, "LOOK", 1)
     for k in range(3):
-        objects.kept(f"facts {k}", lambda: bytes(1000))
+        object_code.kept(f"facts {k}", lambda: bytes(1000))
         for age, path in enumerate(sorted(folder.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)):
             os.utime(path, (1e9 - age, 1e9 - age))
     (folder / "another's").write_bytes(bytes(5000))
-    assert objects.kept("facts 0", made_by_nobody) == bytes(1000)  # used: the newest now
-    objects.kept("facts 3", lambda: bytes(1000))
+    assert object_code.kept("facts 0", made_by_nobody) == bytes(1000)  # used: the newest now
+    object_code.kept("facts 3", lambda: bytes(1000))
     assert len(files(folder)) == 1 + 1
     assert "another's" in files(folder)
-    objects.kept("facts 3", made_by_nobody)
+    object_code.kept("facts 3", made_by_nobody)
 
 
 def test_a_folder_is_looked_at_often_enough_to_stay_small(folder, monkeypatch):
-    monkeypatch.setattr(objects, "_surroundings", lambda: ("the same names on every machine",))
-    monkeypatch.setattr(objects, "ROOM", 20_000)
+    monkeypatch.setattr(object_code, "_surroundings", lambda: ("the same names on every machine",))
+    monkeypatch.setattr(object_code, "ROOM", 20_000)
     most = 0
     for k in range(1000):
-        objects.kept(f"facts {k}", lambda: bytes(1000))
+        object_code.kept(f"facts {k}", lambda: bytes(1000))
         most = max(most, len(list(folder.iterdir())))
-    assert 20 < most < 20 + 8 * objects.LOOK
+    assert 20 < most < 20 + 8 * object_code.LOOK
 
 
 def test_a_full_folder_is_not_listed_for_every_file(folder, monkeypatch):
-    monkeypatch.setattr(objects, "_surroundings", lambda: ("the same names on every machine",))
-    looks, clear = [], objects._clear
-    monkeypatch.setattr(objects, "_clear", lambda at: (looks.append(at), clear(at)))
+    monkeypatch.setattr(object_code, "_surroundings", lambda: ("the same names on every machine",))
+    looks, clear = [], object_code._clear
+    monkeypatch.setattr(object_code, "_clear", lambda at: (looks.append(at), clear(at)))
     for k in range(640):
-        objects.kept(f"facts {k}", lambda: b"code")
+        object_code.kept(f"facts {k}", lambda: b"code")
     assert 1 <= len(looks) <= 30
 
 
@@ -185,18 +186,17 @@ def test_what_numpy_keeps_in_an_array_is_where_the_integrators_look():
     def word(address):
         return ctypes.c_int64.from_address(address).value
 
-    assert word(id(a) + entries._DATA) == a.ctypes.data
-    lengths = word(id(a) + entries._LENGTHS)
+    assert word(id(a) + native._DATA) == a.ctypes.data
+    lengths = word(id(a) + native._LENGTHS)
     assert (word(lengths), word(lengths + 8)) == (3, 4)
 
 
 def test_an_integrator_without_memory_says_so(monkeypatch):
     said = []
     monkeypatch.setattr(sys, "unraisablehook", lambda failure: said.append(failure.exc_type))
-    few, sizes = np.zeros(1), np.array([2**46, 0, 0, 0, 0, 0, 0, 0, 0])
-    addresses = np.zeros(len(machine.ARGUMENTS) * 3, dtype=np.int64)
-    given = (addresses, sizes, few, few, few, few, few, np.zeros((1, 1)), np.zeros(2), np.zeros(2))
-    assert integrators().rest(*given) == 0
+    few, sizes = np.zeros(1), np.array([2**46, 2**46, 1, 2**46, 0])
+    with pytest.raises(MemoryError):
+        entry("newton")(np.zeros(64, dtype=np.int64), sizes, few, few, few, few, few, np.zeros(2))
     assert said == [MemoryError]
 
 
@@ -213,5 +213,5 @@ def test_a_process_that_finds_its_code_loads_no_compiler_of_kernels():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stderr == ""
-    unwanted = {"scipy.linalg", "numba.np.arraymath", "hvdc_ident.simulate.driver", "hvdc_ident.effects"}
+    unwanted = {"scipy.linalg", "numba.np.arraymath", "hvdc_ident.simulate.native", "hvdc_ident.effects"}
     assert sorted(unwanted & set(found.stdout.split())) == []

@@ -26,7 +26,7 @@ from hvdc_ident.discrepancy.trials.refitted import PROMISING, refitted
 from hvdc_ident.effects import EffectUse, Probe, effects
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))

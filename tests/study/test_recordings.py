@@ -14,7 +14,7 @@ from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.fit import FitResult, Problem, fit
 from hvdc_ident.report.page import write_report
 from hvdc_ident.report.results import Results
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.pipeline import run_stage
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study

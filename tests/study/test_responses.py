@@ -12,7 +12,7 @@ from hvdc_ident.fit.frequency_data import WithResponses, frequency_experiment
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse, Port
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 MOTOR = """schema = 1
 name = "motor"

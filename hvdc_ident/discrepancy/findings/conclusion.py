@@ -177,7 +177,7 @@ class Diagnosis(Shown):
         Its description says that the values are the fitted ones, and which were given.
         """
         from hvdc_ident.model import Model, write_card
-        from hvdc_ident.simulate.steady_state import with_guesses
+        from hvdc_ident.simulate import with_guesses
 
         if not isinstance(self.augmented, Model):
             return {}

@@ -14,8 +14,7 @@ from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.fit import Free, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator, Tolerance
 
 PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
 """Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""

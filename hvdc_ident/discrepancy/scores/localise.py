@@ -14,8 +14,7 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit.nuisance import observe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, insertion_point
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator, Tolerance
 
 MOST_OF = 0.8
 """Share of the gap that a time window, a band or a region has to hold."""

@@ -29,8 +29,7 @@ from hvdc_ident.discrepancy.signatures.finite import SignatureColumn, kind_of
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
-from hvdc_ident.simulate.engine import Tolerance
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator, Tolerance
 
 SPOTS = 10
 """Sizes of an effect, the best at any place, at which the model is run."""

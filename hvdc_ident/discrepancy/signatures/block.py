@@ -19,9 +19,7 @@ from hvdc_ident.effects import Effect, EffectUse, alone
 from hvdc_ident.expression import FUNCTIONS, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, ordered_signals
-from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.machine import Code, Function
+from hvdc_ident.simulate import Code, Function, Graph, simulate
 
 FINE = 2.5e-4
 """s: an effect with corners in its derivative is stepped no more coarsely than this, in so many parts of a grid interval as it may take."""

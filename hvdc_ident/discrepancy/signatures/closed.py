@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.signatures.response import instants
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import External
-from hvdc_ident.simulate.engine import Tolerance
+from hvdc_ident.simulate import Tolerance
 
 MOVED = Tolerance(rtol=1e-6)
 """Error control of a run with something added to its inputs, and of the run that it is told against: the inputs are lines

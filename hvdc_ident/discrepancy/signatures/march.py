@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from hvdc_ident.simulate.call import call
-from hvdc_ident.simulate.linear import lu, solve
+from hvdc_ident.simulate import call, lu, solve
 
 
 @njit(cache=True, error_model="numpy")

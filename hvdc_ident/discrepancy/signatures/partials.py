@@ -14,9 +14,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.expression import symbol
 from hvdc_ident.model import Model
-from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.kept import by_structure
-from hvdc_ident.simulate.machine import Code, Function
+from hvdc_ident.simulate import Code, Function, Graph, by_structure
 
 _SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
 

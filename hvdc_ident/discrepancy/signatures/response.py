@@ -19,8 +19,7 @@ from hvdc_ident.discrepancy.signatures.propagation import propagate
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
-from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.recording import with_recording
+from hvdc_ident.simulate import simulate, with_recording
 
 CHUNK = 128
 FEWEST = 600

@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.trials.library import Term, along
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 WIDE = 20.0
 """Times its start value: how large a coefficient may become."""

@@ -30,7 +30,7 @@ from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 K = TypeVar("K", bound=Hashable)
 Data = Literal["fitted", "held out", "all"]

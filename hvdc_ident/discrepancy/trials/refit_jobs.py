@@ -17,7 +17,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.fit import Free
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 BIASED = 0.4
 """Share of its given value by which a gain has moved when it may have taken an effect's place."""

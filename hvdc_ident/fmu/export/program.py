@@ -12,10 +12,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.fmu.export import text
 from hvdc_ident.model import Model
-from hvdc_ident.simulate import tableaus
-from hvdc_ident.simulate.elimination import Elimination
-from hvdc_ident.simulate.engine import engine
-from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.simulate import Elimination, ModelEquations, engine_of, steps
 
 TOLERANCE = 1e-8
 """Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""
@@ -44,9 +41,9 @@ class Program:
     model: Model
 
     @cached_property
-    def structure(self) -> Structure:
+    def structure(self) -> ModelEquations:
         """Graph, equations and order of the variables; its graph gains the tangents."""
-        return Structure(self.model)
+        return ModelEquations(self.model)
 
     @cached_property
     def rest(self) -> Array:
@@ -54,7 +51,7 @@ class Program:
         m = self.model
         p = np.array([q.value for q in m.parameters.values()])
         u = np.array([i.value for i in m.inputs.values()])
-        code = engine(m)
+        code = engine_of(m)
         s = code.structure.sizes
         try:
             y, w = code.start(p, u, model=m)
@@ -160,16 +157,16 @@ class Program:
 def tableau() -> str:
     """The text of tableau.h: the coefficients of the integrator."""
     tables = {
-        "RODAS_A": tableaus.RODAS_A,
-        "RODAS_C": tableaus.RODAS_C,
-        "RODAS_H": tableaus.RODAS_H,
-        "RODAS_TIME": tableaus.RODAS_TIME,
-        "RODAS_D": tableaus.RODAS_D,
+        "RODAS_A": steps.RODAS_A,
+        "RODAS_C": steps.RODAS_C,
+        "RODAS_H": steps.RODAS_H,
+        "RODAS_TIME": steps.RODAS_TIME,
+        "RODAS_D": steps.RODAS_D,
     }
     lines = [
         "/* RODAS5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the",
         "   Julia Differential Equations package, BIT 63 (2023). */",
-        f"#define RODAS_GAMMA {text.number(tableaus.RODAS_GAMMA)}",
+        f"#define RODAS_GAMMA {text.number(steps.RODAS_GAMMA)}",
     ]
     for name, table in tables.items():
         shape = "".join(f"[{k}]" for k in table.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate import Graph
 
 GROUPS = ("y", "yd", "w", "wd", "p", "dp", "m")
 _BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/"}

@@ -24,9 +24,7 @@ from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.structural.finite_field import Array, HighPrecision, NoSuchNumber, NotRational, Ring
 from hvdc_ident.sensitivity.structural.taylor_series import Equations, Taylor, inverse
-from hvdc_ident.simulate.engine import engine
-from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.structure import Structure
+from hvdc_ident.simulate import Graph, ModelEquations, engine_of
 
 InputClass = Literal["constant", "step", "ramp", "free"]
 JUMPS = 8  # step sizes tried from one start before another start is drawn
@@ -238,7 +236,7 @@ class EquationSource:
 
     def __init__(self, model: Model, outputs: Sequence[str], start: Mapping[str, Start]) -> None:
         self.model, self.start = model, dict(start)
-        self.structure = Structure(model, (), outputs)
+        self.structure = ModelEquations(model, (), outputs)
         self.graph = self.structure.graph
         self.p = np.array([x.value for x in model.parameters.values()])
         self.u = np.array([x.value for x in model.inputs.values()])
@@ -251,7 +249,7 @@ class EquationSource:
         if self._point is None:
             try:
                 n = len(self.structure.states) + len(self.structure.unknowns)
-                self._point = engine(self.model).start(self.p, self.u, model=self.model)[0][:n]
+                self._point = engine_of(self.model).start(self.p, self.u, model=self.model)[0][:n]
             except SteadyStateError:
                 if "steady" in self.start.values():
                     raise

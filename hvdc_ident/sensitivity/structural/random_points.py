@@ -24,7 +24,7 @@ from hvdc_ident.sensitivity.structural.finite_field import (
 )
 from hvdc_ident.sensitivity.structural.observability import Base, PointRows, Question, affected, rows
 from hvdc_ident.sensitivity.structural.taylor_series import Equations
-from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate import Graph
 
 FIXED = -1
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.sensitivity.structural.finite_field import Array, NoSuchNumber, NotRational, OutOfTime, Ring
-from hvdc_ident.simulate.graph import Graph
+from hvdc_ident.simulate import Graph
 
 
 class Coefficients:

@@ -22,7 +22,7 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, read_card
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 
 CARDS = Path(__file__).resolve().parents[1] / "cards"
 NAMES = ("fit-1", "fit-2", "holdout")

@@ -16,7 +16,7 @@ from hvdc_ident.fit import Free, Problem, fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate.model_simulator import ModelSimulator
+from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.examples import Campaign, Noise, recorded
 
 NOISE = 5e-4

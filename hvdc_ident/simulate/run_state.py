@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from hvdc_ident.simulate.kernel import kernel
-from hvdc_ident.simulate.structure import NAMES
+from hvdc_ident.simulate.codegen import NAMES
+from hvdc_ident.simulate.simulation import STATUSES
+
+CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF = range(len(STATUSES))
 
 NODES = 5  # a delayed signal is kept as a quartic in each step, through five equidistant values
 
@@ -70,7 +72,7 @@ RUN = np.dtype(
     [(f, np.int64) for f in (*SIZES, *(f"do_{n}" for n in NAMES), "do_rhs", "do_observe", "do_sources", *VECTORS)]
     + [(f, np.int64) for f in (*COUNTS, *FLAGS)]
     + [(f, np.float64) for f in INSTANTS]
-    + [(f, np.int64) for f in ("free", "stamp")]  # where the workspace goes on; what the kernels were made from
+    + [("free", np.int64)]  # where the workspace goes on
 )
 
 
@@ -79,39 +81,3 @@ def place(field: str) -> int:
     names = RUN.names
     assert names is not None
     return names.index(field)
-
-
-@kernel()
-def _take(r, count):  # type: ignore[no-untyped-def]
-    """The address of the next `count` doubles of the workspace, rounded up for loops by four."""
-    address = r.free
-    r.free += 8 * ((count + 3) // 4 * 4 + 4)
-    return address
-
-
-@kernel()
-def arrange(r):  # type: ignore[no-untyped-def]
-    """Gives every vector of the workspace its place from r.free on; returns the end, so that from 0 it is the size."""
-    rows = 1 + r.width
-    r.y, r.yn, r.u = _take(r, r.size), _take(r, r.size), _take(r, r.size)
-    r.k, r.e, r.dense = _take(r, 8 * r.stride), _take(r, r.size), _take(r, 4 * r.stride)
-    r.add, r.mass, r.ft = _take(r, r.size), _take(r, r.size), _take(r, r.size)
-    r.f_before, r.f_after = _take(r, r.size), _take(r, r.size)
-    r.yd, r.m = _take(r, r.n), _take(r, r.ns)
-    r.w = _take(r, r.nw + (r.nd + r.nq) * r.width)
-    r.wd = _take(r, r.nw + (r.nd + r.nq) * r.width)
-    r.jac, r.matrix, r.small = _take(r, r.n * r.n), _take(r, r.n * r.n), _take(r, r.nz * r.nz)
-    r.hessian, r.factor, r.shift = _take(r, r.hessians * r.width), _take(r, r.factors + 1), _take(r, 1)
-    r.pivots, r.small_pivots = _take(r, r.n), _take(r, r.nz)
-    r.floors, r.totals = _take(r, r.width), _take(r, r.width)
-    r.z_before, r.z_from, r.z_step, r.side = _take(r, r.nz), _take(r, r.nz), _take(r, r.nz), _take(r, r.ns)
-    r.sv, r.top, r.slack, r.sws = _take(r, r.ns), _take(r, r.ns), _take(r, r.ns), _take(r, r.ns * rows)
-    r.src, r.src_rate = _take(r, (r.nd + r.nq) * rows), _take(r, r.nd + r.nq)
-    r.src_left = _take(r, r.nd + r.nq)
-    r.lag, r.lag_p, r.before = _take(r, r.nd), _take(r, r.nd * r.width), _take(r, r.nd * rows)
-    r.nodes = _take(r, NODES * r.nd * rows)
-    r.tick, r.publish, r.ticks, r.pending = _take(r, r.nq), _take(r, r.nq), _take(r, r.nq), _take(r, r.nq)
-    r.pending_p, r.publish_p = _take(r, r.nq * r.width), _take(r, r.nq * r.width)
-    r.jump_p, r.at = _take(r, r.width), _take(r, r.nu)
-    r.instants, r.block = _take(r, 4), _take(r, 4 * r.stride)
-    return r.free

@@ -11,43 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any, TypeVar
 
 import sympy as sp
 
-from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.errors import unknown_name
 from hvdc_ident.expression import symbol
-from hvdc_ident.model import Model
-from hvdc_ident.simulate.elimination import Elimination, eliminate, solve_text
+from hvdc_ident.model import Model, dependency_order
+from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.machine import Code, Function, Row, function_text
+from hvdc_ident.simulate.object_code import Code
 
 ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
+SHORTEST = 2.0**-16  # of a path of values: a step that has to be shorter means that the path ends
 TINY = 1e-3  # the least that an unknown counts for, where it tells by what an equation's residual is measured
-# The order in which the integrators take the addresses.
-NAMES = (
-    "f",
-    "fs",
-    "jac",
-    "hess",
-    "ft",
-    "sw",
-    "sws",
-    "swd",
-    "modes",
-    "out",
-    "outs",
-    "rows",
-    "src",
-    "srcs",
-    "srcd",
-    "rest",
-    "rest_jac",
-    "rest_p",
-    "const",
-    "lu",
-    "solve",
-)
 LATE = ("hess",)  # beside the elimination: what only the Rosenbrock method needs
 
 
@@ -102,7 +80,7 @@ class Sizes:
     n_hess: int
 
 
-class Structure:
+class ModelEquations:
     """A model's equations as a graph, and the machine code made from it for the given sensitivity parameters and outputs."""
 
     def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
@@ -129,7 +107,7 @@ class Structure:
         memo: dict[sp.Basic, int] = {}
         plain = [n for n in m.algebraic if n not in self.unknowns]
         definitions = {n: s.value for n, s in m.signals.items()} | {n: m.algebraic[n].equation for n in plain}
-        for name in _ordered(definitions, m.name):
+        for name in dependency_order(m, definitions):
             nodes[name] = g.expression(definitions[name], nodes, memo)
 
         def node(e: sp.Expr) -> int:
@@ -341,30 +319,30 @@ class Structure:
         return Code(self.graph, [f for f in self.functions if f.name in LATE], max(width, 1), written)
 
 
-def _ordered(definitions: dict[str, sp.Expr], model: str) -> list[str]:
-    """The names in an order in which each uses only earlier ones."""
-    uses = {n: [k for k in sorted(_names(e)) if k in definitions] for n, e in definitions.items()}
-    done: dict[str, bool] = {}
-    order: list[str] = []
-    for root in definitions:
-        stack = [(root, iter(uses[root]))]
-        if root in done:
-            continue
-        done[root] = False
-        while stack:
-            name, rest = stack[-1]
-            following = next((k for k in rest if not done.get(k, False)), None)
-            if following is None:
-                done[name] = True
-                order.append(name)
-                stack.pop()
-            elif following in done:
-                raise ModelError(
-                    f"the signals run in a circle through '{following}'",
-                    where=f"model '{model}'",
-                    hint="declare one of them under `algebraic`",
-                )
-            else:
-                done[following] = False
-                stack.append((following, iter(uses[following])))
-    return order
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class _Key:
+    """Key of the machine code: the equations and the other arguments, not the values of parameters and inputs."""
+
+    model: Model
+    others: tuple[Any, ...]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, _Key) or self.others != other.others:
+            return False
+        return self.model is other.model or self.model.structure == other.model.structure
+
+    def __hash__(self) -> int:
+        return hash((self.model.structure, self.others))
+
+
+def by_structure(make: Callable[..., T], room: int) -> Callable[..., T]:
+    """The maker, called with a model and hashable arguments, with its last `room` results kept."""
+
+    @lru_cache(maxsize=room)
+    def kept(key: _Key) -> T:
+        return make(key.model, *key.others)
+
+    return lambda model, *others: kept(_Key(model, others))

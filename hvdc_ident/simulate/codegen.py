@@ -1,4 +1,4 @@
-"""Machine code from graph nodes: LLVM IR written straight from the graph, compiled in a fraction of a second.
+"""LLVM IR written straight from the graph: the functions that an integrator calls, and the elimination of its linear systems.
 
 Every function has the one signature `void f(y, yd, w, wd, p, m, out)` of pointers to doubles (`ARGUMENTS`), so that an
 integrator compiled once can call the functions of any model by address. A matrix row over the sensitivity parameters is
@@ -7,20 +7,18 @@ one LLVM vector, which the compiler turns into the machine's own vector instruct
 
 from __future__ import annotations
 
-import ctypes
 import struct
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import llvmlite.binding as llvm
-import numpy as np
-
-from hvdc_ident.data import Array
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.objects import compiled, kept, loaded
 
+# Names of the generated functions, in the order in which the integrators take their addresses.
+NAMES = (
+    "f", "fs", "jac", "hess", "ft", "sw", "sws", "swd", "modes", "out", "outs", "rows", "src", "srcs", "srcd",
+    "rest", "rest_jac", "rest_p", "const", "lu", "solve",
+)  # fmt: skip
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
 LANES = 4  # instants that a function over several of them takes at once
 BLOCK = 300  # instructions of a block of a long function
@@ -50,47 +48,7 @@ class Function:
     hot: bool = False  # called in every step: worth the compiler's full effort
 
 
-class Code:
-    """Compiled functions of one module: `address[name]`. The code lives as long as this object."""
-
-    def __init__(
-        self,
-        graph: Graph,
-        functions: Sequence[Function],
-        width: int,
-        written: Mapping[str, Callable[[str], str]] | None = None,
-    ) -> None:
-        """written: further hot functions as text, by name; each is called with the symbol it has to define."""
-        self._engines: list[llvm.ExecutionEngine] = []
-        self.address: dict[str, int] = {}
-        for hot in (True, False):
-            texts = {f.name: function_text(graph, f, _symbol(f.name), width) for f in functions if f.hot == hot}
-            if hot:
-                texts |= {n: text(_symbol(n)) for n, text in (written or {}).items()}
-            if texts:
-                engine = _engine("\n".join([*_declarations(), *texts.values()]), hot)
-                self._engines.append(engine)
-                self.address |= {n: engine.get_function_address(_symbol(n)) for n in texts}
-        # Freed with this object, but not at the end of the process, when LLVM may be gone before it.
-        weakref.finalize(self, _close, self._engines).atexit = False
-
-
-def _close(engines: list[llvm.ExecutionEngine]) -> None:
-    for engine in engines:
-        engine.close()
-
-
-def _symbol(name: str) -> str:
-    return f"hvdcident_{name}"
-
-
-def _engine(text: str, hot: bool) -> llvm.ExecutionEngine:
-    """The engine of a module; a cold one is compiled quickly instead of well, which halves the time of a new structure."""
-    # The graph is free of common parts and its rows are vectors already: little is left for the optimiser.
-    return loaded(kept(f"{hot}\0{text}", lambda: compiled(text, effort=2 if hot else 0, combine=hot)))
-
-
-def _declarations() -> list[str]:
+def declarations() -> list[str]:
     lines = ["declare double @llvm.fabs.f64(double)", "declare double @llvm.pow.f64(double, double)"]
     lines += [f"declare <{LANES} x double> @llvm.sqrt.v{LANES}f64(<{LANES} x double>)"]
     for function in FUNCTIONS.values():
@@ -311,10 +269,156 @@ class _LanesEmitter(_Emitter):
         return self._gather([call(op, [self._lane(v, lane) for v in x]) for lane in range(LANES)])
 
 
-_GENERATED = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
+# --- the linear systems of the Rosenbrock method ---
+
+LARGEST = 20_000  # factors beyond which straight-line code no longer pays
 
 
-def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
-    """Calls one generated function from Python."""
-    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, np.zeros_like(w), p, m)]
-    _GENERATED(int(address))(*(a.ctypes.data for a in arrays), out.ctypes.data)
+@dataclass(frozen=True)
+class Elimination:
+    """Pivot order, and the place of every factor: (i, j) -> index; (k, k) holds the pivot's inverse, the first n places."""
+
+    order: tuple[int, ...]
+    places: Mapping[tuple[int, int], int]
+    lower: Mapping[int, tuple[int, ...]]  # column k: rows below it
+    upper: Mapping[int, tuple[int, ...]]  # row k: columns right of it
+    graph: Graph
+    function: Function  # of `graph`: the factors from the Jacobian in y and the shift in w
+
+    @property
+    def count(self) -> int:
+        """Number of factors. The place after them holds `growth`."""
+        return len(self.places)
+
+
+def eliminate(entries: Mapping[tuple[int, int], float | None], n: int, nx: int) -> Elimination | None:
+    """The elimination for a Jacobian with the given entries: a number where one is constant, None where it is read.
+
+    None where the diagonal has a structural zero or the factors would be too many.
+    """
+    graph = Graph()
+    shift = graph.leaf("w", 0)
+    matrix: dict[int, dict[int, int]] = {i: {} for i in range(n)}
+    for (i, j), constant in entries.items():
+        node = graph.leaf("y", i * n + j) if constant is None else graph.constant(constant)
+        matrix[i][j] = graph.neg(node)
+    for i in range(nx):
+        matrix[i][i] = graph.add(shift, matrix[i][i]) if i in matrix[i] else shift
+    columns: dict[int, set[int]] = {j: {i for i in range(n) if j in matrix[i]} for j in range(n)}
+    left = set(range(n))
+    order: list[int] = []
+    lower: dict[int, tuple[int, ...]] = {}
+    upper: dict[int, tuple[int, ...]] = {}
+    factors: dict[tuple[int, int], int] = {}
+    while left:
+        ready = [k for k in left if k in matrix[k]]
+        if not ready:
+            return None
+        k = min(ready, key=lambda k: ((len([j for j in matrix[k] if j in left]) - 1) * (len(columns[k] & left) - 1), k))
+        left.discard(k)
+        order.append(k)
+        inverse = graph.div(graph.one, matrix[k][k])
+        factors[k, k] = inverse
+        upper[k] = tuple(sorted(j for j in matrix[k] if j in left))
+        lower[k] = tuple(sorted(columns[k] & left))
+        for j in upper[k]:
+            factors[k, j] = matrix[k][j]
+        for i in lower[k]:
+            factors[i, k] = graph.mul(matrix[i][k], inverse)
+            for j in upper[k]:
+                product = graph.mul(factors[i, k], matrix[k][j])
+                if j in matrix[i]:
+                    matrix[i][j] = graph.sub(matrix[i][j], product)
+                else:
+                    matrix[i][j] = graph.neg(product)
+                    columns[j].add(i)
+        if len(factors) > LARGEST:
+            return None
+    places = {(k, k): k for k in range(n)}
+    for key in factors:
+        if key[0] != key[1]:
+            places[key] = len(places)
+    stored = [(places[key], node) for key, node in factors.items()]
+    function = Function("lu", [*stored, (len(places), _growth(graph, entries, factors, shift, n, nx))], hot=True)
+    return Elimination(tuple(order), places, lower, upper, graph, function)
+
+
+def _growth(
+    graph: Graph,
+    entries: Mapping[tuple[int, int], float | None],
+    factors: Mapping[tuple[int, int], int],
+    shift: int,
+    n: int,
+    nx: int,
+) -> int:
+    """The node that tells how small pivots are against their rows: the sum of |row| / |pivot|, not finite where one is 0."""
+    total = graph.zero
+    for i in range(n):
+        size = shift if i < nx else graph.zero
+        for (row, j), constant in entries.items():
+            if row == i:
+                entry = graph.leaf("y", i * n + j) if constant is None else graph.constant(constant)
+                size = graph.add(size, graph.call("fabs", entry))
+        total = graph.add(total, graph.mul(graph.call("fabs", factors[i, i]), size))
+    return total
+
+
+def solve_text(elimination: Elimination, symbol: str, width: int, second: Sequence[tuple[int, int]] = ()) -> str:
+    """LLVM IR of `symbol`: solves in place for the flat vector in `out` with the factors in `p`, rows of `width` included.
+
+    First `y` is added to `out`; after the n leading elements are solved, the rows get second derivatives times these:
+    `yd` holds one row for each (equation, unknown) in `second`.
+    """
+    kind = "double"
+    lines: list[str] = []
+    count = 0
+
+    def emit(instruction: str) -> str:
+        nonlocal count
+        count += 1
+        lines.append(f"  %v{count} = {instruction}")
+        return f"%v{count}"
+
+    def element(argument: str, offset: int) -> str:
+        return f"%{argument}" if offset == 0 else emit(f"getelementptr double, ptr %{argument}, i64 {offset}")
+
+    def load(argument: str, offset: int) -> str:
+        return emit(f"load {kind}, ptr {element(argument, offset)}, align 8")
+
+    def splat(value: str) -> str:
+        if kind == "double":
+            return value
+        one = emit(f"insertelement {kind} undef, double {value}, i32 0")
+        return emit(f"shufflevector {kind} {one}, {kind} undef, <{width} x i32> zeroinitializer")
+
+    def factor(i: int, j: int) -> str:
+        return splat(emit(f"load double, ptr {element('p', elimination.places[i, j])}, align 8"))
+
+    def solve(x: dict[int, str], at: int, step: int) -> None:
+        for k in elimination.order:
+            for i in elimination.lower[k]:
+                product = emit(f"fmul contract {kind} {factor(i, k)}, {x[k]}")
+                x[i] = emit(f"fsub contract {kind} {x[i]}, {product}")
+        for k in reversed(elimination.order):
+            for j in elimination.upper[k]:
+                product = emit(f"fmul contract {kind} {factor(k, j)}, {x[j]}")
+                x[k] = emit(f"fsub contract {kind} {x[k]}, {product}")
+            x[k] = emit(f"fmul contract {kind} {x[k]}, {factor(k, k)}")
+            lines.append(f"  store {kind} {x[k]}, ptr {element('out', at + step * k)}, align 8")
+
+    def start(at: int, step: int) -> dict[int, str]:
+        places = {k: at + step * k for k in elimination.order}
+        return {k: emit(f"fadd contract {kind} {load('out', q)}, {load('y', q)}") for k, q in places.items()}
+
+    values = start(0, 1)
+    solve(values, 0, 1)
+    if width:
+        n = len(elimination.order)
+        kind = f"<{width} x double>"
+        rows = start(n, width)
+        for k, (i, j) in enumerate(second):
+            product = emit(f"fmul contract {kind} {load('yd', k * width)}, {splat(values[j])}")
+            rows[i] = emit(f"fadd contract {kind} {rows[i]}, {product}")
+        solve(rows, n, width)
+    arguments = ", ".join(f"ptr %{a}" if a != "out" else "ptr noalias %out" for a in ARGUMENTS)
+    return f"define void @{symbol}({arguments}) nounwind {{\n" + body(lines) + "\n  ret void\n}"

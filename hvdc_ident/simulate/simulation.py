@@ -1,4 +1,4 @@
-"""Result of a simulation."""
+"""Result of a simulation, and the statuses with which a run ends."""
 
 from __future__ import annotations
 
@@ -15,6 +15,17 @@ from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
     import xarray
+
+
+STATUSES = ("converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff")
+HINTS = {
+    "step-limit": "look for a very fast part of the model, or for a jump (`where`) that the state's own derivative turns back: "
+    "give it a width, as clip((a - b)/width, 0, 1); from Python, Tolerance(max_steps=..., rtol=...)",
+    "not-finite": "a value grew without bound or left a function's domain: check parameter values and limits",
+    "chatter": "a limit switches on and off without end: add a hysteresis or a small lag where it acts",
+    "inconsistent": "no solution of the algebraic loop was found there: check the operating point, or give the unknown another start",
+    "stiff": "use the Rosenbrock method",
+}
 
 
 @dataclass(frozen=True)
@@ -106,8 +117,3 @@ class Simulation(Shown):
             "sensitivities": derivatives if self.parameters else {},
             "statistics": self.statistics.__dict__,
         }
-
-
-def rmse(a: Array, b: Array) -> float:
-    """The root mean square of the difference."""
-    return float(np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)))

@@ -8,15 +8,26 @@ with its own digest; what is damaged is compiled anew. A folder that cannot be w
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
+import importlib
 import os
+import platform
+import sys
 import uuid
-from collections.abc import Callable, Iterator
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import llvmlite
 import llvmlite.binding as llvm
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.simulate.codegen import Function, declarations, function_text
+from hvdc_ident.simulate.graph import Graph
 
 ROOM = 128 * 2**20  # bytes kept in a folder; beyond, the half that was not used for the longest time goes
 LOOK = 64  # writes between two looks at what a folder holds: to list thousands of files takes longer than to make one
@@ -154,3 +165,111 @@ def loaded(code: bytes) -> llvm.ExecutionEngine:
     engine.finalize_object()
     engine.set_object_cache()  # it has read the code
     return engine
+
+
+# --- the generated functions of a model ---
+
+
+class Code:
+    """Compiled functions of one module: `address[name]`. The code lives as long as this object."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        functions: Sequence[Function],
+        width: int,
+        written: Mapping[str, Callable[[str], str]] | None = None,
+    ) -> None:
+        """written: further hot functions as text, by name; each is called with the symbol it has to define."""
+        self._engines: list[llvm.ExecutionEngine] = []
+        self.address: dict[str, int] = {}
+        for hot in (True, False):
+            texts = {f.name: function_text(graph, f, _symbol(f.name), width) for f in functions if f.hot == hot}
+            if hot:
+                texts |= {n: text(_symbol(n)) for n, text in (written or {}).items()}
+            if texts:
+                engine = _loaded_module("\n".join([*declarations(), *texts.values()]), hot)
+                self._engines.append(engine)
+                self.address |= {n: engine.get_function_address(_symbol(n)) for n in texts}
+        # Freed with this object, but not at the end of the process, when LLVM may be gone before it.
+        weakref.finalize(self, _close, self._engines).atexit = False
+
+
+def _close(engines: list[llvm.ExecutionEngine]) -> None:
+    for engine in engines:
+        engine.close()
+
+
+def _symbol(name: str) -> str:
+    return f"hvdcident_{name}"
+
+
+def _loaded_module(text: str, hot: bool) -> llvm.ExecutionEngine:
+    """The engine of a module; a cold one is compiled quickly instead of well, which halves the time of a new structure."""
+    # The graph is free of common parts and its rows are vectors already: little is left for the optimiser.
+    return loaded(kept(f"{hot}\0{text}", lambda: compiled(text, effort=2 if hot else 0, combine=hot)))
+
+
+_GENERATED = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
+
+
+def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
+    """Calls one generated function from Python."""
+    arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, np.zeros_like(w), p, m)]
+    _GENERATED(int(address))(*(a.ctypes.data for a in arrays), out.ctypes.data)
+
+
+# --- the integrators ---
+
+ENTRIES = dict.fromkeys(("integrate", "room"), "integrator") | dict.fromkeys(
+    ("newton", "trace", "follow", "slide", "nearest", "judge"), "steady_state_kernels"
+)
+"""Functions of compiled code that Python calls, with their modules."""
+KERNEL_FILES = (
+    "codegen", "equations", "events", "exogenous", "integrator", "native", "run_state", "simd", "simulation",
+    "steady_state_kernels", "steps",
+)  # fmt: skip
+"""What they are made from."""
+
+
+@cache
+def entry(name: str) -> Callable[..., int]:
+    """Return one of `ENTRIES`, loaded, or compiled where this installation has not compiled it as it is.
+
+    It takes arrays, contiguous and of the right type, which is for the caller to see to; it raises MemoryError.
+    """
+    import numba
+    from numba.core.registry import cpu_target
+    from numba.core.runtime import rtsys
+
+    rtsys.initialize(cpu_target.target_context)  # makes what compiled code calls (memory, errors) known by name
+    files = [hashlib.sha256((Path(__file__).parent / f"{f}.py").read_bytes()).hexdigest() for f in KERNEL_FILES]
+    facts = " ".join([name, numba.__version__, platform.python_version(), *files])
+    engine = loaded(kept(facts, lambda: _compiled_entry(name)))
+    function = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.py_object)(engine.get_function_address(_symbol(name)))
+
+    def call(*arrays: Any, _engine: llvm.ExecutionEngine = engine) -> int:
+        answer = function(arrays)
+        if answer == 0:
+            raise MemoryError
+        return answer - 1
+
+    return call
+
+
+def _compiled_entry(name: str) -> bytes:
+    from numba import cfunc, types
+
+    _announce()
+    function = getattr(importlib.import_module(f"hvdc_ident.simulate.{ENTRIES[name]}"), name)
+    made = cfunc(types.int64(types.int64), error_model="numpy")(function)
+    return compiled(str(made.inspect_llvm()).replace(made.native_name, _symbol(name)), effort=3)
+
+
+@cache
+def _announce() -> None:
+    print(
+        "hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...",
+        file=sys.stderr,
+        flush=True,
+    )

@@ -1,0 +1,207 @@
+"""Runs of experiments: with what an experiment changes of the model, which are slots driven by recorded columns, outputs seen through
+instruments, inputs with an unknown offset and states with a start of their own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
+from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
+from hvdc_ident.expression import symbol
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
+from hvdc_ident.parameters import Input, Parameter
+from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
+from hvdc_ident.simulate.simulation import Simulation, Statistics
+
+if TYPE_CHECKING:
+    from hvdc_ident.effects import EffectUse
+
+
+def with_recording(model: Model, experiment: Experiment) -> Model:
+    """The model with the experiment's driven slots as inputs and its recording chains on the outputs."""
+    if not experiment.drive and not experiment.instrument:
+        return model
+    return _with_recording(model, experiment.drive, experiment.instrument)
+
+
+@lru_cache(maxsize=32)
+def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[FrozenMap[float]]) -> Model:
+    return model.driven(drive).with_effects(chains_of(instrument))
+
+
+def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
+    """The recording chains as effects at the outputs: what the instrument does to the signal, in its order."""
+    from hvdc_ident.effects import EffectUse
+
+    chains = []
+    for output, chain in instrument.items():
+        for name in ("window-mean", "delay"):
+            if chain.get(name):
+                chains.append(EffectUse(name, (f"outputs.{output}",), FrozenMap({"T": chain[name]})))
+    return chains
+
+
+def with_own(model: Model, names: Sequence[str]) -> tuple[Model, FrozenMap[str]]:
+    """The model with what an experiment has for itself as parameters, and the parameter of each name.
+
+    names: inputs, to which a constant is added all along, the steady start included (0 unless given); states, which
+    begin at a value instead of at rest. What the model calls free already is its own parameter.
+    """
+    return _with_own(model, tuple(names)) if names else (model, FrozenMap())
+
+
+@lru_cache(maxsize=32)
+def _with_own(model: Model, names: tuple[str, ...]) -> tuple[Model, FrozenMap[str]]:
+    found = {}
+    for name in names:
+        if name in model.states:
+            found[name] = f"{name}_start"
+            state = model.states[name]
+            if state.start != "free":
+                start = Parameter(state.guess or 0.0, state.unit, description=f"{name} at the start")
+                free = replace(state, start="free")
+                model = replace(
+                    model,
+                    states=model.states | {name: free},
+                    parameters=model.parameters | {found[name]: start},
+                )
+            continue
+        found[name] = offset = fresh(model, f"{name}_offset")
+        constant = Parameter(0.0, model.inputs[name].unit, description=f"constant added to {name}")
+        model = replace(model, parameters=model.parameters | {offset: constant})
+        model = rewritten(model, name, "offset", lambda m, u, offset=offset: (m, u + symbol(offset)))  # type: ignore[misc]
+    return model, FrozenMap(found)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSimulator:
+    """The model with its engine: parameters, and runs with sensitivities. It travels to other processes.
+
+    tolerance: of every run (default: the engine's own).
+    """
+
+    model: AnyModel
+    tolerance: Tolerance | None = None
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """The model's parameters by name."""
+        return self.model.parameters
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:
+        """The model's inputs by name; each may stand among the sensitivities, for a constant added to it."""
+        return self.model.inputs
+
+    @property
+    def states(self) -> Mapping[str, State]:
+        """The states by name; each may stand among the sensitivities, for its start. An FMU shows none."""
+        return self.model.states if isinstance(self.model, Model) else {}
+
+    def simulate(
+        self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
+    ) -> Simulation:
+        """A run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
+        try:
+            return simulate(
+                self.model, experiment, values, sensitivities,
+                outputs=experiment.outputs or None, tolerance=self.tolerance,
+            )  # fmt: skip
+        except SteadyStateError as e:
+            raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
+
+
+@lru_cache(maxsize=256)
+def _constant(value: float) -> InputSignal:
+    return InputSignal.constant(value)
+
+
+def simulate(
+    model: AnyModel,
+    experiment: Experiment,
+    values: Mapping[str, float] | None = None,
+    sensitivities: Sequence[str] = (),
+    *,
+    outputs: Sequence[str] | None = None,
+    tolerance: Tolerance | None = None,
+    rtol: float | None = None,
+    method: Method = "auto",
+    partial: bool = False,
+) -> Simulation:
+    """The model's outputs at the experiment's times and, exactly, their derivatives by the named parameters.
+
+    values: parameters (and constant inputs) that differ from the model's. outputs: names of outputs or signals (default:
+    all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
+    the parameters, and so do the sensitivities at the start. rtol: shorthand for a Tolerance with atol = rtol / 100.
+    The name of an input among the sensitivities asks for the derivative by a constant added to that input all along,
+    that of a state for the derivative by its start, which is then no longer the steady one.
+    A model that is external (an FMU) runs itself, from its own start; `method` is then its own. It may ask for the end
+    of its run: partial gives the rows up to there, with status "ended" and the instant in the notes; else that has failed.
+
+    Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
+    """
+    if not isinstance(model, Model):
+        chosen = tuple(model.outputs) if outputs is None else outputs
+        tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
+        ending = {"partial": True} if partial else {}
+        found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
+        return found
+    plant = with_recording(model, experiment)
+    given = {**experiment.values, **(values or {})}
+    names = [*plant.parameters, *plant.inputs]
+    for name in (*given, *experiment.inputs):
+        if name not in plant.parameters and name not in plant.inputs:
+            raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
+    for name in experiment.offsets:
+        if name not in plant.inputs:
+            raise unknown_name("input", name, plant.inputs, where=f"experiment '{experiment.name}'")
+    for name in experiment.starts:
+        if name not in plant.states:
+            raise unknown_name("state", name, plant.states, where=f"experiment '{experiment.name}'")
+    own = {**experiment.offsets, **experiment.starts}
+    plant, parameter = with_own(plant, [n for n in (*plant.inputs, *plant.states) if n in own or n in sensitivities])
+    given |= {parameter[n]: v for n, v in own.items()}
+    code = engine_of(plant, [parameter.get(n, n) for n in sensitivities], outputs)
+    p = [float(given.get(n, q.value)) for n, q in plant.parameters.items()]
+    if not all(map(math.isfinite, p)):
+        bad = [n for n, v in zip(plant.parameters, p, strict=True) if not math.isfinite(v)]
+        raise ModelError(
+            f"the value of parameter '{bad[0]}' is not finite",
+            where=f"model '{model.name}'",
+            hint="an effect at an infinite neutral value is left out: do not set it",
+        )
+    signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
+    tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
+    scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities]) if sensitivities else None
+    try:
+        out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale, model=plant)
+    except (SimulationError, SteadyStateError) as e:
+        raise e.at(f"experiment '{experiment.name}'") from None
+    return _simulation(plant, code, experiment, out, statistics, tuple(sensitivities))
+
+
+def _simulation(
+    model: Model, code: Engine, experiment: Experiment, out: Array, statistics: Statistics, asked: tuple[str, ...]
+) -> Simulation:
+    s = code.structure.sizes
+    names = code.structure.outputs
+    units = tuple(model.outputs[n].unit if n in model.outputs else "" for n in names)
+    gradient = (
+        out[:, s.no :].reshape(experiment.time.size, s.no, s.width)[:, :, : s.np]
+        if s.width
+        else np.zeros((experiment.time.size, s.no, 0))
+    )
+    return Simulation(
+        Trajectory(experiment.time, out[:, : s.no], names, units),
+        asked,
+        gradient,
+        statistics,
+        FrozenMap(),
+    )
