@@ -253,3 +253,32 @@ def test_the_installed_command_answers(tmp_path: Path) -> None:
     assert (
         done.stderr == "error: none.toml: no such study file. Try: 'hvdc-ident new DIR' writes a study to start from\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--budget", "soon"), "expected seconds, at least 0.001, got 'soon'. Try: --budget 600"),
+        (("--budget", "0"), "expected seconds, at least 0.001, got '0'. Try: --budget 600"),
+        (("--memory", "-5"), "expected MiB above 0, got '-5'. Try: --memory 4096"),
+        (("--workers", "0"), "expected a whole number from 1 to 4096, got '0'. Try: --workers 2"),
+    ],
+)
+def test_a_wrong_number_says_what_is_expected_and_what_to_try(arguments: tuple[str, str], expected: str) -> None:
+    result = call("fit", "study.toml", *arguments)
+    assert result.exit_code == 2 and expected in " ".join(result.stderr.split())
+
+
+def test_an_fmu_that_is_not_there_names_those_beside_it(tmp_path: Path) -> None:
+    result = call("check", tmp_path / "nothing.fmu")
+    assert result.exit_code == 2 and "no such FMU" in result.stderr and ". Try: " in result.stderr
+    (tmp_path / "link.fmu").touch()
+    assert "Try: link.fmu in the same folder" in call("check", tmp_path / "nothing.fmu").stderr
+
+
+def test_a_command_to_paste_has_the_options_that_were_given() -> None:
+    from hvdc_ident.command import Access, pasteable
+
+    access = Access(trust=True, deadline=300.0, memory=4096.0)
+    text = pasteable("next: hvdc-ident diagnose STUDY", Path("a b.toml"), Path("r"), access)
+    assert text == "next: hvdc-ident diagnose 'a b.toml' --out r --trust --deadline 300 --memory 4096"
