@@ -14,10 +14,9 @@ import numpy as np
 from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
 from hvdc_ident.linearize.system import Array, CompiledSystem, system
 from hvdc_ident.model import Model
+from hvdc_ident.simulate import ACCURACY
 
 Equations = Callable[[Array], tuple[Array, Array]]
-ACCURACY = 1e-10
-"""Largest scaled residual that counts as solved: each equation against the size of its own terms."""
 SHORTEST = 2.0**-10
 """Of the way of a homotopy: a part that has to be shorter ends it."""
 

@@ -13,11 +13,11 @@ import numpy as np
 from hvdc_ident.display import table_html
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.equilibrium import ACCURACY, At, EquilibriumSearch, Root, homotopy, newton, weights
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate import Equilibria, equilibria, resting
+from hvdc_ident.simulate import ACCURACY, Equilibria, equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
 Side = Literal["here", "below", "above"]

@@ -8,10 +8,10 @@ if TYPE_CHECKING:
     from hvdc_ident.simulate.codegen import NAMES, Elimination, Function
     from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
     from hvdc_ident.simulate.equations import ACCURACY, ModelEquations, by_structure, torn
+    from hvdc_ident.simulate.experiment_run import ModelSimulator, chains_of, simulate, with_recording
     from hvdc_ident.simulate.graph import Graph
     from hvdc_ident.simulate.native import call, lu, solve
     from hvdc_ident.simulate.object_code import Code, evaluate
-    from hvdc_ident.simulate.run import ModelSimulator, chains_of, simulate, with_recording
     from hvdc_ident.simulate.simulation import Simulation, Statistics
     from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting, with_guesses
 else:
@@ -24,7 +24,7 @@ else:
             "graph": "Graph",
             "native": "call lu solve",
             "object_code": "Code evaluate",
-            "run": "ModelSimulator chains_of simulate with_recording",
+            "experiment_run": "ModelSimulator chains_of simulate with_recording",
             "simulation": "Simulation Statistics",
             "steady_state": "Equilibria equilibria resting with_guesses",
         },

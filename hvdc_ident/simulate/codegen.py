@@ -83,7 +83,7 @@ def function_text(graph: Graph, function: Function, symbol: str, width: int) -> 
 
 
 class _Emitter:
-    """Writes one function."""
+    """Writer of one function."""
 
     kind, bit = "double", "i1"
 
@@ -117,11 +117,11 @@ class _Emitter:
         self.lines.append(f"  store {kind} {value}, ptr {pointer}, align 8")
 
     def _node(self, place: int, value: str) -> None:
-        """Stores a node's value."""
+        """Store a node's value."""
         self._store("double", value, place)
 
     def _row(self, place: int, row: Row) -> None:
-        """Stores a row."""
+        """Store a row."""
         kind = f"<{self.width} x double>"
         total = "zeroinitializer"
         for column, node in row.scalars.items():
@@ -217,7 +217,7 @@ class _Emitter:
 
 
 class _LanesEmitter(_Emitter):
-    """Writes a function of plain nodes that works on several instants at once, one a lane.
+    """Writer of a function of plain nodes that works on several instants at once, one a lane.
 
     `y` holds a flat vector and `out` a result for every instant, `stride` doubles apart; `yd` holds the instants. All
     else (inputs, delayed and sampled signals, parameters, modes) is the same for all of them.

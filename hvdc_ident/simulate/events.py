@@ -32,7 +32,7 @@ def violation(r, y):  # type: ignore[no-untyped-def]
 
 @kernel()
 def widen(r):  # type: ignore[no-untyped-def]
-    """Keeps the largest value of every switch so far, which its tolerance is relative to."""
+    """Keep the largest value of every switch so far, which its tolerance is relative to."""
     values, top, slack = vector(r.sv, r.ns), vector(r.top, r.ns), vector(r.slack, r.ns)
     for i in range(r.ns):
         size = abs(values[i])
@@ -106,14 +106,14 @@ def shift_rows(r, before, after, jump):  # type: ignore[no-untyped-def]
 
 @kernel()
 def add_echoes(r, order):  # type: ignore[no-untyped-def]
-    """Notes that what happens now comes back after every delay, whose room the caller has made."""
+    """Note that what happens now comes back after every delay, whose room the caller has made."""
     for i in range(r.nd):
         add_echo(r, i, order)
 
 
 @kernel()
 def add_echo(r, i, order):  # type: ignore[no-untyped-def]
-    """Notes that a jump (order 0) or a corner of delay i's source comes back after the delay."""
+    """Note that a jump (order 0) or a corner of delay i's source comes back after the delay."""
     width = r.width
     at = r.t + vector(r.lag, r.nd)[i]
     if not at < r.end:
@@ -193,7 +193,7 @@ def _jump(r, event, speed):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _loop_matrix(r):  # type: ignore[no-untyped-def]
-    """Factors the Jacobian of the unknowns' equations by the unknowns; r.jac has to be up to date."""
+    """Factor the Jacobian of the unknowns' equations by the unknowns; r.jac has to be up to date."""
     nx, nz, n = r.nx, r.nz, r.n
     jac, small = table(r.jac, n, n), table(r.small, nz, nz)
     for i in range(nz):
@@ -204,7 +204,7 @@ def _loop_matrix(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def consistent(r, live):  # type: ignore[no-untyped-def]
-    """Solves the unknowns (and their sensitivities) for the present states, with modes found from the values where `live`.
+    """Solve the unknowns (and their sensitivities) for the present states, with modes found from the values where `live`.
 
     Returns whether a solution was found. Where Newton's method cycles between the sides of a limit, the way is followed
     from limit to limit, from the values before. Uses r.e as scratch.
@@ -331,7 +331,7 @@ def _residual(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _move(r, share):  # type: ignore[no-untyped-def]
-    """Goes that share of the step from its origin; returns the residual there."""
+    """Go that share of the step from its origin; returns the residual there."""
     y, step, origin = vector(r.y, r.n), vector(r.z_step, r.nz), vector(r.z_from, r.nz)
     for i in range(r.nz):
         y[r.nx + i] = origin[i] - share * step[i]
@@ -350,7 +350,7 @@ def _is_other_side(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def rates(r):  # type: ignore[no-untyped-def]
-    """Writes the rates of states and unknowns into r.yd; needs modes and values that are consistent. Uses r.e as scratch."""
+    """Write the rates of states and unknowns into r.yd; needs modes and values that are consistent. Uses r.e as scratch."""
     nx, nz, n = r.nx, r.nz, r.n
     yd, left = vector(r.yd, n), vector(r.e, r.size)
     evaluate(r, r.do_f, r.y, r.e)

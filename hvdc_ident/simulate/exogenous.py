@@ -10,7 +10,7 @@ from hvdc_ident.simulate.run_state import NODES
 
 @kernel()
 def outside(r, t, ta):  # type: ignore[no-untyped-def]
-    """Writes all that comes from outside at t, within the segment from ta to r.tb, into w and wd."""
+    """Write all that comes from outside at t, within the segment from ta to r.tb, into w and wd."""
     vector(r.w, 1)[0] = t
     if r.quiet:
         return
@@ -22,7 +22,7 @@ def outside(r, t, ta):  # type: ignore[no-untyped-def]
 
 @kernel()
 def enter_segment(r):  # type: ignore[no-untyped-def]
-    """Moves every input's place to the piece right of r.t; says whether that piece reaches to r.tb for all of them."""
+    """Move every input's place to the piece right of r.t; says whether that piece reaches to r.tb for all of them."""
     pointer, at = indices(r.pointer, r.nu + 1), indices(r.at, r.nu)
     times = vector(r.times, pointer[r.nu])
     whole = True
@@ -43,7 +43,7 @@ def enter_segment(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _inputs(r, t):  # type: ignore[no-untyped-def]
-    """Writes the inputs and their slopes at t into w and wd: at r.tb, the segment's end, the values before a jump."""
+    """Write the inputs and their slopes at t into w and wd: at r.tb, the segment's end, the values before a jump."""
     pointer, at = indices(r.pointer, r.nu + 1), indices(r.at, r.nu)
     times, values = vector(r.times, pointer[r.nu]), vector(r.values, pointer[r.nu])
     w, wd = vector(r.w, r.nw), vector(r.wd, r.nw)
@@ -66,7 +66,7 @@ def _inputs(r, t):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _delayed(r, t, ta):  # type: ignore[no-untyped-def]
-    """Writes the delayed signals, their rates and their rows over the parameters at t into w and wd.
+    """Write the delayed signals, their rates and their rows over the parameters at t into w and wd.
 
     The history has one row a step: its instant, its length, then polynomials (delay, 5, 1 + width). Before the start the
     signals are constant. Instants are kept just inside the segment, so that a jump at its ends is seen from the inside.
@@ -111,7 +111,7 @@ def _delayed(r, t, ta):  # type: ignore[no-untyped-def]
 
 @kernel()
 def quartic(v, c):  # type: ignore[no-untyped-def]
-    """Writes into c (5, k) the power coefficients of the quartics through v (5, k) at 0, 1/4, 1/2, 3/4, 1."""
+    """Write into c (5, k) the power coefficients of the quartics through v (5, k) at 0, 1/4, 1/2, 3/4, 1."""
     for j in range(v.shape[1]):
         a, b, d, e, f = v[0, j], v[1, j], v[2, j], v[3, j], v[4, j]
         c[0, j] = a

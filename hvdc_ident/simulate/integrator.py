@@ -56,7 +56,7 @@ def _take(r, count):  # type: ignore[no-untyped-def]
 
 @kernel()
 def arrange(r):  # type: ignore[no-untyped-def]
-    """Gives every vector of the workspace its place from r.free on; returns the end, so that from 0 it is the size."""
+    """Give every vector of the workspace its place from r.free on; returns the end, so that from 0 it is the size."""
     rows = 1 + r.width
     r.y, r.yn, r.u = _take(r, r.size), _take(r, r.size), _take(r, r.size)
     r.k, r.e, r.dense = _take(r, 8 * r.stride), _take(r, r.size), _take(r, 4 * r.stride)
@@ -87,14 +87,14 @@ def arrange(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def write_row(r, y):  # type: ignore[no-untyped-def]
-    """Writes the next row of outputs from the flat vector at the address y, with what comes from outside as it stands."""
+    """Write the next row of outputs from the flat vector at the address y, with what comes from outside as it stands."""
     evaluate(r, r.do_observe, y, r.out + 8 * r.i_out * max(r.no * (1 + r.width), 1))
     r.i_out += 1
 
 
 @kernel()
 def write_rows(r):  # type: ignore[no-untyped-def]
-    """Writes the rows of outputs within the present step, from its dense output."""
+    """Write the rows of outputs within the present step, from its dense output."""
     t_out = vector(r.t_out, r.n_out)
     while True:
         count = 0
@@ -117,7 +117,7 @@ def write_rows(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _write_four(r, t_out, count):  # type: ignore[no-untyped-def]
-    """Writes the next `count` rows in one go; the rows up to the fourth get the last one's values, until their turn comes."""
+    """Write the next `count` rows in one go; the rows up to the fourth get the last one's values, until their turn comes."""
     instants, first, last = vector(r.instants, LANES), r.i_out, count - 1
     for k in range(LANES):
         instants[k] = t_out[first + min(k, last)]
@@ -136,7 +136,7 @@ def _write_four(r, t_out, count):  # type: ignore[no-untyped-def]
 
 @kernel()
 def remember(r):  # type: ignore[no-untyped-def]
-    """Adds the present step to the history of delayed signals."""
+    """Add the present step to the history of delayed signals."""
     nd, width = r.nd, r.width
     rows = 1 + width
     src, nodes = vector(r.src, (nd + r.nq) * rows), vector(r.nodes, NODES * nd * rows)
@@ -214,7 +214,7 @@ def begin_segment(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _sample(r):  # type: ignore[no-untyped-def]
-    """Takes the samples that are due: value and rows, at the instant's own dependence on the parameters.
+    """Take the samples that are due: value and rows, at the instant's own dependence on the parameters.
 
     A sample whose compute time is the whole period is published first, but all are taken from the signals before that.
     False: the unknowns have no solution with what is published.
@@ -256,7 +256,7 @@ def _sample(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _publish(r):  # type: ignore[no-untyped-def]
-    """Publishes the samples that are due. False: the unknowns have no solution with them."""
+    """Publish the samples that are due. False: the unknowns have no solution with them."""
     nd, nq, width = r.nd, r.nq, r.width
     publish, pending, pending_p = vector(r.publish, nq), vector(r.pending, nq), vector(r.pending_p, nq * width)
     w = vector(r.w, r.nw + (nd + nq) * width)
@@ -390,7 +390,7 @@ def longer(rows, count, room):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _begin(r, y, w):  # type: ignore[no-untyped-def]
-    """Fills the workspace for a run from the flat start vector y and what comes from outside, w."""
+    """Fill the workspace for a run from the flat start vector y and what comes from outside, w."""
     nd, nq, width = r.nd, r.nq, r.width
     start, outside, mass = vector(r.y, y.size), vector(r.w, w.size), vector(r.mass, r.size)
     for i in range(y.size):
@@ -426,7 +426,7 @@ def _begin(r, y, w):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _step(r):  # type: ignore[no-untyped-def]
-    """Tries one step, and what follows if it is good: outputs, history, a switch at its end. Returns a status."""
+    """Try one step, and what follows if it is good: outputs, history, a switch at its end. Returns a status."""
     r.steps += 1
     if r.steps > r.max_steps:
         return STEP_LIMIT

@@ -214,7 +214,7 @@ _GENERATED = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)
 
 
 def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -> None:
-    """Calls one generated function from Python."""
+    """Call one generated function from Python."""
     arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, np.zeros_like(w), p, m)]
     _GENERATED(int(address))(*(a.ctypes.data for a in arrays), out.ctypes.data)
 

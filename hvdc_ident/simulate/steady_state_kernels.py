@@ -1,6 +1,6 @@
 """Compiled ways to a steady state: Newton's method with sensitivities, a path of values, steps of least norm, following the model.
 
-Each entry takes a tuple of arrays, the first seven being the fields of `Equations`.
+Each entry takes a tuple of arrays, the first seven being the fields of `SteadyEquations`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ NEAR = 0.1  # radians, or of a value above 1: the longest step across a limit; a
 SAME = 1e-6  # of a value: places nearer than this are one steady state, reached by different arithmetic
 
 
-class Equations(NamedTuple):
+class SteadyEquations(NamedTuple):
     """Generated functions of the steady-state equations, and the vectors that these take.
 
     sizes: states, elements of y, elements of w before the unknowns in it, unknowns, width of a row over the parameters.
@@ -36,7 +36,7 @@ class Equations(NamedTuple):
 
 @kernel()
 def _equations(a):  # type: ignore[no-untyped-def]
-    return Equations(
+    return SteadyEquations(
         integers(a, 0), integers(a, 1), numbers(a, 2), numbers(a, 3), numbers(a, 4), numbers(a, 5), numbers(a, 6)
     )
 

@@ -123,7 +123,7 @@ DOPRI_DENSE = np.array(
 
 @kernel()
 def evaluate(r, function, y, out):  # type: ignore[no-untyped-def]
-    """Calls a generated function at the flat vector y; all are addresses."""
+    """Call a generated function at the flat vector y; all are addresses."""
     call(function, y, r.yd, r.w, r.wd, r.p, r.m, out)
 
 
@@ -154,7 +154,7 @@ def _sum(a, b):  # type: ignore[no-untyped-def]
 
 @kernel()
 def interpolate(r, x, count, out):  # type: ignore[no-untyped-def]
-    """Writes the first `count` elements (and up to three more) of the step's quartic at x in 0..1 to the address out."""
+    """Write the first `count` elements (and up to three more) of the step's quartic at x in 0..1 to the address out."""
     line = 8 * r.stride
     d = r.dense
     _horner((count + 3) // 4 * 4, (r.y, d, d + line, d + 2 * line, d + 3 * line), (out,), (x,))
@@ -162,7 +162,7 @@ def interpolate(r, x, count, out):  # type: ignore[no-untyped-def]
 
 @kernel()
 def interpolate_four(r, x0, x1, x2, x3):  # type: ignore[no-untyped-def]
-    """Writes the step's quartic at four places to the rows of r.block."""
+    """Write the step's quartic at four places to the rows of r.block."""
     line = 8 * r.stride
     d, b = r.dense, r.block
     places = (b, b + line, b + 2 * line, b + 3 * line)
@@ -208,7 +208,7 @@ def attempt(r):  # type: ignore[no-untyped-def]
 
 @kernel()
 def make_dense(r):  # type: ignore[no-untyped-def]
-    """Writes the quartic of the step that ended in r.yn into r.dense."""
+    """Write the quartic of the step that ended in r.yn into r.dense."""
     if r.rosenbrock:
         _rodas_dense(r)
     else:
@@ -249,7 +249,7 @@ def _rodas_quartic(y, yn, *k):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _rodas_prepare(r, stage):  # type: ignore[no-untyped-def]
-    """Writes r.u, where the stage's right-hand side is taken (r.y at stage 0), and r.add, what is added to it."""
+    """Write r.u, where the stage's right-hand side is taken (r.y at stage 0), and r.add, what is added to it."""
     n, line = r.stride, 8 * r.stride
     k0 = r.k
     k1, k2, k3, k4, k5, k6 = k0 + line, k0 + 2 * line, k0 + 3 * line, k0 + 4 * line, k0 + 5 * line, k0 + 6 * line
@@ -275,7 +275,7 @@ def _rodas_prepare(r, stage):  # type: ignore[no-untyped-def]
 
 @kernel(fastmath={"contract"})
 def _rodas_matrix(r):  # type: ignore[no-untyped-def]
-    """Factors M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
+    """Factor M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
 
     The generated one takes its pivots as they come: it is trusted where none is small against its row.
     """
@@ -379,7 +379,7 @@ def _dopri_quartic(y, yn, *rest):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _dopri_prepare(r, stage):  # type: ignore[no-untyped-def]
-    """Writes where the stage's right-hand side is taken into r.u, or into r.yn for the last one; returns that address."""
+    """Write where the stage's right-hand side is taken into r.u, or into r.yn for the last one; returns that address."""
     n, line = r.stride, 8 * r.stride
     k0 = r.k
     k1, k2, k3, k4, k5 = k0 + line, k0 + 2 * line, k0 + 3 * line, k0 + 4 * line, k0 + 5 * line
