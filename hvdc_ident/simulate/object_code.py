@@ -260,16 +260,12 @@ def entry(name: str) -> Callable[..., int]:
 def _compiled_entry(name: str) -> bytes:
     from numba import cfunc, types
 
-    _announce()
+    if name == "integrate":  # most of the time; the others take seconds
+        print(
+            "hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...",
+            file=sys.stderr,
+            flush=True,
+        )
     function = getattr(importlib.import_module(f"hvdc_ident.simulate.{ENTRIES[name]}"), name)
     made = cfunc(types.int64(types.int64), error_model="numpy")(function)
     return compiled(str(made.inspect_llvm()).replace(made.native_name, _symbol(name)), effort=3)
-
-
-@cache
-def _announce() -> None:
-    print(
-        "hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...",
-        file=sys.stderr,
-        flush=True,
-    )
