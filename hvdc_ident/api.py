@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 # The rooms are there before the package binds the verbs of the same names: an import of a room would replace them later.
 import hvdc_ident.fit
@@ -68,30 +68,17 @@ def simulate(
     >>> run["Irorder2"].round(3).tolist()
     [0.4, 0.4, 0.495, 0.5, 0.5, 0.5]
     """
-    from hvdc_ident.data import Experiment
-    from hvdc_ident.model import Model
     from hvdc_ident.simulate import simulate as run
+    from hvdc_ident.study.assemble import model_of, names_of, subject_of, values_of
 
-    plant: Any = model
-    experiment, values, columns, rows = data, parameters, sensitivities or (), outputs
-    as_it_is = isinstance(model, Model) and isinstance(data, Experiment) and inputs is None
-    texts = isinstance(sensitivities, str) or isinstance(outputs, str)
-    if (
-        not as_it_is or texts or not isinstance(parameters, dict | None)
-    ):  # else no study is needed: its rooms load slowly
-        from hvdc_ident.study.assemble import names_of, subject_of, values_of
-        from hvdc_ident.study.study import Study
-
-        subject = subject_of(model)
-        plant = subject.model if isinstance(subject, Study) else subject
-        experiment, values = _experiment(subject, data, inputs), values_of(parameters, plant)
-        columns, rows = names_of(sensitivities, "parameter") or (), names_of(outputs, "output")
+    subject = subject_of(model)
+    plant = model_of(subject)
     return run(
         plant,
-        experiment,
-        cast("dict[str, float] | None", values),
-        tuple(columns),
-        outputs=None if rows is None else tuple(rows),
+        _experiment(subject, data, inputs),
+        values_of(parameters, plant),
+        names_of(sensitivities, "parameter") or (),
+        outputs=names_of(outputs, "output"),
         tolerance=tolerance,
         rtol=rtol,
         method=method,
@@ -161,15 +148,14 @@ def linearize(
     """
     from hvdc_ident.linearize import find_operating_point as find
     from hvdc_ident.linearize import linearize as linear_model
-    from hvdc_ident.study.assemble import names_of, subject_of, values_of
+    from hvdc_ident.study.assemble import is_study, model_of, names_of, subject_of, values_of
     from hvdc_ident.study.linear_analysis import operating_point
-    from hvdc_ident.study.study import Study
 
     subject = subject_of(model)
-    plant = subject.model if isinstance(subject, Study) else subject
-    asked = subject.settings.linearize if isinstance(subject, Study) else None
+    plant = model_of(subject)
+    asked = subject.settings.linearize if is_study(subject) else None
     values = values_of(parameters, plant)
-    if point is None and isinstance(subject, Study):
+    if point is None and is_study(subject):
         point = operating_point(subject, {**subject.given, **values})
     elif point is None:
         point = find(plant, values)
@@ -248,11 +234,10 @@ def sensitivities(
     from hvdc_ident.errors import InputError
     from hvdc_ident.model import Model
     from hvdc_ident.sensitivity import sensitivities as derivatives
-    from hvdc_ident.study.assemble import experiments_of, names_of, subject_of, values_of
-    from hvdc_ident.study.study import Study
+    from hvdc_ident.study.assemble import experiments_of, is_study, model_of, names_of, subject_of, values_of
 
     subject = subject_of(model)
-    plant = subject.model if isinstance(subject, Study) else subject
+    plant = model_of(subject)
     if not isinstance(plant, Model):
         hint = "simulate(..., sensitivities=[...]) gives an FMU's derivatives"
         raise InputError(
@@ -262,7 +247,7 @@ def sensitivities(
     seen = None if isinstance(inputs, Mapping) else names_of(inputs, "input")
     experiments: Sequence[Experiment] = ()
     if data is None:
-        experiments = subject.experiments if isinstance(subject, Study) else ()
+        experiments = subject.experiments if is_study(subject) else ()
     elif moved is not None or _are_times(data):
         experiments = (_experiment(plant, data, moved),)
     else:
@@ -499,15 +484,14 @@ def export(
     """
     from hvdc_ident.linearize import LinearModel
     from hvdc_ident.model import Model
-    from hvdc_ident.study.assemble import subject_of, values_of
+    from hvdc_ident.study.assemble import is_study, model_of, subject_of, values_of
     from hvdc_ident.study.export import export as write
-    from hvdc_ident.study.study import Study
 
     found: Any = source if isinstance(source, LinearModel) else subject_of(source)
     if values is not None and not isinstance(values, str):
-        plant = found.model if isinstance(found, Study) else found
+        plant = model_of(found)
         found, values = plant.with_values(values_of(values, plant)), None
-    if not isinstance(found, Study | Model | LinearModel):
+    if not (is_study(found) or isinstance(found, Model | LinearModel)):
         from hvdc_ident.linearize import linearize as linear_model
 
         found = linear_model(found)
@@ -526,8 +510,8 @@ def _are_times(data: Any) -> bool:
 def _experiment(subject: Any, data: Any, inputs: Mapping[str, SignalLike] | None) -> Experiment:
     """Return the experiment that is meant, with these inputs in place of its own. Raises InputError."""
     from hvdc_ident.data import Experiment
-    from hvdc_ident.errors import InputError, unknown_name
-    from hvdc_ident.study.study import Study
+    from hvdc_ident.errors import InputError, require_known
+    from hvdc_ident.study.assemble import is_study
 
     if inputs is not None and not isinstance(inputs, Mapping):
         raise InputError(
@@ -535,10 +519,9 @@ def _experiment(subject: Any, data: Any, inputs: Mapping[str, SignalLike] | None
             expected='{"u": 1.0}, {"u": hi.step(...)} or {"u": samples}',
             got=repr(inputs)[:60],
         )
-    known = {e.name: e for e in subject.experiments} if isinstance(subject, Study) else {}
+    known = {e.name: e for e in subject.experiments} if is_study(subject) else {}
     if isinstance(data, str) and known:
-        if data not in known:
-            raise unknown_name("experiment", data, known, where=f"study '{subject.name}'")
+        require_known("experiment", [data], known, f"study '{subject.name}'")
         data = known[data]
     elif data is None and len(known) == 1:
         data = next(iter(known.values()))

@@ -1,46 +1,62 @@
-"""A study put together in Python: from a model, data and parameters in any of the forms in which a user has them."""
+"""A study put together in Python: from a model, data and parameters in any of the forms in which a user has them.
+
+Nothing that reads, fits or linearises is imported before a function needs it: `hi.simulate` of a model is to begin at once.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
 from hvdc_ident.data import Experiment, Trajectory
-from hvdc_ident.errors import InputError, StudyError, unknown_name
-from hvdc_ident.fit import FitResult, Free
+from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.study.parse import checked, is_study
-from hvdc_ident.study.recordings import with_noise
-from hvdc_ident.study.study import Study, candidates_of, check_questions, load_study, with_nuisances, with_unknowns
 
-ModelLike: TypeAlias = AnyModel | Study | str | Path
+if TYPE_CHECKING:
+    from hvdc_ident.fit import FitResult
+    from hvdc_ident.study.study import Study
+
+ModelLike: TypeAlias = "AnyModel | Study | str | Path"
 """A model, a study's model, a shipped name, or the path of a model card, an FMU or a study."""
-DataLike: TypeAlias = Experiment | Trajectory | Study | str | Path | Iterable[Any] | Any
+DataLike: TypeAlias = "Experiment | Trajectory | Study | str | Path | Iterable[Any] | Any"
 """Experiments, a study's, a table whose columns are named like the model's inputs and outputs, or the path of one."""
 ParametersLike: TypeAlias = str | Iterable[Any] | Mapping[str, Any]
 """Parameter names; or by name bounds (min, max), a start value, or a line as in a study's [parameters]."""
 
 
-def model_of(source: ModelLike) -> AnyModel:
-    """Return the model that is meant. Raises InputError for what is no model."""
+def is_study(subject: object) -> TypeGuard[Study]:
+    """Return whether an object is a Study; without the module of studies nothing is one."""
+    module = sys.modules.get("hvdc_ident.study.study")
+    return module is not None and isinstance(subject, module.Study)
+
+
+def subject_of(source: ModelLike) -> AnyModel | Study:
+    """Return the study or the model that is meant; a .toml file with a table [model] is a study.
+
+    Raises InputError for what is neither.
+    """
     if isinstance(source, str | Path):
-        found = subject_of(source)
-        return found.model if isinstance(found, Study) else found
-    if isinstance(source, Study):
-        return source.model
-    if isinstance(source, Model) or (hasattr(source, "with_effects") and hasattr(source, "simulate")):
+        path = Path(source)
+        if not is_shipped(str(source)) and path.suffix.lower() == ".toml":
+            from hvdc_ident.study.parse import is_study_file
+            from hvdc_ident.study.study import load_study
+
+            if is_study_file(path):
+                return load_study(path)
+        return load_model(source)
+    if is_study(source):
         return source
-    inner = getattr(source, "model", None)
-    if isinstance(inner, Model) or hasattr(inner, "with_effects"):
-        return cast("AnyModel", inner)
+    for found in (source, getattr(source, "model", None)):
+        if isinstance(found, Model) or (hasattr(found, "with_effects") and hasattr(found, "simulate")):
+            return cast("AnyModel", found)
     raise InputError(
         "no model",
         expected="a Model, a Study, the name of a shipped model, or the path of a model card, an FMU or a study",
@@ -48,14 +64,10 @@ def model_of(source: ModelLike) -> AnyModel:
     )
 
 
-def subject_of(source: ModelLike) -> AnyModel | Study:
-    """Return the study or the model that is meant; a .toml file with a table [model] is a study."""
-    if isinstance(source, str | Path):
-        path = Path(source)
-        if not is_shipped(str(source)) and path.suffix.lower() == ".toml" and is_study(path):
-            return load_study(path)
-        return load_model(source)
-    return source if isinstance(source, Study) else model_of(source)
+def model_of(source: ModelLike) -> AnyModel:
+    """Return the model that is meant, of a study its own. Raises InputError for what is no model."""
+    found = subject_of(source)
+    return found.model if is_study(found) else cast("AnyModel", found)
 
 
 def names_of(names: str | Iterable[str] | None, kind: str) -> tuple[str, ...] | None:
@@ -74,7 +86,7 @@ def values_of(
     values: Mapping[str, float] | FitResult | None, model: AnyModel, kind: str = "parameter"
 ) -> dict[str, float]:
     """Return values by name, of a fit its estimates. Raises InputError where one is no number or no such name is there."""
-    table = dict(values.values) if isinstance(values, FitResult) else values or {}
+    table = values or {} if isinstance(values, Mapping | None) else getattr(values, "values", values)
     if not isinstance(table, Mapping):
         raise InputError(f"{kind} values are given by name", expected="{name: number}", got=repr(values)[:60])
     known: Collection[str] = model.inputs if kind == "input" else model.parameters
@@ -98,11 +110,13 @@ def experiments_of(data: DataLike, model: AnyModel) -> tuple[Experiment, ...]:
     if isinstance(data, str | Path):
         path = Path(data)
         if path.suffix.lower() == ".toml":
+            from hvdc_ident.study.study import load_study
+
             return load_study(path).experiments
         from hvdc_ident.formats import read_waveforms
 
         data = [_from_table(read_waveforms(path), model, path.stem)]
-    elif isinstance(data, Study):
+    elif is_study(data):
         return data.experiments
     elif isinstance(data, Experiment):
         data = [data]
@@ -161,15 +175,9 @@ def _numbered(experiments: Sequence[Experiment]) -> list[Experiment]:
 def _fitting(e: Experiment, model: AnyModel) -> Experiment:
     """Return the experiment with the units of the model's outputs. Raises UnknownNameError."""
     where = f"experiment '{e.name}'"
-    for name in e.inputs:
-        if name not in model.inputs and name not in e.drive:
-            raise unknown_name("input", name, model.inputs, where=where)
-    for name in e.outputs:
-        if name not in model.outputs:
-            raise unknown_name("output", name, model.outputs, where=where)
-    for name in e.noise:
-        if name not in e.outputs:
-            raise unknown_name("recorded output", name, e.outputs, where=f"{where}, noise")
+    require_known("input", (n for n in e.inputs if n not in e.drive), model.inputs, where)
+    require_known("output", e.outputs, model.outputs, where)
+    require_known("recorded output", e.noise, e.outputs, f"{where}, noise")
     if e.measured is None or any(e.measured.units):
         return e
     table = e.measured
@@ -184,39 +192,32 @@ def lines_of(parameters: ParametersLike, model: AnyModel) -> dict[str, dict[str,
     """
     if isinstance(parameters, str):
         parameters = (parameters,)
-    if not isinstance(parameters, Mapping):
-        parameters = {p.name: p for p in parameters if isinstance(p, Free)} | {
-            p: None for p in parameters if not isinstance(p, Free)
-        }
-    lines = {}
-    for name, given in parameters.items():
-        if name not in model.parameters:
-            if name in model.inputs:
-                raise StudyError(
-                    f"'{name}' is an input, not a parameter", where="parameters", hint="an experiment's inputs"
-                )
-            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
-        lines[name] = _line(name, given, model.parameters[name].value)
-    return lines
+    if not isinstance(parameters, Mapping):  # names, or the parameters of a fit
+        parameters = {getattr(p, "name", p): None if isinstance(p, str) else p for p in parameters}
+    for name in parameters:
+        if name in model.inputs and name not in model.parameters:
+            raise StudyError(
+                f"'{name}' is an input, not a parameter", where="parameters", hint="an experiment's inputs"
+            )
+    require_known("parameter", parameters, model.parameters, f"model '{model.name}'")
+    return {name: _line(name, given, model.parameters[name].value) for name, given in parameters.items()}
 
 
 def _line(name: str, given: Any, value: float) -> dict[str, Any]:
     """Return one line of [parameters]. Raises StudyError for what is none."""
     if given is None:
         return {}
-    if isinstance(given, Free | Parameter):
-        keys = ("start", "min", "max", "given") if isinstance(given, Free) else ("min", "max")
-        stated = {k: float(getattr(given, k)) for k in keys}
-        stated |= {} if isinstance(given, Free) else {"start": given.value}
-        return {k: v for k, v in stated.items() if np.isfinite(v)}
+    if isinstance(given, Parameter):
+        given = {"start": given.value, "min": given.min, "max": given.max}
+    elif hasattr(given, "start") and hasattr(given, "given"):  # a parameter of a fit
+        given = {k: getattr(given, k) for k in ("start", "min", "max", "given")}
     if isinstance(given, Mapping):
-        return {
-            k: float(v) if isinstance(v, int | np.number) and not isinstance(v, bool) else v for k, v in given.items()
-        }
-    if isinstance(given, int | float | np.number) and not isinstance(given, bool):
+        numbers = {k: float(v) for k, v in given.items() if _is_number(v)}
+        return {k: numbers.get(k, v) for k, v in given.items() if np.isfinite(numbers.get(k, 0.0))}
+    if _is_number(given):
         return {"start": float(given)}
     pair = list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else []
-    if len(pair) != 2 or not all(isinstance(v, int | float | np.number) for v in pair):
+    if len(pair) != 2 or not all(map(_is_number, pair)):
         raise StudyError(
             "no bounds",
             where=f"parameters, '{name}'",
@@ -232,6 +233,10 @@ def _line(name: str, given: Any, value: float) -> dict[str, Any]:
     return bounds if low <= value <= high else bounds | {"start": float(np.clip(0.5 * (low + high), low, high))}
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
 def study_of(
     subject: ModelLike, data: DataLike | None = None, parameters: ParametersLike | None = None, **tables: Any
 ) -> Study:
@@ -240,46 +245,39 @@ def study_of(
     tables: keys of the study's tables by table, {"fit": {"starts": 4}}, added to its own.
     Raises InputError: StudyError, UnknownNameError or WaveformError.
     """
+    from hvdc_ident.study.checks import check_questions
+    from hvdc_ident.study.parse import checked
+    from hvdc_ident.study.recordings import with_noise
+    from hvdc_ident.study.study import Study, candidates_of, load_study, with_nuisances, with_unknowns
+
     found = subject_of(subject)
     source = found if isinstance(found, Study) else None
     model = source.model if source else cast("AnyModel", found)
-    if data is not None and isinstance(data, str | Path) and Path(data).suffix.lower() == ".toml":
+    if isinstance(data, str | Path) and Path(data).suffix.lower() == ".toml":
         data = load_study(data)
     if source is None and isinstance(data, Study):
         source, data = replace(data, model=model), None
     where = source.path.name if source else model.name
-    base: dict[str, Any] = (
-        source.settings.model_dump(by_alias=True, exclude_unset=True)
-        if source
-        else {"schema": 1, "model": {"source": model.name}}
-    )
+    base: dict[str, Any] = {"schema": 1, "model": {"source": model.name}}
+    if source:
+        base = source.settings.model_dump(by_alias=True, exclude_unset=True)
     if parameters is not None:
         base["parameters"] = lines_of(parameters, model)
-    for table, keys in tables.items():
-        if keys:
-            base[table] = {**(base.get(table) or {}), **keys}
+    base |= {table: {**(base.get(table) or {}), **keys} for table, keys in tables.items() if keys}
     settings = checked(base, where)
     if parameters is not None or source is None:
         model = with_unknowns(settings, model, where)
-    candidates = (
-        candidates_of(settings, model, where) if parameters is not None or source is None else source.candidates
-    )
-    responses: tuple[MeasuredResponse, ...] = ()
-    if data is None and source is not None:
-        experiments, noise, responses = source.experiments, source.noise, source.responses
+        candidates = candidates_of(settings, model, where)
     else:
+        candidates = source.candidates
+    made: dict[str, Any] = {"model": model, "candidates": candidates, "settings": settings}
+    if data is not None or source is None:
         pairs = [with_noise(e) for e in (experiments_of(data, model) if data is not None else ())]
-        experiments, noise = tuple(e for e, _ in pairs), FrozenMap({e.name: n for e, n in pairs})
-        experiments = with_nuisances(settings, model, experiments, tuple(candidates), where)
-    made: dict[str, Any] = {
-        "model": model,
-        "candidates": candidates,
-        "experiments": experiments,
-        "noise": noise,
-        "settings": settings,
-    }
+        experiments = with_nuisances(settings, model, [e for e, _ in pairs], tuple(candidates), where)
+        noise = FrozenMap({e.name: n for e, n in pairs})
+        made |= {"experiments": experiments, "noise": noise, "responses": ()}
     if source is not None:
-        study = replace(source, **made, responses=responses)
+        study = replace(source, **made)
     else:
         study = Study(name=model.name, path=Path(model.name), sources=FrozenMap(), **made)
     check_questions(study, where)

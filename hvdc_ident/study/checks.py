@@ -1,16 +1,178 @@
-"""What a stage needs of a study, or the message that says it is missing."""
+"""What a study has to hold before a stage runs, and what a result has to hold before it is told.
+
+Names that its questions use, the preconditions of each stage, remarks on the steady states its runs begin at; and the one
+place that decides whether a stage's JSON is plausible.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError, SteadyStateError, StudyError
-from hvdc_ident.model import Model
-from hvdc_ident.study.study import Study
+from hvdc_ident.errors import (
+    ComputationError,
+    HvdcIdentError,
+    InputError,
+    SteadyStateError,
+    StudyError,
+    require_known,
+)
+from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.study import schema
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+
+def check_questions(study: Study, where: str) -> None:
+    """Raise UnknownNameError or StudyError where a stage's table names what is not there."""
+    s, model = study.settings, study.model
+    names = [e.name for e in study.experiments]
+    measured = list(dict.fromkeys(o for e in study.experiments for o in e.outputs))
+    if s.linearize:
+        require_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
+        require_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
+        check_linear(study, where)
+    for line in s.sweep:
+        _free_line(line.parameter, s.parameters, f"{where}, sweep", own=True)
+        require_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
+        _check_sweep(line, model, where)
+    if s.sweep:
+        from hvdc_ident.study.stages.sweep import sweep_axes
+
+        sweep_axes(s.sweep, 0, f"{where}, sweep")
+    if s.screening:
+        _all_candidates(s.screening.parameters, study, f"{where}, screening.parameters")
+    if s.identifiability:
+        _all_candidates(s.identifiability.pair, study, f"{where}, identifiability.pair")
+    for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
+        place = f"{where}, fit.groups number {number}"
+        _all_candidates(group.parameters, study, f"{place}.parameters")
+        require_known("measured output", group.outputs, measured, f"{place}.outputs")
+        require_known(
+            "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
+        )
+    if s.fit:
+        from hvdc_ident.fit.loss import LOSSES
+        from hvdc_ident.fit.optimisers import catalogue, need
+        from hvdc_ident.fit.tolerance import tolerance
+
+        require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
+        try:
+            need(s.fit.optimiser)
+        except InputError as e:
+            raise e.at(where) from None
+        require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
+        try:
+            tolerance(s.fit.tolerance, study.path.parent)
+        except InputError as e:
+            raise e.at(f"{where}, fit.tolerance") from None
+    if s.diagnose:
+        require_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
+        if s.diagnose.effects != "all":
+            from hvdc_ident.effects import effects
+
+            require_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
+
+
+def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
+    """Raises where a swept value leaves the model's own bounds."""
+    own = model.parameters[line.parameter]
+    ends = line.values or [v for v in (line.min, line.max) if v is not None]
+    for value in (min(ends), max(ends)):
+        if not own.min <= value <= own.max:
+            raise StudyError(
+                f"a value of '{line.parameter}' lies outside the model's own bounds",
+                where=f"{where}, sweep of {line.parameter}",
+                expected=f"values in [{own.min:g}, {own.max:g}]",
+                got=f"{value:g}",
+            )
+
+
+def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> None:
+    """Raise where a name is no candidate, with the reason where it stands in [parameters] all the same."""
+    for name in names or ():
+        _free_line(name, study.settings.parameters, where)
+        require_known("candidate", [name], study.candidates, where)
+
+
+def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, own: bool = False) -> None:
+    """Raise StudyError for a parameter that follows others by its tie or, unless `own`, has a value in each experiment."""
+    line = lines.get(name)
+    if line is not None and line.tie is not None:
+        what, why = "follows other parameters", f"tie = {line.tie!r}"
+        hint = "name one that it follows, or leave the tie out"
+    elif line is not None and line.per_experiment and not own:
+        what, why = "has a value in each experiment", "per-experiment = true"
+        hint = "leave that out for one value in all experiments"
+    else:
+        return
+    raise StudyError(
+        f"'{name}' {what}", where=where, expected="a parameter with one value of its own", got=why, hint=hint
+    )
+
+
+def check_linear(study: Study, where: str) -> None:
+    """Raise StudyError or UnknownNameError where [linearize] names what the model lacks."""
+    asked, model = study.settings.linearize, study.model
+    if asked is None:
+        return
+    place = f"{where}, linearize"
+    inner = [*model.states]
+    if isinstance(model, Model):
+        inner += [*model.signals, *model.algebraic]
+    elif asked.break_at or asked.plant or asked.port or asked.formula or asked.locus:
+        raise StudyError(
+            "loops, ports, loci and formulas need the model's equations",
+            where=place,
+            expected="a model card or a shipped model",
+            got="an FMU",
+            hint="leave break_at, plant, port, locus and formula out",
+        )
+    trim = asked.trim
+    if trim is not None:
+        require_known("output", trim.outputs, model.outputs, f"{place}.trim.outputs")
+        require_known("input", trim.inputs, model.inputs, f"{place}.trim.inputs")
+        require_known("input or parameter", trim.free, [*model.inputs, *model.parameters], f"{place}.trim.free")
+    require_known("signal", asked.break_at, inner, f"{place}.break_at")
+    if asked.plant:
+        require_known("signal", [*asked.plant.inputs, *asked.plant.outputs], inner, f"{place}.plant")
+    channels = [*(asked.inputs or model.inputs), *(asked.outputs or model.outputs)]
+    require_known("input or output of [linearize]", asked.scale, channels, f"{place}.scale")
+    require_known("parameter", asked.formula, model.parameters, f"{place}.formula")
+    if asked.locus:
+        moved = [*model.parameters, *model.inputs]
+        require_known("parameter or input", [asked.locus.parameter], moved, f"{place}.locus.parameter")
+    for port in asked.port:
+        _check_port(port, study, f"{place}.port '{port.name}'")
+    names = [p.name for p in asked.port]
+    doubled = next((n for n in names if names.count(n) > 1), None)
+    if doubled is not None:
+        raise StudyError(f"two ports are called '{doubled}'", where=place)
+    if study.compared is not None:
+        require_known(
+            "input", asked.inputs or model.inputs, study.compared.inputs, f"{place}.compare '{study.compared.name}'"
+        )
+        require_known("output", asked.outputs or model.outputs, study.compared.outputs, f"{place}.compare")
+
+
+def _check_port(port: schema.PortTable, study: Study, where: str) -> None:
+    from hvdc_ident.expression import parse
+
+    model = study.model
+    assert isinstance(model, Model)
+    require_known("signal", port.source, model.slots, f"{where}, source")
+    known = [*model.inputs, *model.states, *model.signals, *model.algebraic, *model.parameters]
+    for key, texts in (("voltage", port.voltage), ("current", port.current), ("angle", [port.angle])):
+        for text in texts:
+            try:
+                names = sorted(s.name for s in parse(text).free_symbols)
+            except HvdcIdentError as e:
+                raise e.at(f"{where}, {key}") from None
+            require_known("name", names, known, f"{where}, {key}")
 
 
 def need_experiments(study: Study, stage: str, role: str | None = None, *, responses: bool = False) -> None:

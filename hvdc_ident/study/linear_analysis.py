@@ -12,7 +12,6 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import (
-    HvdcIdentError,
     InputError,
     LinearizationError,
     SteadyStateError,
@@ -42,66 +41,6 @@ if TYPE_CHECKING:
 
 MOST_NORMS = 12
 """Channels up to which the norms of each are given beside those of the whole."""
-
-
-def check_linear(study: Study, where: str) -> None:
-    """Raise StudyError or UnknownNameError where [linearize] names what the model lacks."""
-    asked, model = study.settings.linearize, study.model
-    if asked is None:
-        return
-    place = f"{where}, linearize"
-    inner = [*model.states]
-    if isinstance(model, Model):
-        inner += [*model.signals, *model.algebraic]
-    elif asked.break_at or asked.plant or asked.port or asked.formula or asked.locus:
-        raise StudyError(
-            "loops, ports, loci and formulas need the model's equations",
-            where=place,
-            expected="a model card or a shipped model",
-            got="an FMU",
-            hint="leave break_at, plant, port, locus and formula out",
-        )
-    trim = asked.trim
-    if trim is not None:
-        require_known("output", trim.outputs, model.outputs, f"{place}.trim.outputs")
-        require_known("input", trim.inputs, model.inputs, f"{place}.trim.inputs")
-        require_known("input or parameter", trim.free, [*model.inputs, *model.parameters], f"{place}.trim.free")
-    require_known("signal", asked.break_at, inner, f"{place}.break_at")
-    if asked.plant:
-        require_known("signal", [*asked.plant.inputs, *asked.plant.outputs], inner, f"{place}.plant")
-    channels = [*(asked.inputs or model.inputs), *(asked.outputs or model.outputs)]
-    require_known("input or output of [linearize]", asked.scale, channels, f"{place}.scale")
-    require_known("parameter", asked.formula, model.parameters, f"{place}.formula")
-    if asked.locus:
-        moved = [*model.parameters, *model.inputs]
-        require_known("parameter or input", [asked.locus.parameter], moved, f"{place}.locus.parameter")
-    for port in asked.port:
-        _check_port(port, study, f"{place}.port '{port.name}'")
-    names = [p.name for p in asked.port]
-    doubled = next((n for n in names if names.count(n) > 1), None)
-    if doubled is not None:
-        raise StudyError(f"two ports are called '{doubled}'", where=place)
-    if study.compared is not None:
-        require_known(
-            "input", asked.inputs or model.inputs, study.compared.inputs, f"{place}.compare '{study.compared.name}'"
-        )
-        require_known("output", asked.outputs or model.outputs, study.compared.outputs, f"{place}.compare")
-
-
-def _check_port(port: schema.PortTable, study: Study, where: str) -> None:
-    from hvdc_ident.expression import parse
-
-    model = study.model
-    assert isinstance(model, Model)
-    require_known("signal", port.source, model.slots, f"{where}, source")
-    known = [*model.inputs, *model.states, *model.signals, *model.algebraic, *model.parameters]
-    for key, texts in (("voltage", port.voltage), ("current", port.current), ("angle", [port.angle])):
-        for text in texts:
-            try:
-                names = sorted(s.name for s in parse(text).free_symbols)
-            except HvdcIdentError as e:
-                raise e.at(f"{where}, {key}") from None
-            require_known("name", names, known, f"{where}, {key}")
 
 
 def operating_point(study: Study, values: Mapping[str, float] | None = None) -> OperatingPoint:

@@ -32,7 +32,7 @@ EXPECTED = {
 }
 
 
-def is_study(path: Path) -> bool:
+def is_study_file(path: Path) -> bool:
     """Return whether a file is a study and no model card: TOML with a table [model]."""
     try:
         return isinstance(_toml(path.read_bytes(), path.name).get("model"), dict)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
-from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
+from hvdc_ident.errors import InputError, StudyError, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
@@ -20,7 +20,8 @@ from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
-from hvdc_ident.study.linear_analysis import check_linear, read_responses
+from hvdc_ident.study.checks import check_questions
+from hvdc_ident.study.linear_analysis import read_responses
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
 
@@ -301,94 +302,6 @@ def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> Fr
             )
         found[name] = free
     return FrozenMap(found)
-
-
-def check_questions(study: Study, where: str) -> None:
-    """Raise UnknownNameError or StudyError where a stage's table names what is not there."""
-    s, model = study.settings, study.model
-    names = [e.name for e in study.experiments]
-    measured = list(dict.fromkeys(o for e in study.experiments for o in e.outputs))
-    if s.linearize:
-        require_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
-        require_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
-        check_linear(study, where)
-    for line in s.sweep:
-        _free_line(line.parameter, s.parameters, f"{where}, sweep", own=True)
-        require_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
-        _check_sweep(line, model, where)
-    if s.sweep:
-        from hvdc_ident.study.stages.sweep import sweep_axes
-
-        sweep_axes(s.sweep, 0, f"{where}, sweep")
-    if s.screening:
-        _all_candidates(s.screening.parameters, study, f"{where}, screening.parameters")
-    if s.identifiability:
-        _all_candidates(s.identifiability.pair, study, f"{where}, identifiability.pair")
-    for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
-        place = f"{where}, fit.groups number {number}"
-        _all_candidates(group.parameters, study, f"{place}.parameters")
-        require_known("measured output", group.outputs, measured, f"{place}.outputs")
-        require_known(
-            "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
-        )
-    if s.fit:
-        from hvdc_ident.fit.loss import LOSSES
-        from hvdc_ident.fit.optimisers import catalogue, need
-        from hvdc_ident.fit.tolerance import tolerance
-
-        require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
-        try:
-            need(s.fit.optimiser)
-        except InputError as e:
-            raise e.at(where) from None
-        require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
-        try:
-            tolerance(s.fit.tolerance, study.path.parent)
-        except InputError as e:
-            raise e.at(f"{where}, fit.tolerance") from None
-    if s.diagnose:
-        require_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
-        if s.diagnose.effects != "all":
-            from hvdc_ident.effects import effects
-
-            require_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
-
-
-def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
-    """Raises where a swept value leaves the model's own bounds."""
-    own = model.parameters[line.parameter]
-    ends = line.values or [v for v in (line.min, line.max) if v is not None]
-    for value in (min(ends), max(ends)):
-        if not own.min <= value <= own.max:
-            raise StudyError(
-                f"a value of '{line.parameter}' lies outside the model's own bounds",
-                where=f"{where}, sweep of {line.parameter}",
-                expected=f"values in [{own.min:g}, {own.max:g}]",
-                got=f"{value:g}",
-            )
-
-
-def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> None:
-    """Raise where a name is no candidate, with the reason where it stands in [parameters] all the same."""
-    for name in names or ():
-        _free_line(name, study.settings.parameters, where)
-        require_known("candidate", [name], study.candidates, where)
-
-
-def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, own: bool = False) -> None:
-    """Raise StudyError for a parameter that follows others by its tie or, unless `own`, has a value in each experiment."""
-    line = lines.get(name)
-    if line is not None and line.tie is not None:
-        what, why = "follows other parameters", f"tie = {line.tie!r}"
-        hint = "name one that it follows, or leave the tie out"
-    elif line is not None and line.per_experiment and not own:
-        what, why = "has a value in each experiment", "per-experiment = true"
-        hint = "leave that out for one value in all experiments"
-    else:
-        return
-    raise StudyError(
-        f"'{name}' {what}", where=where, expected="a parameter with one value of its own", got=why, hint=hint
-    )
 
 
 def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
