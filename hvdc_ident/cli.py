@@ -15,8 +15,8 @@ import typer
 from hvdc_ident.command import (
     Access,
     Budget,
+    CommandFailed,
     Console,
-    Failed,
     FitWork,
     FmuFormat,
     Out,
@@ -200,7 +200,7 @@ def _tell_run(study: Study, folder: Path, done: list[Done], console: Console, ty
     console.say(f"report: {folder / 'report.html'}")
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:
-        raise Failed("; ".join(failures))
+        raise CommandFailed("; ".join(failures))
 
 
 def _stage_command(stage: Stage) -> Callable[..., None]:
@@ -221,7 +221,7 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
         console.say(*(pasteable(line, study, out, access) for line in lines))
         console.say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}")
         if done.failed:
-            raise Failed(f"{stage.name}: {done.failed}")
+            raise CommandFailed(f"{stage.name}: {done.failed}")
 
     one_stage.__doc__ = stage.summary
     if "force" in stage.takes:

@@ -204,7 +204,7 @@ class FmuFormat:
         return fmu_options(self.fmi, self.kind, self.source_only)
 
 
-class Failed(Exception):
+class CommandFailed(Exception):
     """The work ran and failed; what it found is written."""
 
 
@@ -267,7 +267,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             raise
         except HvdcIdentError as e:
             end(2 if isinstance(e, InputError) else 1, str(e))
-        except Failed as e:
+        except CommandFailed as e:
             end(1, str(e))
         except _BudgetSpent as e:
             end(1, f"{e}; what was finished is kept, and the same command goes on from there")
