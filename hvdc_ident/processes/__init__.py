@@ -1,24 +1,11 @@
-"""Every process that the package starts to work in: started, limited, watched and ended here, which says how it ended.
+"""Workers, processes for work that may crash, hang or take too much memory: started, limited, watched and ended here.
 
-An FMU's workers, the workers of a pool and the reader of a file that may be damaged are forked from a process that has
-loaded what they need (`Supervisor`). They end with their owner, even where that is killed.
+They are forked from a process that has loaded what they need (`Supervisor`), end with their owner, even where that is
+killed, and it is said how they ended. An FMU's machine code runs in them.
 """
 
 from hvdc_ident.processes.endings import MIB, Budget, Ending
 from hvdc_ident.processes.messages import Message, packed, unpacked
-from hvdc_ident.processes.supervisor import ChildProcess, Lost, Overdue, Supervisor, Watch, done_apart
+from hvdc_ident.processes.supervisor import ChildProcess, Supervisor, Watch
 
-__all__ = [
-    "MIB",
-    "Budget",
-    "ChildProcess",
-    "Ending",
-    "Lost",
-    "Message",
-    "Overdue",
-    "Supervisor",
-    "Watch",
-    "done_apart",
-    "packed",
-    "unpacked",
-]
+__all__ = ["MIB", "Budget", "ChildProcess", "Ending", "Message", "Supervisor", "Watch", "packed", "unpacked"]

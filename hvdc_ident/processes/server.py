@@ -7,8 +7,8 @@ workers' module, whose functions it calls:
     serve(connection, progress, setup, begun)   in each worker, until its owner closes the connection
     finish(setup)                            here, at the end
 
-What is loaded before is not loaded, or counted as its memory, by each worker. Where the owner of the workers ends, however
-it does, this process ends them, finishes and ends too; where it is itself killed, the system ends the workers.
+Workers share what is loaded before, and it does not count as their memory. Where the owner of the workers ends, however it
+does, this process ends them, finishes and ends too; where it is itself killed, the system ends the workers.
 
 A worker that crashes, leaves or is told to dumps its Python frames here before it goes. It cannot go on before the dump
 is read, so the memory it has at that moment is known as well. The system says of each part from which process it is: a

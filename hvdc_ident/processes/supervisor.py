@@ -31,7 +31,6 @@ from hvdc_ident.processes.messages import (
     SPACE,
     START,
     STOP,
-    Message,
     progress_file,
     progress_in,
     unpacked,
@@ -202,40 +201,6 @@ class Watch:
         at = (self.progress[BEGAN], self.progress[NOW])
         if at != self.at and not (math.isnan(at[1]) and at[0] == self.at[0]):
             self.at, self.moved = at, time.monotonic()
-
-
-class Overdue(Exception):
-    """A piece of work that was not done by its deadline."""
-
-
-class Lost(Exception):
-    """A worker that ended at its work. said: the last line that it printed."""
-
-    def __init__(self, end: Ending | None, said: str) -> None:
-        super().__init__(said)
-        self.end, self.said = end, said
-
-
-def done_apart(entry: str, setup: object, deadline: float) -> Message:
-    """Return the message that a worker sends, started for this one piece of work.
-
-    deadline: s, the start of the interpreter included. Raises Overdue, or Lost where the process ends without a word.
-    """
-    supervisor = Supervisor(entry, setup)
-    try:
-        child = supervisor.start()
-        try:
-            if not child.connection.poll(deadline):
-                raise Overdue
-            return unpacked(child.connection.recv_bytes())
-        except (EOFError, OSError):
-            said = child.last_line
-            end = supervisor.end(child, trace=False)
-            raise Lost(end, said or supervisor.last) from None
-        finally:
-            child.close()
-    finally:
-        supervisor.close()
 
 
 def last_line(printed: IO[bytes] | None) -> str:
