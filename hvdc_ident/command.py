@@ -1,4 +1,4 @@
-"""What the commands share: groups of options as dataclasses, and how a command ends.
+"""Groups of options as dataclasses, and the end of a command: all that the commands share.
 
 A command is a function of keyword arguments; an argument whose type is one of the groups stands for the group's options.
 """
@@ -47,6 +47,11 @@ def _number(option: str, unit: str, example: str, low: float, high: float = math
 
 def option(flag: str, metavar: str, text: str, **settings: Any) -> Any:
     return typer.Option(flag, metavar=metavar, help=text, **{"show_default": False, **settings})
+
+
+def _limit(flag: str, metavar: str, unit: str, example: str, text: str) -> Any:
+    """Return an option that takes a number above 0."""
+    return option(flag, metavar, text, parser=_number(flag, f"{unit} above 0", example, 1e-9))
 
 
 StudyFile = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).", show_default=False)]
@@ -143,31 +148,13 @@ class Access:
 
     trust: Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")] = False
     deadline: Annotated[
-        float | None,
-        option(
-            "--deadline",
-            "S",
-            "Of an FMU: seconds one run may take; default 60.",
-            parser=_number("--deadline", "seconds above 0", "300", 1e-9),
-        ),
+        float | None, _limit("--deadline", "S", "seconds", "300", "Of an FMU: seconds one run may take; default 60.")
     ] = None
     load: Annotated[
-        float | None,
-        option(
-            "--load",
-            "S",
-            "Of an FMU: seconds it may take to begin; default 60.",
-            parser=_number("--load", "seconds above 0", "300", 1e-9),
-        ),
+        float | None, _limit("--load", "S", "seconds", "300", "Of an FMU: seconds it may take to begin; default 60.")
     ] = None
     memory: Annotated[
-        float | None,
-        option(
-            "--memory",
-            "MIB",
-            "Of an FMU: MiB it may take; default 2048.",
-            parser=_number("--memory", "MiB above 0", "4096", 1e-9),
-        ),
+        float | None, _limit("--memory", "MIB", "MiB", "4096", "Of an FMU: MiB it may take; default 2048.")
     ] = None
 
     @property
