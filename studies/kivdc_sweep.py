@@ -35,7 +35,7 @@ RISE = 1.92  # of the negative log-likelihood at the ends of a 95 % interval
 
 
 def write_waveforms(folder: Path) -> None:
-    """Nothing; the reference waveforms are in the folder, one CSV an experiment."""
+    """Write the reference waveforms into the folder, one CSV an experiment."""
     time = np.round(np.arange(round(END / SAMPLE) + 1) * SAMPLE, 9)
     for name, (moved, before, after) in MOVES.items():
         signal = InputSignal.step(EVENT, before, after)
@@ -217,7 +217,7 @@ def main(folder: Path, title: str, at: tuple[float, ...], paper: dict[float, flo
 
 
 def tell(folder: Path, result: dict[str, Any]) -> None:
-    """Nothing; the numbers are printed beside those expected."""
+    """Print the numbers beside those expected."""
     expected = json.loads((folder / "expected.json").read_text(encoding="utf-8"))
     for name, line in result["rmse"].items():
         print(f"RMSE of {OUTPUT}, {name}, pu")

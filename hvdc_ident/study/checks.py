@@ -1,4 +1,4 @@
-"""What a study has to hold before a stage runs, and what a result has to hold before it is told.
+"""Checks of what a study holds before a stage runs, and of what a result holds before it is told.
 
 Names that its questions use, the preconditions of each stage, remarks on the steady states its runs begin at; and the one
 place that decides whether a stage's JSON is plausible.

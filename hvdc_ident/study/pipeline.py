@@ -92,7 +92,7 @@ def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
 
 
 def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) -> None:
-    """Nothing; `run.json` says what a run did: the heading, and each stage with its outcome."""
+    """Write `run.json`, which says what a run did: the heading, and each stage with its outcome."""
     rows = {d.stage.name: {"file": d.stage.file, "failed": d.failed} for d in done}
     write_text(folder / "run.json", json_text({**heading, "stages": rows}))
 

@@ -73,7 +73,7 @@ class Recordings:
     _read: dict[str, Trajectory] = field(default_factory=dict)
 
     def load(self, columns: Mapping[str, Mapping[str, Sequence[str]]]) -> None:
-        """Nothing; the files are read. columns: by file, by experiment, the columns wanted."""
+        """Read the files. columns: by file, by experiment, the columns wanted."""
         for name, wanted in columns.items():
             path = self.folder / name
             try:

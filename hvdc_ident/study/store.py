@@ -46,7 +46,7 @@ _HELD: dict[Path, list[int]] = {}
 
 @contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Nothing; inside, no other process works in the folder. Made where missing, removed again where left empty.
+    """Keep other processes out of the folder while inside. Made where missing, removed again where left empty.
 
     Raises InputError where another one does. May be nested within a process. The lock lies on the folder itself and
     ends with the process, however that ends.
@@ -145,7 +145,7 @@ class Store:
 
     @contextmanager
     def _clear(self) -> Iterator[None]:
-        """Nothing; a database error inside becomes an InputError."""
+        """Raise a database error inside as an InputError."""
         try:
             yield
         except sqlite3.DatabaseError as e:
@@ -188,7 +188,7 @@ class Job:
         return self._store._get(self.name, keys)
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Nothing; the value is kept: a kill of this process at any instant afterwards does not lose it."""
+        """Keep the value: a kill of this process at any instant afterwards does not lose it."""
         self._store._put(self.name, key, value)
 
 

@@ -111,7 +111,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def write_tables(readme: Path, tables: Mapping[str, str]) -> None:
-    """Nothing; each table stands in the README between its marks. Raises ValueError where the marks are missing."""
+    """Put each table into the README between its marks. Raises ValueError where the marks are missing."""
     text = readme.read_text(encoding="utf-8")
     for name, table in tables.items():
         head, rest = text.split(f"<!-- {name} -->\n", 1)
@@ -121,7 +121,7 @@ def write_tables(readme: Path, tables: Mapping[str, str]) -> None:
 
 
 def save(figure: Any, path: Path) -> None:
-    """Nothing; the figure is an SVG file, the same bytes each time."""
+    """Write the figure as an SVG file, the same bytes each time."""
     import matplotlib
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,7 @@ WHY = {
 
 
 def write_waveforms() -> None:
-    """Nothing; the reference's answer to one step of each set-point is in the folder, all three outputs."""
+    """Write the reference's answer to one step of each set-point into the folder, all three outputs."""
     for kind, c in paper.CONTROLLERS.items():
         e = paper.step(kind)
         recorded = [np.round(e.measured[o], 9) for o in e.outputs]

@@ -106,7 +106,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 
 
 def _work(todo: list[Design], asked: argparse.Namespace, path: Path, before: int) -> None:
-    """Nothing; every case's line is in the file as soon as it is there."""
+    """Append each case's line to the file as soon as it is there."""
     if path.exists() and path.read_bytes()[-1:] not in (b"\n", b""):
         with path.open("a", encoding="utf-8") as stream:
             stream.write("\n")

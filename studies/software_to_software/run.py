@@ -92,7 +92,7 @@ def errors(reference: Trajectory, other: Trajectory) -> dict[str, dict[str, floa
 def plot(
     pairs: dict[str, tuple[Trajectory, Trajectory]], signals: tuple[str, ...], words: tuple[str, str], to: Path
 ) -> None:
-    """Nothing; overlaid waveforms, one row a signal and one column a case, are in the file."""
+    """Draw overlaid waveforms into the file, one row a signal and one column a case."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -132,7 +132,7 @@ def main(results: Path = HERE / "study-results", plots: bool = True) -> dict[str
 
 
 def show(table: dict[str, dict[str, float]], words: dict[str, str]) -> None:
-    """Nothing; the table is printed."""
+    """Print the table."""
     print(f"  {'signal':10s}{'RMSE, %':>10s}{'max, %':>10s}{'ripple, %':>11s}{'range, pu':>11s}")
     for name, e in table.items():
         own = f"{e['ripple_%']:11.3f}" if "ripple_%" in e else " " * 11

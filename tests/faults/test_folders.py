@@ -69,7 +69,7 @@ def test_a_folder_that_is_a_file_is_said(tmp_path):
 
 
 def powerless() -> None:
-    """Nothing; permissions bind this process even where it is root's: it may no longer override them."""
+    """Let permissions bind this process even where it is root's: it may no longer override them."""
     libc = ctypes.CDLL(None, use_errno=True)
     header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # version 3 of the interface, this process
     sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable, twice

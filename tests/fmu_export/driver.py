@@ -83,12 +83,12 @@ class Run:
         return np.array(self.raw.getReal(refs) if self.fmu.second else self.raw.getFloat64(refs))
 
     def set(self, values: dict[str, float]) -> None:
-        """Nothing; the variables have the values."""
+        """Set the variables to the values."""
         refs = self.fmu.references(list(values))
         (self.raw.setReal if self.fmu.second else self.raw.setFloat64)(refs, list(values.values()))
 
     def enter(self, start: float = 0.0, stop: float | None = None, tolerance: float | None = None) -> None:
-        """Nothing; the instance is in initialisation mode."""
+        """Enter initialisation mode."""
         if self.fmu.second:
             self.raw.setupExperiment(tolerance=tolerance, startTime=start, stopTime=stop)
             self.raw.enterInitializationMode()
@@ -129,11 +129,11 @@ class Run:
         return self.raw.getFMUstate() if self.fmu.second else self.raw.getFMUState()
 
     def restore(self, state: Any) -> None:
-        """Nothing; the state is as it was when copied."""
+        """Bring the state back to that when copied."""
         (self.raw.setFMUstate if self.fmu.second else self.raw.setFMUState)(state)
 
     def step(self, t: float, h: float) -> None:
-        """Nothing; a communication step is done."""
+        """Do a communication step."""
         self.raw.doStep(currentCommunicationPoint=t, communicationStepSize=h)
 
 

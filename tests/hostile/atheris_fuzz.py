@@ -20,7 +20,7 @@ with atheris.instrument_imports(include=["hvdc_ident"]):
 
 
 def main() -> None:
-    """Nothing; runs until libFuzzer is told to stop."""
+    """Run until libFuzzer is told to stop."""
     name = sys.argv.pop(1) if len(sys.argv) > 1 else ""
     if name not in fuzz.KINDS:
         sys.exit(f"which kind? one of {', '.join(sorted(fuzz.KINDS))}")

@@ -1,4 +1,4 @@
-"""What becomes of an item that was given to a pool."""
+"""The fate of an item that was given to a pool."""
 
 from __future__ import annotations
 

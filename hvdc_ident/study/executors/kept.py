@@ -22,7 +22,7 @@ class Shelf(Protocol):
         """What is kept under the keys, as a mapping; a key without a result is missing."""
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Nothing; the value is kept."""
+        """Keep the value."""
 
 
 class Runner(Protocol):

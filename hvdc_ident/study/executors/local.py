@@ -34,7 +34,7 @@ DEATHS = 2  # of workers at the same item before it is given up
 IDLE = -1
 START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 LOADED = ["hvdc_ident.discrepancy"]
-"""What the server loads, once for all workers: it imports what nearly any work needs."""
+"""Module that the server loads, once for all workers: it imports what nearly any work needs."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -117,7 +117,7 @@ class OpenPool:
             session.close()
 
     def close(self) -> None:
-        """Nothing; the workers have ended."""
+        """End the workers."""
         while self._idle:
             _end(self._idle.pop())
 
@@ -269,7 +269,7 @@ class _Session:
         _end(worker)
 
     def close(self) -> None:
-        """Nothing; workers that are at nothing wait for the next run, also where nobody asks for what comes after the last item."""
+        """Let workers that are at nothing wait for the next run, also where nobody asks for what comes after the last item."""
         for worker in list(self.workers):
             if worker.ready and not worker.pending:
                 self._retire(worker)
@@ -289,7 +289,7 @@ def _started(memory: int | None) -> _Worker:
 
 
 def _serving() -> None:
-    """Nothing; the server that workers are forked from begins to load, if it has not, with the environment of now."""
+    """Let the server that workers are forked from begin to load, if it has not, with the environment of now."""
     if START_METHOD != "forkserver":
         return
     from multiprocessing import forkserver
@@ -339,7 +339,7 @@ def _exit(code: int | None) -> str:
 
 
 def _serve(connection: Connection, current: Any, memory: int | None) -> None:
-    """Nothing; loads each function sent and runs batches with it until the parent closes the connection or ends."""
+    """Load each function sent and run batches with it until the parent closes the connection or ends."""
     _end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if memory is not None:
@@ -383,7 +383,7 @@ def _run_batch(connection: Connection, work: Callable[[Any], Any], batch: list[t
 
 
 def _end_with_parent() -> None:
-    """Nothing; the process ends when the pool's does, however that ends. Only the server ends by itself, after the last."""
+    """End this process when the pool's ends, however it does. Only the server ends by itself, after the last."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -1,4 +1,4 @@
-"""What a stage is: a question a study can ask, answered by one JSON and some files. A stage is one file in `stages/`.
+"""Stages: questions that a study can ask, each answered by one JSON and some files. A stage is one file in `stages/`.
 
 A stage's file has `STAGE = Stage(...)` and imports numpy and the like inside its functions, for the command line
 lists the stages before it knows which one will run.
@@ -51,7 +51,7 @@ class StageOptions:
 
 @dataclass(frozen=True)
 class StageResult:
-    """What a stage found. data: the JSON without its heading. files: text by name, written beside it.
+    """The result of a stage. data: the JSON without its heading. files: text by name, written beside it.
 
     failed: why the work did not come to an end, empty where it did; what there is, is kept all the same.
     """

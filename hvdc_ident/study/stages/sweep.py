@@ -92,7 +92,7 @@ def _cube(tables: Sequence[schema.SweepTable], seed: int, where: str) -> Samples
 
 
 def sweep_reference(tables: Sequence[schema.SweepTable], where: str = "sweep") -> str:
-    """What the sweep is compared with, "data", "base" or a model's name: every table that says so says the same."""
+    """Reference of the sweep, "data", "base" or a model's name, in the same words in every table."""
     from hvdc_ident.errors import StudyError
 
     said = {t.against for t in tables if t.against is not None}

@@ -186,5 +186,5 @@ def coarse_solver(step: float = COARSE) -> dict[str, float]:
 
 
 def on_stderr(text: str) -> None:
-    """Nothing; whoever watches is told."""
+    """Tell whoever watches."""
     print(text, file=sys.stderr, flush=True)
