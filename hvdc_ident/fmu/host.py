@@ -19,7 +19,7 @@ from threading import Lock
 from typing import Any
 
 from hvdc_ident.data import Array
-from hvdc_ident.errors import InputError, SimulationError, unknown_name
+from hvdc_ident.errors import InputError, SimulationError, require_known
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.endings import call_of, crash, more_memory, overdue
 from hvdc_ident.fmu.folder import Folder, joined
@@ -55,9 +55,7 @@ class Limits:
             return stated
         found: dict[str, Any] = dict(stated or {})
         known = [f.name for f in fields(cls)]
-        for name in found:
-            if name not in known:
-                raise unknown_name("limit", name, known, where="limits of an FMU")
+        require_known("limit", found, known, "limits of an FMU")
         if "memory" in found:
             found["memory"] = round(found["memory"] * MIB)
         return replace(cls(), **found)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, unknown_name
+from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known, unknown_name
 from hvdc_ident.fmu.signals import Signals
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance
@@ -69,9 +69,7 @@ def simulate(
             got=", ".join(experiment.starts),
             hint="a parameter of the FMU that is a start value, where it has one",
         )
-    for name in experiment.offsets:
-        if name not in checked.inputs:
-            raise unknown_name("input", name, checked.inputs, where=f"{place}, offsets")
+    require_known("input", experiment.offsets, checked.inputs, f"{place}, offsets")
     try:
         if checked.effects:
             return simulate_with_effects(checked, experiment, given, sensitivities, names, tolerance)

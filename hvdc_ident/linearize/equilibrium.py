@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.errors import ModelError, SteadyStateError, unknown_name
+from hvdc_ident.errors import ModelError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.linearize.system import Array, CompiledSystem, system
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import ACCURACY
@@ -391,9 +391,7 @@ def _check(
     moving: Collection[str],
 ) -> None:
     where = f"operating point of model '{model.name}'"
-    for n in moving:
-        if n not in model.states:
-            raise unknown_name("state", n, model.states, where=where)
+    require_known("state", moving, model.states, where)
     for n in free:
         if n in model.states or n in s.unknowns or n in model.outputs or n in model.signals:
             continue  # free by nature

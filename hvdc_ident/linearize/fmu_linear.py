@@ -9,7 +9,14 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from hvdc_ident.errors import LinearizationError, ModelError, SimulationError, SteadyStateError, unknown_name
+from hvdc_ident.errors import (
+    LinearizationError,
+    ModelError,
+    SimulationError,
+    SteadyStateError,
+    require_known,
+    unknown_name,
+)
 from hvdc_ident.fmu.model import FmuModel
 from hvdc_ident.fmu.point import FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
@@ -78,12 +85,8 @@ class _FmuSearch:
             if name not in known and name not in model.states and name not in model.outputs:
                 everything = [*known, *model.states, *model.outputs]
                 raise unknown_name("variable", name, everything, where=f"model '{model.name}'")
-        for name in free:
-            if name not in known:
-                raise unknown_name("parameter or input", name, known, where=f"model '{model.name}', free")
-        for name in moving:
-            if name not in model.states:
-                raise unknown_name("state", name, model.states, where=f"model '{model.name}', moving")
+        require_known("parameter or input", free, known, f"model '{model.name}', free")
+        require_known("state", moving, model.states, f"model '{model.name}', moving")
         self.states, self.outputs = list(model.states), list(model.outputs)
         self.values = {n: v for n, v in fixed.items() if n in known}
         self.held = {n: v for n, v in fixed.items() if n in model.states}
@@ -195,9 +198,7 @@ def linear_model(
     """
     model = fmu_of(given).recording(outputs or ())
     ins, outs = _names(model, inputs, outputs)
-    for name in sensitivities:
-        if name not in model.parameters:
-            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+    require_known("parameter", sensitivities, model.parameters, f"model '{model.name}'")
     p = _at(model, point, outs)
     a, b, c, d = _matrices(model, p, ins)
     notes = {

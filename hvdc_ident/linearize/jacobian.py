@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.errors import LinearizationError, require_known
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delays import Blocks, DelayFree, Eliminated, channels, eliminate
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
@@ -58,9 +58,7 @@ def linearize(
         return linear_model(model, at, inputs, outputs, sensitivities)
     s = system(model, outputs)
     chosen = _chosen(s, inputs, model.name)
-    for name in sensitivities:
-        if name not in s.parameters:
-            raise unknown_name("parameter", name, s.parameters, where=f"model '{model.name}'")
+    require_known("parameter", sensitivities, s.parameters, f"model '{model.name}'")
     y, w, p = at.y, at.w, at.p
     modes = modes_at(s, y, w, p, side)
     jac = s.jacobian(y, w, p, modes)[: s.layout.main]
@@ -314,9 +312,7 @@ def _model(
 
 def _chosen(s: CompiledSystem, inputs: Sequence[str] | None, model: str) -> list[int]:
     names = s.inputs if inputs is None else tuple(inputs)
-    for n in names:
-        if n not in s.inputs:
-            raise unknown_name("input", n, s.inputs, where=f"model '{model}'")
+    require_known("input", names, s.inputs, f"model '{model}'")
     return [s.inputs.index(n) for n in names]
 
 

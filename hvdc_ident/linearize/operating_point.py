@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hvdc_ident.display import table_html
-from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
+from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
@@ -439,9 +439,7 @@ as the other one, in their units, and rounding leaves about 1e-16."""
 
 def known_inputs(model: AnyModel, inputs: Mapping[str, float]) -> dict[str, float]:
     """Return the inputs' values. Raises UnknownNameError for a name that is no input."""
-    for name in inputs:
-        if name not in model.inputs:
-            raise unknown_name("input", name, model.inputs, where=f"operating point of model '{model.name}'")
+    require_known("input", inputs, model.inputs, f"operating point of model '{model.name}'")
     return dict(inputs)
 
 

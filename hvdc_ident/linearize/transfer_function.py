@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 import sympy as sp
 
-from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.errors import LinearizationError, require_known, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.linearize.loops import signal_values
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
@@ -76,9 +76,7 @@ def symbolic_transfer(
     """
     if model.delays or model.sampled:
         raise LinearizationError("a model with delays has no rational formula", where=f"model '{model.name}'")
-    for name in (*parameters, *(together or {})):
-        if name not in model.parameters:
-            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+    require_known("parameter", (*parameters, *(together or {})), model.parameters, f"model '{model.name}'")
     if input not in model.inputs:
         raise unknown_name("input", input, model.inputs, where=f"model '{model.name}'")
     at = find_operating_point(model) if point is None else point

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import sympy as sp
 
-from hvdc_ident.errors import InputError, ModelError, UnknownNameError, unknown_name
+from hvdc_ident.errors import InputError, ModelError, UnknownNameError, require_known, unknown_name
 from hvdc_ident.expression import EXACT, FUNCTIONS, is_identifier, is_reserved, normal, parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model.definition import Algebraic, Delay, Output, Parameterisation, Sampled, Signal, State
@@ -340,9 +340,7 @@ def _check_parameterisation(model: Model, name: str, parameterisation: Parameter
             raise ModelError(f"the name '{new}' is taken in the model", where=place, expected="another name")
     known = [*parameterisation.parameters, *(p for p in model.parameters if p in kept)]
     for replaced, expression in parameterisation.replaces.items():
-        for used in sorted(_used(expression)):
-            if used not in known:
-                raise unknown_name("parameter", used, known, where=f"{place}, replaced '{replaced}'")
+        require_known("parameter", sorted(_used(expression)), known, f"{place}, replaced '{replaced}'")
 
 
 def ordered_signals(model: Model) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from hvdc_ident.errors import unknown_name
+from hvdc_ident.errors import require_known
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
@@ -131,9 +131,7 @@ def model(
     """
     chosen = frozenset(filters)
     for given, known in ((chosen, MEASURED), ({rating}, RATINGS), ({priority}, ("d", "q"))):
-        for value in given:
-            if value not in known:
-                raise unknown_name("option", value, known, where="the average-value link")
+        require_known("option", given, known, "the average-value link")
     rated = RATINGS[rating]
     starts = _guesses(rated)
     derivatives = _dc_derivatives() | _control_derivatives()

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import sympy as sp
 
-from hvdc_ident.errors import unknown_name
+from hvdc_ident.errors import require_known, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.model import Model, dependency_order
 from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
@@ -87,9 +87,7 @@ class ModelEquations:
         self.model = model
         self.sensitivities = tuple(sensitivities)
         self.outputs = tuple(model.outputs if outputs is None else outputs)
-        for name in self.sensitivities:
-            if name not in model.parameters:
-                raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+        require_known("parameter", self.sensitivities, model.parameters, f"model '{model.name}'")
         self.states = tuple(model.states)
         self.unknowns = torn(model)
         self.graph = Graph()

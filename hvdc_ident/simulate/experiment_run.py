@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, unknown_name
+from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
@@ -159,12 +159,8 @@ def simulate(
     for name in (*given, *experiment.inputs):
         if name not in plant.parameters and name not in plant.inputs:
             raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
-    for name in experiment.offsets:
-        if name not in plant.inputs:
-            raise unknown_name("input", name, plant.inputs, where=f"experiment '{experiment.name}'")
-    for name in experiment.starts:
-        if name not in plant.states:
-            raise unknown_name("state", name, plant.states, where=f"experiment '{experiment.name}'")
+    require_known("input", experiment.offsets, plant.inputs, f"experiment '{experiment.name}'")
+    require_known("state", experiment.starts, plant.states, f"experiment '{experiment.name}'")
     own = {**experiment.offsets, **experiment.starts}
     plant, parameter = with_own(plant, [n for n in (*plant.inputs, *plant.states) if n in own or n in sensitivities])
     given |= {parameter[n]: v for n, v in own.items()}

@@ -11,7 +11,7 @@ import numpy as np
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
-from hvdc_ident.errors import InputError, StudyError, unknown_name
+from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
 from hvdc_ident.fit import Free
@@ -317,9 +317,7 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
                 raise e.at(f"{where}, parameters.{name}.given") from None
     ties = {n: line.tie for n, line in settings.parameters.items() if line.tie is not None}
     own = [n for n, line in settings.parameters.items() if line.per_experiment]
-    for name in (*ties, *own):
-        if name not in model.parameters:
-            raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
+    require_known("parameter", (*ties, *own), model.parameters, f"{where}, parameters")
     if not ties and not own:
         return model
     if not isinstance(model, Model):

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.errors import InputError, unknown_name
+from hvdc_ident.errors import InputError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.information import leading
@@ -322,9 +322,7 @@ def structural_identifiability(
     names, watched = tuple(dict.fromkeys(parameters)), tuple(outputs)
     moved = _classes(model, inputs)
     starts = _starts(model, start)
-    for name in names:
-        if name not in model.parameters:
-            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
+    require_known("parameter", names, model.parameters, f"model '{model.name}'")
     ask = _Ask(model, names, watched, moved, starts, dict(regime or {}), seed, begun + time_limit)
     try:
         found = ask.answer()
@@ -348,9 +346,7 @@ def identifiable_subset(result: StructuralResult, order: Sequence[str] | None = 
     order: names of the result's parameters; None: as they were listed. All of them where nothing was decided.
     """
     names = tuple(result.parameters if order is None else order)
-    for n in names:
-        if n not in result.parameters:
-            raise unknown_name("parameter", n, result.parameters, where="order")
+    require_known("parameter", names, result.parameters, "order")
     if result.status != "decided":
         return names
     position = {n: k for k, n in enumerate(result.parameters)}
