@@ -3,39 +3,18 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.data import Array
-from hvdc_ident.errors import (
-    InputError,
-    LinearizationError,
-    SteadyStateError,
-    StudyError,
-    require_known,
-    unknown_name,
-)
-from hvdc_ident.files import digest
-from hvdc_ident.formats import files_of, read_waveforms
-from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize import (
-    FrequencyResponse,
-    MeasuredResponse,
-    Port,
-    ResponseFile,
-    read_response,
-    response_at_tones,
-    response_from_record,
-)
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.errors import LinearizationError, SteadyStateError
+from hvdc_ident.model import Model
 from hvdc_ident.study import schema
+from hvdc_ident.study.measured_responses import port_of
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize import LinearModel, OperatingPoint, Port
+    from hvdc_ident.linearize import LinearModel, OperatingPoint
     from hvdc_ident.study.study import Study
 
 
@@ -172,7 +151,6 @@ def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:
 
 def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[dict[str, Any]]:
     """Each transfer function with some parameters as symbols; where there is none, the reason."""
-    from hvdc_ident.errors import LinearizationError
     from hvdc_ident.linearize import symbolic_transfer
 
     model = study.model
@@ -192,7 +170,6 @@ def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[
 
 def _locus(asked: schema.LocusTable, linear: LinearModel) -> dict[str, Any]:
     """The eigenvalues along the parameter, all else as at the operating point."""
-    import numpy as np
 
     from hvdc_ident.linearize import root_locus
 
@@ -204,19 +181,8 @@ def _locus(asked: schema.LocusTable, linear: LinearModel) -> dict[str, Any]:
     return root_locus(point.model, asked.parameter, values, fixed).to_dict()
 
 
-def port_of(table: schema.PortTable) -> Port:
-    """Return the port that a table of the study describes."""
-    from hvdc_ident.linearize import Port
-
-    source, voltage, current = (
-        (v[0], v[1]) if len(v) == 2 else (v[0],) for v in (table.source, table.voltage, table.current)
-    )
-    return Port(source, voltage, current, table.angle)
-
-
 def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """The impedance of each port, and a file of each."""
-    import numpy as np
 
     from hvdc_ident.linearize import port_impedance
     from hvdc_ident.linearize.export.csv_response import text
@@ -320,234 +286,3 @@ def _margin_lines(found: Mapping[str, Any]) -> list[str]:
         n = found["ncf_margin"]
         result.append(f"coprime factor margin {n['value']:.4g}; the largest attainable {n['attainable']:.4g}")
     return result
-
-
-def read_responses(
-    settings: schema.StudyFile, model: AnyModel, folder: Path, where: str
-) -> tuple[tuple[MeasuredResponse, ...], dict[str, str]]:
-    """Return the measured responses of a study, and the sha256 of every file behind them by its name in the study.
-
-    Raises StudyError, UnknownNameError or WaveformError with the response's place in the study.
-    """
-    found: list[MeasuredResponse] = []
-    sources: dict[str, str] = {}
-    taken = {e.name.lower() for e in settings.experiment}
-    for table in settings.response:
-        place = f"{where}, response '{table.name}'"
-        if table.name.lower() in taken:
-            raise StudyError("two experiments or responses of one name", where=place, expected="a name of its own")
-        taken.add(table.name.lower())
-        port = _checked(table, settings, model, place)
-        try:
-            found.append(_response(table, port, folder / table.data))
-        except InputError as e:
-            raise e.at(place) from None
-        path = folder / table.data
-        for file in files_of(path) if table.signals else (path,):
-            name = table.data if file == path else f"{Path(table.data).parent / file.name}"
-            sources[name] = digest(file.read_bytes())
-    return tuple(found), sources
-
-
-def _checked(table: schema.ResponseTable, settings: schema.StudyFile, model: AnyModel, place: str) -> Port | None:
-    """The port, where it is one. Raises where the table names what is not there."""
-    require_known("input", table.values, model.inputs, f"{place}.values")
-    if table.trim is not None:
-        require_known("output", table.trim.outputs, model.outputs, f"{place}.trim.outputs")
-        require_known("input", table.trim.inputs, model.inputs, f"{place}.trim.inputs")
-        require_known("input or parameter", table.trim.free, [*model.inputs, *model.parameters], f"{place}.trim.free")
-    if table.port is None:
-        assert table.input is not None and table.output is not None
-        inner = [*model.signals, *model.algebraic, *model.states] if isinstance(model, Model) else []
-        require_known("input", [table.input], model.inputs, f"{place}.input")
-        require_known("output", [table.output], [*model.outputs, *inner], f"{place}.output")
-        return None
-    ports = {p.name: p for p in (settings.linearize.port if settings.linearize else ())}
-    if table.port not in ports:
-        raise unknown_name("port of [[linearize.port]]", table.port, ports, where=f"{place}.port")
-    return port_of(ports[table.port])
-
-
-def _response(table: schema.ResponseTable, port: Port | None, path: Path) -> MeasuredResponse:
-    if port is None:
-        wanted = {"": (table.output or "", table.input or "")}
-    else:
-        axes = port.axes
-        wanted = {"": ("dc", "dc")} if len(axes) == 1 else {f"{o}{i}": (o, i) for o in axes for i in axes}
-    file = _waveforms(table, path) if table.frequencies is not None or table.signals else read_response(path)
-    names = _channels(table, file, list(wanted), path.name)
-    keep = np.ones(file.omega.size, dtype=bool)
-    if table.band is not None:
-        keep = (file.omega >= 2 * np.pi * table.band[0]) & (file.omega <= 2 * np.pi * table.band[1])
-    if not keep.any():
-        hertz = file.omega / (2 * np.pi)
-        raise StudyError(
-            "no frequency lies in the band", expected=f"{table.band} Hz", got=f"{hertz[0]:.4g} to {hertz[-1]:.4g} Hz"
-        )
-    values = table.scale * np.stack([file.channels[names[w]][keep] for w in wanted if w in names], axis=1)
-    std, dof = _noise(table, file, [names[w] for w in wanted if w in names], keep, values)
-    trim = table.trim
-    return MeasuredResponse(
-        table.name,
-        "transfer" if port is None else table.kind,
-        tuple(wanted[w] for w in wanted if w in names),
-        file.omega[keep],
-        values,
-        std,
-        dof,
-        port,
-        FrozenMap(table.values | (trim.inputs if trim else {})),
-        FrozenMap(trim.outputs if trim else {}),
-        tuple((trim.free or ()) if trim else ()),
-        table.role,
-        table.unit,
-    )
-
-
-def _noise(
-    table: schema.ResponseTable, file: ResponseFile, names: Sequence[str], keep: Array, values: Array
-) -> tuple[Array | None, float]:
-    """(standard deviation of each value's modulus, independent numbers behind it): as stated, else as the file tells."""
-    if table.noise is not None:
-        return np.full(values.shape, table.noise), np.inf
-    if table.relative_noise is not None:
-        return table.relative_noise * np.abs(values), np.inf
-    if all(n in file.std and (file.std[n][keep] > 0).all() for n in names):
-        std = abs(table.scale) * np.stack([file.std[n][keep] for n in names], axis=1)
-        return std, min((file.dof.get(n, np.inf) for n in names), default=np.inf)
-    return None, np.inf
-
-
-def _channels(table: schema.ResponseTable, file: ResponseFile, wanted: Sequence[str], where: str) -> dict[str, str]:
-    """The file's channel for each wanted one: as `columns` says, or by its name's end (Zdd, Ydq, Z11, "d from q")."""
-    known = list(file.channels)
-    for key, name in table.columns.items():
-        if key not in wanted and not (len(wanted) == 1 and len(table.columns) == 1):
-            raise unknown_name("channel", key, wanted, where="columns")
-        if name not in known:
-            raise unknown_name("channel", name, known, where=f"{where}, columns")
-    if len(wanted) == 1:
-        if table.columns:
-            return {wanted[0]: next(iter(table.columns.values()))}
-        if len(known) == 1:
-            return {wanted[0]: known[0]}
-        expected = "one channel, or the key columns"
-        hint = f'columns = {{value = "{known[0]}"}}'
-        raise StudyError("which channel of the file?", where=where, expected=expected, got=", ".join(known), hint=hint)
-    found = dict(table.columns)
-    for key in wanted if not found else ():
-        numbered = key.replace("d", "1").replace("q", "2")
-        ends = (key, numbered, f"{key[0]}from{key[1]}")
-        bare = {n: re.sub(r"[^a-z0-9]", "", n.lower()) for n in known}
-        hits = [n for n, b in bare.items() if b.endswith(ends)]
-        if len(hits) == 1:
-            found[key] = hits[0]
-    other = "y" if table.kind == "impedance" else "z"
-    turned = [n for n in found.values() if re.fullmatch(rf"{other}\s?(\d\d|[dq][dq])", n.lower())]
-    if turned and not table.columns:
-        kind = "admittance" if table.kind == "impedance" else "impedance"
-        raise StudyError(
-            f"channel '{turned[0]}' is no {table.kind}", where=where, hint=f'kind = "{kind}", or name it in columns'
-        )
-    if not found:
-        raise StudyError(
-            "no channel of the port is in the file",
-            where=where,
-            expected=f"channels that end in {', '.join(wanted)}, or the key columns",
-            got=", ".join(known),
-        )
-    return found
-
-
-def _waveforms(table: schema.ResponseTable, path: Path) -> ResponseFile:
-    """The response that a record in time shows: at the perturbation's frequencies, or by Welch's averages over all."""
-    sent, seen = table.signals["input"], table.signals["output"]
-    record = read_waveforms(path, [sent, seen])
-    u, y = record[sent], record[seen]
-    if table.frequencies is None:
-        found: FrequencyResponse = response_from_record(record.time, u, y, input=sent, output=seen)
-    else:
-        omega = 2 * np.pi * np.array(table.frequencies)
-        found = response_at_tones(record.time, u, y, omega, input=sent, output=seen)
-    order = np.argsort(found.omega)
-    assert found.std is not None
-    name = f"{seen} from {sent}"
-    channels = FrozenMap({name: found.values[order, 0, 0]})
-    return ResponseFile(found.omega[order], channels, FrozenMap({name: found.std[order, 0, 0]}))
-
-
-def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Return every measured response beside the model's at some sets of values, with the errors of each, as plain numbers.
-
-    sets: values of parameters by the set's name ("given", "fitted"). A set for which there is no response has the reason.
-    """
-    found = []
-    for r in study.responses:
-        line: dict[str, Any] = {
-            "name": r.name,
-            **described(r),
-            "omega": r.omega.tolist(),
-            "measured": _parts(r.values),
-            "std": None if r.std is None else r.std.tolist(),
-            "models": {},
-        }
-        for name, values in sets.items():
-            try:
-                linear = r.linear(study.model, values)
-                curve = r.seen(linear)[0]
-            except (SteadyStateError, LinearizationError) as e:
-                line["models"][name] = {"reason": str(e)}
-            else:
-                right = float(linear.poles().real.max(initial=-np.inf))
-                line["models"][name] = {**_parts(curve), "errors": r.errors(curve), "stable": right < 1e-6}
-        found.append(line)
-    return found
-
-
-def _parts(values: Array) -> dict[str, Any]:
-    return {"real": values.real.tolist(), "imag": values.imag.tolist()}
-
-
-def response_lines(responses: Iterable[Mapping[str, Any]], of: str) -> list[str]:
-    """Return a line for each channel of the compared responses: how far the model with one set of values is from it."""
-    lines = []
-    for r in responses:
-        model = r["models"].get(of)
-        if model is None:
-            continue
-        if "reason" in model:
-            lines.append(f"response {r['name']}: the {of} model has none: {model['reason']}")
-        if model.get("stable") is False:
-            lines.append(f"response {r['name']}, {of}: the model is unstable where it was measured")
-        for e in model.get("errors", ()):
-            share = "" if e["relative"] is None else f" off by {100 * e['relative']:.3g} %,"
-            chi2 = "" if e["chi2_per_point"] is None else f"; {math.sqrt(e['chi2_per_point']):.3g} times the noise"
-            lines.append(
-                f"response {r['name']}, {e['channel']}, {of}:{share} gain by up to {e['gain_db']['value']:+.3g} dB at "
-                f"{e['gain_db']['omega'] / math.tau:.4g} Hz, phase by up to {e['phase_deg']['value']:+.3g} degrees at "
-                f"{e['phase_deg']['omega'] / math.tau:.4g} Hz{chi2}"
-            )
-            if e["factor"] is not None:
-                lines.append(
-                    f"response {r['name']}, {e['channel']}: the measured one is {e['factor']:.4g} times the model's: sign, "
-                    "unit or base? `scale` in [[response]] multiplies it"
-                )
-    return lines
-
-
-def described(response: MeasuredResponse) -> dict[str, object]:
-    """Return what `check` tells of a measured response."""
-    hertz = response.omega / (2 * np.pi)
-    noise: float | None = None
-    if response.std is not None:
-        noise = float(np.sqrt(np.mean(response.std**2) / np.mean(np.abs(response.values) ** 2)))
-    return {
-        "role": response.role,
-        "kind": response.kind,
-        "channels": list(response.labels),
-        "points": int(hertz.size),
-        "band_hz": [float(hertz[0]), float(hertz[-1])],
-        "unit": response.unit,
-        "relative_noise": noise,
-        "noise_source": "misfit" if response.std is None else "estimated" if np.isfinite(response.dof) else "given",
-    }

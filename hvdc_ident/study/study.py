@@ -21,7 +21,7 @@ from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.study import schema
 from hvdc_ident.study.checks import check_questions
-from hvdc_ident.study.linear_analysis import read_responses
+from hvdc_ident.study.measured_responses import read_responses
 from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
 

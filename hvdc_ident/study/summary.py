@@ -9,7 +9,7 @@ from typing import Any
 
 from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.checks import steady_notes
-from hvdc_ident.study.linear_analysis import described
+from hvdc_ident.study.measured_responses import described
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.recordings import noise_line

@@ -19,7 +19,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     """Return the estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
     from hvdc_ident.identifiability.gate import gate, gated
     from hvdc_ident.study import fitting
-    from hvdc_ident.study.linear_analysis import compared
+    from hvdc_ident.study.measured_responses import compared
     from hvdc_ident.study.pipeline import executor_of
 
     fitting.need(study, "fit")
@@ -134,7 +134,7 @@ def told(data: Mapping[str, Any]) -> list[str]:
     lines += [f"{FIT_WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
     lines += [f"Next: {judged['next']}"] if judged.get("next") else []
     lines += [f"{data['roughness']['text']}."] if data.get("roughness") else []
-    from hvdc_ident.study.linear_analysis import response_lines
+    from hvdc_ident.study.measured_responses import response_lines
 
     beside = _beside(data)
     for name, e in data["estimates"].items():

@@ -51,7 +51,8 @@ def _described(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
-    from hvdc_ident.study.linear_analysis import analyses, compared, modes_of
+    from hvdc_ident.study.linear_analysis import analyses, modes_of
+    from hvdc_ident.study.measured_responses import compared
 
     point = model.point
     assert point is not None
@@ -114,7 +115,8 @@ def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
 
 def told(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
-    from hvdc_ident.study.linear_analysis import lines, response_lines
+    from hvdc_ident.study.linear_analysis import lines
+    from hvdc_ident.study.measured_responses import response_lines
 
     def described(found: Mapping[str, Any], of: str) -> list[str]:
         return lines(found) + response_lines(found.get("responses", ()), of)
