@@ -23,7 +23,7 @@ import usage
 from hvdc_ident.data import Experiment, InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
@@ -33,11 +33,11 @@ ROWS, END, EVENT, NOISE = 1000, 0.999, 0.1, 1e-3
 HIDDEN = EffectUse("lag", ("Vdc1_m",), FrozenMap({"T": 0.005}))
 OUTPUTS = ("Irorder1", "Irorder2", "Iiorder1", "Iiorder2", "Vdc1", "P1", "P2", "Q1")
 FREE = (
-    Free("KIP", 25.0, 5.0, 60.0),
-    Free("KPVDC", 20.0, 5.0, 60.0),
-    Free("KIVDC", 600.0, 100.0, 2000.0),
-    Free("KIQ", 25.0, 5.0, 60.0),
-    Free("KIQ2", 25.0, 5.0, 60.0),
+    FitParameter("KIP", 25.0, 5.0, 60.0),
+    FitParameter("KPVDC", 20.0, 5.0, 60.0),
+    FitParameter("KIVDC", 600.0, 100.0, 2000.0),
+    FitParameter("KIQ", 25.0, 5.0, 60.0),
+    FitParameter("KIQ2", 25.0, 5.0, 60.0),
 )
 # What is moved, from, to, over so many s; the last three are held out.
 MOVES = (

@@ -13,7 +13,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
 from hvdc_ident.files import csv_text, json_text, write_text
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.uncertainty import autocorrelation
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.linearize import find_operating_point, loop, margins
@@ -100,7 +100,7 @@ def information(study: Study) -> dict[str, dict[str, float]]:
 
 def verdicts(study: Study, bounds: tuple[float, float]) -> list[dict[str, Any]]:
     """What the identifiability report says of KIVDC, KPVDC unknown too, by noise, without and with the load step."""
-    free = [Free("KPVDC", 20, 10, 40), Free("KIVDC", min(max(750, bounds[0]), bounds[1]), *bounds)]
+    free = [FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", min(max(750, bounds[0]), bounds[1]), *bounds)]
     found = []
     for noise in NOISE:
         random = np.random.default_rng(1)

@@ -148,10 +148,12 @@ def test_every_result_is_one_screen_a_table_and_a_figure(report: Any, fit: Any) 
 
 
 def test_a_problem_is_fitted_as_it_stands() -> None:
-    from hvdc_ident.fit import Free
+    from hvdc_ident.fit import FitParameter
     from hvdc_ident.simulate import ModelSimulator
 
-    problem = Problem(ModelSimulator(LAG), (RECORD,), (Free("T", 1.0, 0.1, 10.0), Free("k", 2.0, 0.0, 10.0)))
+    problem = Problem(
+        ModelSimulator(LAG), (RECORD,), (FitParameter("T", 1.0, 0.1, 10.0), FitParameter("k", 2.0, 0.0, 10.0))
+    )
     assert hi.fit(problem, starts=1).values["T"] == pytest.approx(T, rel=0.02)
 
 

@@ -10,14 +10,14 @@ import numpy as np
 from numba import njit
 
 from hvdc_ident.data import InputSignal, Trajectory, experiment
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import NAMES, ModelSimulator, call, engine_of, simulate
 
 RTOL = 1e-6
 STEP = (0.1, 1.0, 1.019)
 TIME = np.linspace(0.0, 1.0, 501)
-FREE = (Free("KPVDC", 20.0, 10.0, 40.0), Free("KIVDC", 600.0, 300.0, 1200.0))
+FREE = (FitParameter("KPVDC", 20.0, 10.0, 40.0), FitParameter("KIVDC", 600.0, 300.0, 1200.0))
 TRUE = {"KPVDC": 24.0, "KIVDC": 734.7}
 NOISE = 1e-4
 

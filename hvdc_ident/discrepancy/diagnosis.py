@@ -26,7 +26,7 @@ from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
 from hvdc_ident.discrepancy.verdict.lines import detectable, lines
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.fit import Free, Simulator
+from hvdc_ident.fit import FitParameter, Simulator
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate import ModelSimulator
@@ -45,7 +45,7 @@ SPARED = (
 def diagnose(
     subject: AnyModel | Simulator,
     experiments: Iterable[Experiment],
-    parameters: Iterable[Free],
+    parameters: Iterable[FitParameter],
     *,
     effects: Iterable[str] | Literal["all"] = "all",
     places: Iterable[str | tuple[str, ...]] | None = None,
@@ -132,7 +132,7 @@ def _assembled(
     outcome: SearchOutcome,
     judgement: Judgement,
     other: Fallback | None,
-    free: tuple[Free, ...],
+    free: tuple[FitParameter, ...],
     notes: tuple[str, ...],
 ) -> Diagnosis:
     search.tell(0, 1, "before and after")

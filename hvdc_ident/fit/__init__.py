@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from hvdc_ident.fit.per_experiment import fit_each
     from hvdc_ident.fit.problem import Problem
     from hvdc_ident.fit.result import Estimate, FitResult, StartOutcome
-    from hvdc_ident.fit.simulator import Simulation, Simulator
-    from hvdc_ident.fit.unknown import Free
+    from hvdc_ident.fit.simulator import SimulationRun, Simulator
+    from hvdc_ident.fit.unknown import FitParameter
 else:
     __getattr__ = offered(
         __name__,
@@ -23,20 +23,20 @@ else:
             "per_experiment": "fit_each",
             "problem": "Problem",
             "result": "Estimate FitResult StartOutcome",
-            "simulator": "Simulation Simulator",
-            "unknown": "Free",
+            "simulator": "SimulationRun Simulator",
+            "unknown": "FitParameter",
         },
     )
 
 __all__ = [
     "Estimate",
+    "FitParameter",
     "FitResult",
-    "Free",
     "Group",
     "Optimiser",
     "OptimiserResult",
     "Problem",
-    "Simulation",
+    "SimulationRun",
     "Simulator",
     "StartOutcome",
     "fit",

@@ -19,7 +19,7 @@ from scipy.special import fdtri
 from hvdc_ident.data import Array
 from hvdc_ident.fit.noise import ESTIMATED, FLOOR, GIVEN, MISFIT, from_misfit, scatter_of
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.weights import MAD
 from hvdc_ident.immutable import FrozenMap
 
@@ -33,7 +33,7 @@ Verdict = Literal["fits", "does-not-fit", "noise-understated", "noise-overstated
 
 
 @dataclass(frozen=True)
-class Size:
+class ResidualSize:
     """The residual of one output. ratio: its power over that of the noise, per degree of freedom.
 
     low, high: between them the ratio says nothing; noise: the standard deviation told or, where none was, the scatter from
@@ -65,7 +65,7 @@ class Adequacy:
 
     verdict: Verdict
     chi2_per_dof: float | None
-    outputs: FrozenMap[Size] = field(default_factory=FrozenMap)
+    outputs: FrozenMap[ResidualSize] = field(default_factory=FrozenMap)
     text: str = ""
     next: str = ""
 
@@ -81,7 +81,7 @@ class Adequacy:
 
 def adequacy(
     problem: Problem,
-    blocks: Sequence[Block],
+    blocks: Sequence[ResidualBlock],
     sources: Mapping[str, str],
     effective: Mapping[str, float],
     rho: Mapping[str, float],
@@ -119,25 +119,25 @@ def _power(problem: Problem, residual: Array) -> float:
 def _size(
     problem: Problem,
     output: str,
-    blocks: Sequence[Block],
+    blocks: Sequence[ResidualBlock],
     share: float,
     independence: tuple[float, float],
     source: str,
     level: float,
-) -> Size:
+) -> ResidualSize:
     """The size of one output's residual. share: of the rows that the unknowns leave free. independence: effective, rho."""
     residual = np.concatenate([b.residual for b in blocks])
     effective, white = _independent(residual.size, independence), independence[1] == 0.0
     spare = max(effective - residual.size * (1.0 - share), 1.0)
     if from_misfit(source) and source != MISFIT:
-        return Size(None, 0.0, np.inf, None, white, "fits")
+        return ResidualSize(None, 0.0, np.inf, None, white, "fits")
     if not from_misfit(source):
         noise: float | None = float(np.sqrt(sum(b.sigma**2 * b.residual.size for b in blocks) / residual.size))
         ratio, behind = _power(problem, residual) / share, problem.noise_dof
     else:
         scatter = scatter_of(problem.fitted_experiments, output)
         if scatter is None:
-            return Size(None, 0.0, np.inf, None, white, "not-judged")
+            return ResidualSize(None, 0.0, np.inf, None, white, "not-judged")
         noise, rows = scatter
         misfit = np.concatenate([b.residual * b.sigma for b in blocks])
         ratio, behind = _power(problem, misfit) / share / noise**2, 0.5 * rows
@@ -149,7 +149,7 @@ def _size(
         verdict = "noise-understated" if white and not from_misfit(source) else "does-not-fit"
     elif ratio < low and not from_misfit(source):
         verdict = "noise-overstated"
-    return Size(ratio, low, high, noise, white, verdict)
+    return ResidualSize(ratio, low, high, noise, white, verdict)
 
 
 def _independent(rows: int, independence: tuple[float, float]) -> float:
@@ -167,14 +167,14 @@ def _quantile(dof: float, behind: float, chance: float) -> float:
     return float(fdtri(dof, min(behind, 1e9), chance))
 
 
-def _together(sizes: Mapping[str, Size]) -> Verdict:
+def _together(sizes: Mapping[str, ResidualSize]) -> Verdict:
     """The worst verdict of any output."""
     order: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
     return min((s.verdict for s in sizes.values()), key=order.index)
 
 
 def _words(
-    problem: Problem, sizes: Mapping[str, Size], verdict: Verdict, sources: Mapping[str, str]
+    problem: Problem, sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str]
 ) -> tuple[str, str]:
     """The verdict in words, and what to do."""
     parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
@@ -195,7 +195,7 @@ def _words(
     return text, ""
 
 
-def _line(output: str, size: Size, source: str) -> str:
+def _line(output: str, size: ResidualSize, source: str) -> str:
     """Return the sentence on one output."""
     if size.verdict == "fits" and size.ratio is None:
         return f"{output} is met to {FLOOR:g} of its range, and the intervals are of what is left below that"

@@ -17,7 +17,7 @@ from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 
 FEWEST = 3
 """Fewer experiments have no scatter worth the name."""
@@ -69,7 +69,7 @@ def bootstrap(
     return Bootstrap(names, np.array(good)[:, : len(names)], len(rows) - len(good), len(units))
 
 
-def _refit(problem: Problem, theta: Array, blocks: Sequence[Block], counts: NDArray[np.intp]) -> Array | None:
+def _refit(problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], counts: NDArray[np.intp]) -> Array | None:
     """The estimates, (p,), with every experiment counted so many times; None where the fit fails."""
     units = problem.fitted_experiments
     times = {e.name: int(c) for e, c in zip(units, counts, strict=True) if c}
@@ -94,7 +94,7 @@ def _refit(problem: Problem, theta: Array, blocks: Sequence[Block], counts: NDAr
     return None
 
 
-def _counted(blocks: Sequence[Block], times: Mapping[str, int], columns: Sequence[int]) -> tuple[Array, Array]:
+def _counted(blocks: Sequence[ResidualBlock], times: Mapping[str, int], columns: Sequence[int]) -> tuple[Array, Array]:
     """Residual and jacobian in which every experiment counts so many times."""
     root = [np.sqrt(times[b.experiment]) for b in blocks]
     r = np.concatenate([b.residual * k for b, k in zip(blocks, root, strict=True)])
@@ -109,7 +109,7 @@ def _one_step(problem: Problem, theta: Array, r: Array, jacobian: Array) -> Arra
     return space.unscaled(x + bounded_step(scaled.T @ r, scaled.T @ scaled, 0.0, low - x, high - x))
 
 
-def cluster_sandwich(blocks: Sequence[Block]) -> tuple[Array, int]:
+def cluster_sandwich(blocks: Sequence[ResidualBlock]) -> tuple[Array, int]:
     """(p, p) covariance of the unknowns from the scatter of the experiments' scores, and its degrees of freedom, n - 1.
 
     (J'J)^-1 (sum g_e g_e') (J'J)^-1 n/(n - 1), with g_e the gradient of experiment e alone at the common optimum
@@ -124,7 +124,7 @@ def cluster_sandwich(blocks: Sequence[Block]) -> tuple[Array, int]:
     return inverse @ (scores.T @ scores) @ inverse * (n / (n - 1.0)), n - 1
 
 
-def _scores(blocks: Sequence[Block]) -> tuple[Array, Array]:
+def _scores(blocks: Sequence[ResidualBlock]) -> tuple[Array, Array]:
     """(n, p) gradients by experiment and (p, p) J'J."""
     names = list(dict.fromkeys(b.experiment for b in blocks))
     scores = np.zeros((len(names), blocks[0].jacobian.shape[1]))

@@ -15,7 +15,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.nuisance import TIME_SHIFT, unknown_of
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.starts import Optimum
+from hvdc_ident.fit.starts import LocalMinimum
 
 MOST = 80
 """Stretches that are tried in an experiment; of more, every so many."""
@@ -28,7 +28,7 @@ def has_clocks(problem: Problem) -> bool:
     return any(TIME_SHIFT in e.nuisance for e in problem.fitted_experiments)
 
 
-def searched(problem: Problem, best: Optimum, method: Optimiser) -> Optimum:
+def searched(problem: Problem, best: LocalMinimum, method: Optimiser) -> LocalMinimum:
     """The best optimum over the stretches of all clocks: search, fit again, until no other stretch is better."""
     for _ in range(ROUNDS):
         theta = best.theta.copy()
@@ -40,7 +40,7 @@ def searched(problem: Problem, best: Optimum, method: Optimiser) -> Optimum:
         run = method.run(problem, theta)
         if run.status == "failed" or run.cost is None or not run.cost < best.cost:
             return best
-        best = Optimum(run.theta, run.cost)
+        best = LocalMinimum(run.theta, run.cost)
     return best
 
 

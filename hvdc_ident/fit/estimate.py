@@ -24,11 +24,11 @@ from hvdc_ident.fit.optimisers import optimiser as named
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.refined import Refined
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.residual_tests import residual_tests
 from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, StartOutcome, Status
 from hvdc_ident.fit.rough import LUCK, Trend, residual_at, threshold_of, trend_of
-from hvdc_ident.fit.starts import DISTINCT, Optimum, best_first, distinct, latin_hypercube
+from hvdc_ident.fit.starts import DISTINCT, LocalMinimum, best_first, distinct, latin_hypercube
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
 from hvdc_ident.immutable import FrozenMap
@@ -149,13 +149,13 @@ def _result(
     )
 
 
-def on_trend(problem: Problem, best: Optimum) -> tuple[Optimum, Trend | None]:
+def on_trend(problem: Problem, best: LocalMinimum) -> tuple[LocalMinimum, Trend | None]:
     """The optimum, that of the trend where the cost is rough, and that trend. Raises SimulationError."""
     trend = trend_of(problem, best.theta)
     if trend is None:
         return best, None
     r, _ = problem.residual(trend.theta)
-    return Optimum(trend.theta, 0.5 * float(r @ r)), trend
+    return LocalMinimum(trend.theta, 0.5 * float(r @ r)), trend
 
 
 def _method(optimiser: Optimiser | str | None, starts: int | None, seed: int) -> tuple[Optimiser, int]:
@@ -199,21 +199,21 @@ def _continued(problem: Problem, runs: Sequence[OptimiserResult], method: Optimi
     return runs
 
 
-def _ends(runs: Sequence[OptimiserResult]) -> list[Optimum]:
+def _ends(runs: Sequence[OptimiserResult]) -> list[LocalMinimum]:
     """Where the runs ended, the lowest cost first whatever stopped it; of the others those that may be optima."""
-    reached = [(r.status, Optimum(r.theta, r.cost)) for r in runs if r.cost is not None]
+    reached = [(r.status, LocalMinimum(r.theta, r.cost)) for r in runs if r.cost is not None]
     first, *rest = best_first([o for _, o in reached])
     optima = [o for status, o in reached if status in ("converged", "stalled")]
     return [first, *(o for o in rest if o in optima)]
 
 
-def _in_time(problem: Problem, theta: Array, blocks: Sequence[Block]) -> Sequence[Block]:
+def _in_time(problem: Problem, theta: Array, blocks: Sequence[ResidualBlock]) -> Sequence[ResidualBlock]:
     """The blocks as samples in time, which tests of residuals need."""
     return blocks if problem.band is None else problem.blocks(theta, derivatives=False, in_time=True)
 
 
 def _uncertainties(
-    problem: Problem, theta: Array, blocks: Sequence[Block], source: dict[str, str]
+    problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], source: dict[str, str]
 ) -> tuple[Uncertainty, Uncertainty]:
     """What the curvature says about the unknowns inside their bounds, and about all of them."""
     names = problem.names
@@ -229,7 +229,7 @@ def _uncertainties(
     return inner, everything
 
 
-def _informative(problem: Problem, blocks: Sequence[Block]) -> list[Block]:
+def _informative(problem: Problem, blocks: Sequence[ResidualBlock]) -> list[ResidualBlock]:
     """The blocks with the information their samples have under a robust loss."""
     if problem.loss.linear:
         return list(blocks)
@@ -261,8 +261,8 @@ def _outcomes(
 
 def _status(
     problem: Problem,
-    best: Optimum,
-    optima: Sequence[Optimum],
+    best: LocalMinimum,
+    optima: Sequence[LocalMinimum],
     outcomes: Sequence[StartOutcome],
     worth: float,
     trend: Trend | None,
@@ -306,7 +306,7 @@ def _status(
 
 
 def _beside_the_other_optimum(
-    problem: Problem, found: dict[str, Estimate], rivals: Sequence[Optimum]
+    problem: Problem, found: dict[str, Estimate], rivals: Sequence[LocalMinimum]
 ) -> dict[str, Estimate]:
     """The estimates, each with the value it has at another optimum as good where that lies outside its interval."""
     told = dict(found)
@@ -321,7 +321,7 @@ def _beside_the_other_optimum(
 
 
 def _arrived(
-    problem: Problem, best: Optimum, outcomes: Sequence[StartOutcome], worth: float, jump: float
+    problem: Problem, best: LocalMinimum, outcomes: Sequence[StartOutcome], worth: float, jump: float
 ) -> list[StartOutcome]:
     """The runs that reached the optimum, the best first: its cost, to within what moves no estimate by half its spread, or
     its place, to a thousandth of the ranges, for a cost may scatter by the simulation's own error. jump: what it does so by,
@@ -340,14 +340,14 @@ def _end(problem: Problem, outcome: StartOutcome) -> Array:
     return np.array([outcome.end[n] for n in problem.names])
 
 
-def _there(problem: Problem, best: Optimum, outcome: StartOutcome) -> bool:
+def _there(problem: Problem, best: LocalMinimum, outcome: StartOutcome) -> bool:
     """Return whether a run ended where the best one did."""
     space = problem.coordinates
     end = space.scaled(_end(problem, outcome))
     return bool((np.abs(end - space.scaled(best.theta)) <= 1e-3 * space.ranges).all())
 
 
-def _stands(problem: Problem, best: Optimum, there: Sequence[StartOutcome]) -> bool:
+def _stands(problem: Problem, best: LocalMinimum, there: Sequence[StartOutcome]) -> bool:
     """Return whether the best point is an optimum: a run says so that arrived, or nothing is left to gain, or two runs agree.
 
     Runs that ended at one point from different starts have found what there is to be found, whatever stopped them.

@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import LinearizationError, SimulationError, SteadyStateError
-from hvdc_ident.fit.simulator import Simulation, Simulator
+from hvdc_ident.fit.simulator import SimulationRun, Simulator
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, State
@@ -106,7 +106,7 @@ class WithResponses:
 
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
-    ) -> Simulation:
+    ) -> SimulationRun:
         """A run, or the response at the experiment's frequencies. Raises SimulationError where there is none."""
         if experiment.domain == "time":
             return self.simulator.simulate(experiment, values, sensitivities)

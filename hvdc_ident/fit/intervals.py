@@ -12,17 +12,17 @@ from scipy.special import stdtrit
 from hvdc_ident.data import Array
 from hvdc_ident.fit.nuisance import unit_of, unknown_of
 from hvdc_ident.fit.problem import Problem, stacked
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.uncertainty import Uncertainty
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 
 ONE_SIDED = 1.353
 """Half the 90 % quantile of chi-square with one degree of freedom: the 95 % limit of a parameter on its bound."""
 
 
 def estimates_of(
-    problem: Problem, theta: Array, blocks: Sequence[Block], inner: Uncertainty, everything: Uncertainty
+    problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], inner: Uncertainty, everything: Uncertainty
 ) -> dict[str, Estimate]:
     """The estimate of every unknown by name.
 
@@ -59,7 +59,7 @@ WIDER = 2.0
 """From this ratio of an interval to that of independent residuals on, the difference is told in words."""
 
 
-def _inside(unknown: Free, value: float, known: Uncertainty, limits: tuple[float, float]) -> Estimate:
+def _inside(unknown: FitParameter, value: float, known: Uncertainty, limits: tuple[float, float]) -> Estimate:
     """Value, std and t interval, which ends where the parameter does; a reason where it is wider than the bounds.
 
     limits: what the parameter may be by its nature, in its unit. A parameter whose bounds admit no negative value has none.
@@ -93,7 +93,7 @@ def _counted(samples: float) -> str:
     return f"{number} independent {'row' if number == '1' else 'rows'}"
 
 
-def _on_bound(unknown: Free, value: float, slope: float, known: Uncertainty, *, alone: bool) -> Estimate:
+def _on_bound(unknown: FitParameter, value: float, slope: float, known: Uncertainty, *, alone: bool) -> Estimate:
     """The bound with its one-sided 95 % limit, where the profile's cost, to second order, has risen by 1.353."""
     if not alone:
         return Estimate(value, reason="on a bound together with others: their limits are not independent")

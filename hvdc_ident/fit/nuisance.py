@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.fit.simulator import Simulator, WithInputs, WithStates
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 from hvdc_ident.parameters import Input
 
 TIME_SHIFT = "time-shift"
@@ -40,7 +40,7 @@ def unknown_of(experiment: str, nuisance: str) -> str:
     return f"{experiment}:{nuisance}"
 
 
-def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[Free, ...]:
+def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[FitParameter, ...]:
     """The unknowns of the experiment alone, in the order it names them.
 
     A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0, a state's start at
@@ -71,16 +71,16 @@ def _states(simulator: Simulator) -> Mapping[str, Any]:
     return simulator.states if isinstance(simulator, WithStates) else {}
 
 
-def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> Free:
+def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> FitParameter:
     name = unknown_of(experiment.name, nuisance)
     if nuisance == TIME_SHIFT:
         return _clock(experiment, name)
     if nuisance in simulator.parameters:
         search = dict(zip(("start", "min", "max"), experiment.search.get(nuisance, ()), strict=False))
-        return Free.of(name, simulator.parameters[nuisance], **search)
+        return FitParameter.of(name, simulator.parameters[nuisance], **search)
     known, states = _inputs(simulator), _states(simulator)
     if nuisance in states:
-        return Free(name, states[nuisance].guess or 0.0, scale=1.0)
+        return FitParameter(name, states[nuisance].guess or 0.0, scale=1.0)
     if nuisance in known or (known and nuisance in experiment.drive):
         return _offset(experiment, nuisance, known, name)
     names = ", ".join(map(repr, [TIME_SHIFT, *known, *(experiment.drive if known else ()), *states]))
@@ -92,22 +92,22 @@ def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> Free:
     )
 
 
-def _clock(experiment: Experiment, name: str) -> Free:
+def _clock(experiment: Experiment, name: str) -> FitParameter:
     steps = np.diff(np.unique(experiment.time))
     if not steps.size:
         raise StudyError(
             "a time shift needs more than one instant", where=f"experiment '{experiment.name}'", got="one row"
         )
     reach = max(0.02 * float(np.ptp(experiment.time)), 2.0 * float(np.median(steps)))
-    return Free(name, 0.0, -reach, reach, scale=reach)
+    return FitParameter(name, 0.0, -reach, reach, scale=reach)
 
 
-def _offset(experiment: Experiment, nuisance: str, known: Mapping[str, Input], name: str) -> Free:
+def _offset(experiment: Experiment, nuisance: str, known: Mapping[str, Input], name: str) -> FitParameter:
     signal = experiment.inputs.get(nuisance)
     level = known[nuisance].value if nuisance in known else 0.0
     size = np.abs(signal.values).max() if signal is not None else abs(experiment.values.get(nuisance, level))
     reach = REACH * (float(size) or 1.0)
-    return Free(name, 0.0, -reach, reach, scale=reach)
+    return FitParameter(name, 0.0, -reach, reach, scale=reach)
 
 
 def observe(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.unknown import Coordinates, Free
+from hvdc_ident.fit.unknown import Coordinates, FitParameter
 
 LONGEST = 10.0
 """A step changes a logarithm by at most this: no parabola holds over four decades, and on a plateau its minimum lies anywhere."""
@@ -31,7 +31,7 @@ class Objective(Protocol):
     """A cost of some unknowns; for a fit the negative log-likelihood up to a constant."""
 
     @property
-    def unknowns(self) -> tuple[Free, ...]:
+    def unknowns(self) -> tuple[FitParameter, ...]:
         """The unknowns with their bounds."""
 
     def evaluate(self, theta: Array) -> Evaluated:
@@ -42,7 +42,7 @@ class Objective(Protocol):
 class LeastSquares:
     """Half a sum of squares. residual: theta to r, (n,), and dr/dtheta, (n, p)."""
 
-    unknowns: tuple[Free, ...]
+    unknowns: tuple[FitParameter, ...]
     residual: Callable[[Array], tuple[Array, Array]]
 
     def evaluate(self, theta: Array) -> Evaluated:
@@ -60,7 +60,7 @@ class LeastSquares:
 class Smooth:
     """Any smooth cost. cost: theta to the cost and its gradient; the curvature comes from differences of gradients."""
 
-    unknowns: tuple[Free, ...]
+    unknowns: tuple[FitParameter, ...]
     cost: Callable[[Array], tuple[float, Array]]
 
     def evaluate(self, theta: Array) -> Evaluated:
@@ -77,7 +77,7 @@ class Smooth:
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
+class DescentResult:
     """Where a descent ended: theta, (p,), what the objective is there, and how many evaluations it took."""
 
     theta: Array
@@ -87,7 +87,7 @@ class Reached:
 
 def descend(
     objective: Objective, theta: Array, fixed: NDArray[np.bool_], *, enough: float, max_evaluations: int = 80
-) -> Reached:
+) -> DescentResult:
     """The minimum over the unknowns that are not fixed, within their bounds, by damped Gauss-Newton steps.
 
     enough: a predicted fall of the cost not worth a step. Raises SimulationError where theta is inadmissible.
@@ -123,7 +123,7 @@ def descend(
         rejected = 0
         theta, here = trial, there
         x = space.scaled(theta)
-    return Reached(theta, here, used)
+    return DescentResult(theta, here, used)
 
 
 def promised(problem: Problem, theta: Array) -> float:

@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 from hvdc_ident.data import Array
 from hvdc_ident.fit.problem import Problem
 
-Outcome = Literal["converged", "max-evaluations", "stopped", "stalled", "flat", "failed"]
+OptimiserStatus = Literal["converged", "max-evaluations", "stopped", "stalled", "flat", "failed"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class OptimiserResult:
 
     theta: Array
     cost: float | None
-    status: Outcome
+    status: OptimiserStatus
     message: str
     evaluations: int
 

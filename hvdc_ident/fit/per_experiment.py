@@ -17,7 +17,7 @@ from hvdc_ident.fit.estimate import fit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import FitResult
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 
 
 def fit_each(
@@ -68,7 +68,7 @@ def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | s
     return fit(problem, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten, assess=False)
 
 
-def _row(free: Free, results: Mapping[str, FitResult]) -> dict[str, Any]:
+def _row(free: FitParameter, results: Mapping[str, FitResult]) -> dict[str, Any]:
     """One parameter's estimates by run, and their spread."""
     rows: dict[str, dict[str, Any]] = {}
     for run, result in results.items():

@@ -13,16 +13,16 @@ from scipy.linalg import block_diag
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
+from hvdc_ident.fit.initial_states import centred, recentred, unknown_initial_states
 from hvdc_ident.fit.loss import LOSSES, Loss
 from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
 from hvdc_ident.fit.nuisance import unknown_of, unknowns
 from hvdc_ident.fit.prior import Prior, prior_rows
-from hvdc_ident.fit.residual import Block, Record, Treatment, records, residual_blocks
-from hvdc_ident.fit.rounding import Rounding
+from hvdc_ident.fit.residual import ComparedRecord, ResidualBlock, Treatment, records, residual_blocks
+from hvdc_ident.fit.rounding import QuantisedNoise
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band
-from hvdc_ident.fit.unknown import Coordinates, Free
-from hvdc_ident.fit.unsettled import centred, loose_states, recentred
+from hvdc_ident.fit.unknown import Coordinates, FitParameter
 from hvdc_ident.fit.whitening import AR
 from hvdc_ident.immutable import FrozenMap
 
@@ -36,19 +36,19 @@ class Problem:
     the simulator's own value. why: the reason for each held one. conditional_on: for a free parameter the held ones
     without which it could not be told.
     rho: the noise model to whiten with by output: an AR(1) coefficient or a tuple of AR coefficients.
-    rounding: by output whose record is rounded to steps that its noise does not hide; its residuals then know of it.
+    quantised_noise: by output whose record is rounded to steps that its noise does not hide; its residuals then know of it.
     weights: standard deviation by output that replaces the experiments' own noise, in the output's unit.
     guard: rows this close to a break of an input are not compared, s. band: Hz; given, the residual is the misfit's
     spectrum there. loss: what a residual costs. priors: by unknown ("EXPERIMENT:NUISANCE" for a nuisance).
-    unsettled: whether the records, held-out ones too, begin elsewhere than at rest; what unknown starts of the states
-    can make good is then taken out of residuals and jacobians (`fit.unsettled`).
+    free_initial_states: whether the records, held-out ones too, begin elsewhere than at rest; what unknown starts of the states
+    can make good is then taken out of residuals and jacobians (`fit.initial_states`).
     Theta, wherever it appears, holds the unknowns in the order of `unknowns`, each in its own unit.
     Raises StudyError or UnknownNameError where the parts do not fit.
     """
 
     simulator: Simulator
     experiments: tuple[Experiment, ...]
-    free: tuple[Free, ...]
+    free: tuple[FitParameter, ...]
     held: FrozenMap[float] = field(default_factory=FrozenMap)
     why: FrozenMap[str] = field(default_factory=FrozenMap)
     conditional_on: FrozenMap[tuple[str, ...]] = field(default_factory=FrozenMap)
@@ -58,13 +58,13 @@ class Problem:
     band: Band | None = None
     loss: Loss = LOSSES["linear"]
     priors: FrozenMap[Prior] = field(default_factory=FrozenMap)
-    unsettled: bool = False
-    rounding: FrozenMap[Rounding] = field(default_factory=FrozenMap)
+    free_initial_states: bool = False
+    quantised_noise: FrozenMap[QuantisedNoise] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         for name in ("experiments", "free"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name in ("held", "why", "conditional_on", "rho", "weights", "priors", "rounding"):
+        for name in ("held", "why", "conditional_on", "rho", "weights", "priors", "quantised_noise"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         self._check()
 
@@ -118,7 +118,7 @@ class Problem:
         return tuple(dict.fromkeys(o for e in self.fitted_experiments if e.domain == "time" for o in e.outputs))
 
     @cached_property
-    def unknowns(self) -> tuple[Free, ...]:
+    def unknowns(self) -> tuple[FitParameter, ...]:
         """The free parameters, then the nuisances of each experiment."""
         return (*self.free, *(u for e in self.fitted_experiments for u in unknowns(self.simulator, e)))
 
@@ -174,9 +174,9 @@ class Problem:
     def treatment(self) -> Treatment:
         """What is done to misfits before they are residuals."""
         models = {o: (m,) if isinstance(m, float | int) else tuple(m) for o, m in self.rho.items()}
-        return Treatment(FrozenMap(models), self.guard, self.band, self.rounding)
+        return Treatment(FrozenMap(models), self.guard, self.band, self.quantised_noise)
 
-    def blocks(self, theta: Array, *, derivatives: bool = True, in_time: bool = False) -> tuple[Block, ...]:
+    def blocks(self, theta: Array, *, derivatives: bool = True, in_time: bool = False) -> tuple[ResidualBlock, ...]:
         """The residuals of each output in each experiment; jacobians have a column for every unknown.
 
         Neither the loss nor the priors are in them. Without derivatives the columns are 0. in_time: samples in time
@@ -184,7 +184,7 @@ class Problem:
         """
         treatment = replace(self.treatment, band=None) if in_time else self.treatment
         width = len(self.names)
-        parts: list[Block] = []
+        parts: list[ResidualBlock] = []
         for e in self.fitted_experiments:
             columns = self._columns[e.name]
             found = self._experiment(e, theta, derivatives, treatment)
@@ -201,49 +201,53 @@ class Problem:
         return {name: [self.names.index(n) for n in own] for name, own in local.items()}
 
     @cached_property
-    def _records(self) -> dict[str, tuple[Record, ...]]:
+    def _records(self) -> dict[str, tuple[ComparedRecord, ...]]:
         """By fitted experiment what of its records is compared with every run."""
         return {e.name: records(e, self.guard) for e in self.fitted_experiments}
 
-    def starts(self, theta: Array) -> Array:
+    def initial_state_jacobian(self, theta: Array) -> Array:
         """(N, k): how the residuals answer the states' starts that are not known, one column a state and experiment."""
         return np.asarray(block_diag(*(self._begun(e, theta)[1] for e in self.fitted_experiments)))
 
     def _begun(self, e: Experiment, theta: Array, treatment: Treatment | None = None) -> tuple[Experiment, Array]:
         """The experiment with the starts that suit its records best, and how its residuals answer them, (n, k)."""
         own, nuisance = self.values(theta), self.nuisances(e, theta)
-        loose = loose_states(self.simulator, e)
+        unknown_starts = unknown_initial_states(self.simulator, e)
 
-        def blocks(at: Experiment) -> tuple[Block, ...]:
+        def blocks(at: Experiment) -> tuple[ResidualBlock, ...]:
             return residual_blocks(
-                self.simulator, at, own, loose, self.sigma[e.name], nuisance=nuisance,
+                self.simulator, at, own, unknown_starts, self.sigma[e.name], nuisance=nuisance,
                 treatment=treatment or self.treatment, compared=self._compared(e, treatment or self.treatment),
             )  # fmt: skip
 
-        at = centred(self.simulator, e, own, loose, nuisance) if loose else e
+        at = centred(self.simulator, e, own, unknown_starts, nuisance) if unknown_starts else e
         seen = blocks(at)
-        if loose:
-            at = recentred(at, seen, loose)
-        return at, np.vstack([b.jacobian[:, : len(loose)] for b in seen])
+        if unknown_starts:
+            at = recentred(at, seen, unknown_starts)
+        return at, np.vstack([b.jacobian[:, : len(unknown_starts)] for b in seen])
 
-    def _experiment(self, e: Experiment, theta: Array, derivatives: bool, treatment: Treatment) -> tuple[Block, ...]:
-        loose = loose_states(self.simulator, e) if self.unsettled and e.domain == "time" else ()
+    def _experiment(
+        self, e: Experiment, theta: Array, derivatives: bool, treatment: Treatment
+    ) -> tuple[ResidualBlock, ...]:
+        unknown_starts = (
+            unknown_initial_states(self.simulator, e) if self.free_initial_states and e.domain == "time" else ()
+        )
         if e.domain == "frequency":  # is compared as it is: whitening, guards and bands are of samples in time
             treatment = Treatment()
         return residual_blocks(
             self.simulator,
-            self._begun(e, theta, treatment)[0] if loose else e,
+            self._begun(e, theta, treatment)[0] if unknown_starts else e,
             self.values(theta),
             tuple(f.name for f in self.free),
             self.sigma[e.name],
             nuisance=self.nuisances(e, theta),
             treatment=treatment,
             derivatives=derivatives,
-            loose=loose,
+            unknown_starts=unknown_starts,
             compared=self._compared(e, treatment),
         )
 
-    def _compared(self, e: Experiment, treatment: Treatment) -> tuple[Record, ...] | None:
+    def _compared(self, e: Experiment, treatment: Treatment) -> tuple[ComparedRecord, ...] | None:
         """The records of an experiment, where it is one of the fit and compared as there."""
         return self._records.get(e.name) if treatment.guard == self.guard else None
 
@@ -275,7 +279,7 @@ class Problem:
         data = self.cost_of(self.blocks(theta, derivatives=False))
         return data + 0.5 * float(np.sum(self.prior(theta)[0] ** 2))
 
-    def cost_of(self, blocks: Sequence[Block]) -> float:
+    def cost_of(self, blocks: Sequence[ResidualBlock]) -> float:
         """The sum of the losses of some blocks."""
         return sum(float(np.sum(self.loss.rho(b.residual))) for b in blocks)
 
@@ -307,6 +311,6 @@ class Problem:
         )
 
 
-def stacked(blocks: Sequence[Block]) -> tuple[Array, Array]:
+def stacked(blocks: Sequence[ResidualBlock]) -> tuple[Array, Array]:
     """Residual, (N,), and jacobian, (N, p), of several blocks in one."""
     return np.concatenate([b.residual for b in blocks]), np.vstack([b.jacobian for b in blocks])

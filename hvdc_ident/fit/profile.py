@@ -15,21 +15,21 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
-from hvdc_ident.fit.objective import Objective, Reached, descend
+from hvdc_ident.fit.objective import DescentResult, Objective, descend
 from hvdc_ident.fit.profile_walk import (
     ONE_SIDED,
     TWO_SIDED,
     BetterFoundError,
-    Descent,
+    DescentStep,
     Physical,
+    ProfileOptions,
+    ProfilePath,
     Side,
     SideStatus,
     Steps,
-    Walk,
-    Walker,
 )
 from hvdc_ident.fit.rough import Trend
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 from hvdc_ident.immutable import FrozenMap
 
 __all__ = [
@@ -37,10 +37,10 @@ __all__ = [
     "TWO_SIDED",
     "Physical",
     "Profile",
+    "ProfileOptions",
     "Profiles",
     "Side",
     "SideStatus",
-    "Walk",
     "profiles",
     "trend_profiles",
 ]
@@ -100,7 +100,7 @@ def profiles(
     *,
     threshold: float | Mapping[str, float] = TWO_SIDED,
     physical: Physical | None = None,
-    walk: Walk | None = None,
+    options: ProfileOptions | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Profiles:
@@ -111,21 +111,21 @@ def profiles(
     says so. executor: a step is a piece of work, and which one comes next does not depend on where the last was done.
     Raises SimulationError where the objective cannot be evaluated at theta.
     """
-    walk = walk or Walk()
+    options = options or ProfileOptions()
     wanted = list(names) if names is not None else [u.name for u in objective.unknowns]
     rises = {n: threshold[n] if isinstance(threshold, Mapping) else threshold for n in wanted}
-    start = Descent(
+    start = DescentStep(
         np.asarray(theta, dtype=float),
         np.zeros(len(objective.unknowns), dtype=bool),
-        0.1 * walk.tolerance * min(rises.values(), default=TWO_SIDED),
+        0.1 * options.tolerance * min(rises.values(), default=TWO_SIDED),
     )
     take = _Taken(objective, executor)
     restarts: list[str] = []
     while True:
         best = _certain(next(take([start])))
         walkers = {
-            (name, direction): Walker(
-                objective.unknowns, best, rises[name], physical or {}, walk, name, direction, last=len(restarts) == 3
+            (name, direction): ProfilePath(
+                objective.unknowns, best, rises[name], physical or {}, options, name, direction, last=len(restarts) == 3
             )
             for name in wanted
             for direction in (-1.0, 1.0)
@@ -142,7 +142,7 @@ def profiles(
 
 def trend_profiles(
     optimum: Trend,
-    unknowns: Sequence[Free],
+    unknowns: Sequence[FitParameter],
     names: Sequence[str],
     covariance: Array,
     gradient: Array,
@@ -172,7 +172,7 @@ def trend_profiles(
     return FrozenMap(found)
 
 
-def _trend_side(u: Free, at: float, off: float, physical: tuple[bool, bool]) -> Side:
+def _trend_side(u: FitParameter, at: float, off: float, physical: tuple[bool, bool]) -> Side:
     """One end of the profile of a trend: off from the optimum, or the bound before it."""
     end = u.max if off > 0 else u.min
     if at == end:
@@ -197,7 +197,7 @@ class _Descend:
 
     objective: Objective
 
-    def __call__(self, step: Descent) -> Reached | Failed:
+    def __call__(self, step: DescentStep) -> DescentResult | Failed:
         try:
             return descend(self.objective, step.theta, step.fixed, enough=step.enough)
         except SimulationError as error:
@@ -211,11 +211,11 @@ class _Taken:
     objective: Objective
     executor: Executor | None
 
-    def __call__(self, steps: list[Descent]) -> Iterator[Reached | Failed]:
+    def __call__(self, steps: list[DescentStep]) -> Iterator[DescentResult | Failed]:
         return mapped(self.executor, _Descend(self.objective), steps)
 
 
-def _certain(end: Reached | Failed) -> Reached:
+def _certain(end: DescentResult | Failed) -> DescentResult:
     if isinstance(end, Failed):
         raise SimulationError(end.what)
     return end
@@ -229,13 +229,13 @@ class _BetterAtError(Exception):
         self.name, self.theta, self.fall = name, found.theta, found.fall
 
 
-def _walked(walkers: Mapping[Asked, Walker], take: _Taken, progress: Progress | None) -> dict[Asked, Side]:
+def _walked(walkers: Mapping[Asked, ProfilePath], take: _Taken, progress: Progress | None) -> dict[Asked, Side]:
     """How each side ended. Raises _BetterAtError for the first side, in their order, that fell below the optimum."""
     walks = {asked: walker.steps() for asked, walker in walkers.items()}
     sides: dict[Asked, Side] = {}
-    waiting: dict[Asked, Descent] = {}
+    waiting: dict[Asked, DescentStep] = {}
 
-    def go_on(asked: Asked, end: Reached | Failed | None) -> None:
+    def go_on(asked: Asked, end: DescentResult | Failed | None) -> None:
         """The walk goes on to its next question, or to its end."""
         try:
             waiting[asked] = _next(walks[asked], end)
@@ -258,7 +258,7 @@ def _walked(walkers: Mapping[Asked, Walker], take: _Taken, progress: Progress | 
     return sides
 
 
-def _next(walk: Steps[Side], end: Reached | Failed | None) -> Descent:
+def _next(walk: Steps[Side], end: DescentResult | Failed | None) -> DescentStep:
     """What a walk asks for when it is told how the last step ended (None: it has not begun)."""
     if end is None:
         return next(walk)
@@ -267,7 +267,7 @@ def _next(walk: Steps[Side], end: Reached | Failed | None) -> Descent:
     return walk.send(end)
 
 
-def _profile(sides: Sequence[tuple[Walker, Side]]) -> Profile:
+def _profile(sides: Sequence[tuple[ProfilePath, Side]]) -> Profile:
     """The profile put together from its two sides and the optimum between them."""
     (walker, below), (_, above) = sides
     best = walker.best

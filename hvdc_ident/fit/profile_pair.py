@@ -8,7 +8,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.objective import Objective, Reached, descend
+from hvdc_ident.fit.objective import DescentResult, Objective, descend
 
 JOINT = 2.996
 """Rise of the cost on the border of a joint 95 % region of two parameters: half the chi-square quantile, 2 degrees."""
@@ -36,7 +36,7 @@ def profile_pair(
     fixed = np.isin(np.arange(len(known)), rows)
     best = descend(objective, theta, np.zeros(len(known), dtype=bool), enough=enough)
     rises = np.full((first.size, second.size), np.nan)
-    done: dict[tuple[int, int], Reached] = {}
+    done: dict[tuple[int, int], DescentResult] = {}
     centre = (int(np.abs(first - best.theta[rows[0]]).argmin()), int(np.abs(second - best.theta[rows[1]]).argmin()))
     order = sorted(np.ndindex(rises.shape), key=lambda k: (max(abs(k[0] - centre[0]), abs(k[1] - centre[1])), k))
     for k in order:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.objective import LONGEST, Reached
-from hvdc_ident.fit.unknown import Coordinates, Free
+from hvdc_ident.fit.objective import LONGEST, DescentResult
+from hvdc_ident.fit.unknown import Coordinates, FitParameter
 
 TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
@@ -54,7 +54,7 @@ class Side:
 
 
 @dataclass(frozen=True)
-class Walk:
+class ProfileOptions:
     """How profiles are walked.
 
     tolerance: of the rise at a crossing, as a share of the threshold. points: at most so many a side. steps: of the
@@ -69,7 +69,7 @@ class Walk:
 
 
 @dataclass(frozen=True, eq=False)
-class Descent:
+class DescentStep:
     """A step to take: down from theta, (p,), with some unknowns fixed, (p,), to where less than `enough` is to be had."""
 
     theta: Array
@@ -78,7 +78,7 @@ class Descent:
 
 
 T = TypeVar("T")
-Steps = Generator[Descent, Reached, T]
+Steps = Generator[DescentStep, DescentResult, T]
 """Asks for descents, is sent where each ended, and comes to a T."""
 
 
@@ -91,19 +91,19 @@ class BetterFoundError(Exception):
 
 
 @dataclass
-class Walker:
+class ProfilePath:
     """The walk of one side of one unknown's profile from one optimum. direction: -1.0 or 1.0."""
 
-    unknowns: tuple[Free, ...]
-    best: Reached
+    unknowns: tuple[FitParameter, ...]
+    best: DescentResult
     threshold: float
     physical: Physical
-    walk: Walk
+    options: ProfileOptions
     name: str
     direction: float
     last: bool = False
     evaluations: int = field(default=0, init=False)
-    points: list[tuple[float, Reached]] = field(default_factory=list, init=False)
+    points: list[tuple[float, DescentResult]] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         self.space = Coordinates(self.unknowns)
@@ -112,7 +112,7 @@ class Walker:
         self.fixed = np.arange(len(self.unknowns)) == self.i
         self.x0 = self.space.scaled(self.best.theta)
         self.on_bound = bool(self.x0[self.i] <= self.low[self.i] or self.x0[self.i] >= self.high[self.i])
-        self.reach = math.log(self.walk.reach) if self.unknowns[self.i].log else self.walk.reach
+        self.reach = math.log(self.options.reach) if self.unknowns[self.i].log else self.options.reach
         self.rise = self.threshold * (ONE_SIDED / TWO_SIDED if self.on_bound else 1.0)
         if not self.unknowns[self.i].log and math.isfinite(self._parabola):
             self.reach = max(self.reach, BEYOND * self._parabola)
@@ -129,7 +129,7 @@ class Walker:
             return Side("open-at-bound", None, "the optimum lies on this bound")
         step, failures = self._first_step(), 0
         goal = np.sqrt(2.0 * self.rise)
-        while len(points) < self.walk.points and abs(x - self.x0[self.i]) < self.reach:
+        while len(points) < self.options.points and abs(x - self.x0[self.i]) < self.reach:
             ahead = x + direction * min(step, self._largest())
             ahead = float(np.clip(ahead, self.low[self.i], self.high[self.i]))
             try:
@@ -174,9 +174,9 @@ class Walker:
 
     def _largest(self) -> float:
         width = self.high[self.i] - self.low[self.i]
-        return float(width / self.walk.steps) if np.isfinite(width) else self.reach
+        return float(width / self.options.steps) if np.isfinite(width) else self.reach
 
-    def _point(self, near: Reached, value: float) -> Steps[Reached]:
+    def _point(self, near: DescentResult, value: float) -> Steps[DescentResult]:
         """The minimum over the others with this one at `value` (scaled), begun on the tangent from a point nearby."""
         x = self.space.scaled(near.theta)
         slope = self.space.slope(near.theta)
@@ -189,35 +189,37 @@ class Walker:
             longest = np.where(self.space.log[others], LONGEST, np.inf)
             moved = np.clip(-bend * (value - x[self.i]), -longest, longest)
             ahead[others] = np.clip(x[others] + moved, self.low[others], self.high[others])
-        enough = 0.1 * self.walk.tolerance * self.rise
+        enough = 0.1 * self.options.tolerance * self.rise
         try:
-            found = yield Descent(self.space.unscaled(ahead), self.fixed, enough)
+            found = yield DescentStep(self.space.unscaled(ahead), self.fixed, enough)
         except SimulationError:
             x[self.i] = value
-            found = yield Descent(self.space.unscaled(x), self.fixed, enough)
+            found = yield DescentStep(self.space.unscaled(x), self.fixed, enough)
         self.evaluations += found.evaluations
         fall = self.best.at.cost - found.at.cost
-        if fall > max(0.02, self.walk.tolerance) * self.rise and not self.last:
+        if fall > max(0.02, self.options.tolerance) * self.rise and not self.last:
             raise BetterFoundError(found.theta, fall)
         return found
 
-    def _look_for_another(self, point: Reached) -> Steps[None]:
+    def _look_for_another(self, point: DescentResult) -> Steps[None]:
         """Where the profile falls away from the optimum there is another basin: its own optimum may be the better."""
         if self.last:
             return
-        end = yield Descent(point.theta, np.zeros_like(self.fixed), 0.1 * self.walk.tolerance * self.rise)
+        end = yield DescentStep(point.theta, np.zeros_like(self.fixed), 0.1 * self.options.tolerance * self.rise)
         self.evaluations += end.evaluations
         fall = self.best.at.cost - end.at.cost
-        if fall > max(0.02, self.walk.tolerance) * self.rise:
+        if fall > max(0.02, self.options.tolerance) * self.rise:
             raise BetterFoundError(end.theta, fall)
 
-    def _refine(self, x: float, at: Reached, ahead: float, there: Reached) -> Steps[tuple[float, Reached]]:
+    def _refine(
+        self, x: float, at: DescentResult, ahead: float, there: DescentResult
+    ) -> Steps[tuple[float, DescentResult]]:
         """The crossing between a point below the threshold and one above, by false position (Illinois)."""
         goal = np.sqrt(2.0 * self.rise)
         kept = [self._root(at) - goal, self._root(there) - goal]
         for _ in range(60):
             lowest = min((x, at), (ahead, there), key=lambda p: abs(self._rise_off(p[1])))
-            if abs(self._rise_off(lowest[1])) <= self.walk.tolerance * self.rise or abs(ahead - x) <= 1e-14 * (
+            if abs(self._rise_off(lowest[1])) <= self.options.tolerance * self.rise or abs(ahead - x) <= 1e-14 * (
                 1 + abs(x)
             ):
                 return lowest
@@ -234,13 +236,13 @@ class Walker:
                 ahead, there, kept = middle, found, [0.5 * kept[0], value]
         return ahead, there
 
-    def _root(self, point: Reached) -> float:
+    def _root(self, point: DescentResult) -> float:
         return float(np.sqrt(2.0 * max(point.at.cost - self.best.at.cost, 0.0)))
 
-    def _rise_off(self, point: Reached) -> float:
+    def _rise_off(self, point: DescentResult) -> float:
         return point.at.cost - self.best.at.cost - self.rise
 
-    def _crossed(self, point: Reached) -> Side:
+    def _crossed(self, point: DescentResult) -> Side:
         """Closed; or not found, where the crossing leans on another unknown's search bound."""
         leaning = []
         x = self.space.scaled(point.theta)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, StudyError
+from hvdc_ident.fit.initial_states import freed
 from hvdc_ident.fit.nuisance import observe
-from hvdc_ident.fit.rounding import Rounding
+from hvdc_ident.fit.rounding import QuantisedNoise
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.fit.spectrum import Band, transformed
-from hvdc_ident.fit.unsettled import freed
 from hvdc_ident.fit.whitening import AR, GAP, segments, whitened
 from hvdc_ident.immutable import FrozenMap
 
@@ -25,7 +25,7 @@ factorisation of them would end."""
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ResidualBlock:
     """The residuals of one output in one experiment, over its m compared rows; a spectrum has n values instead of m.
 
     misfit: (m,) measured - simulated, in the output's unit. sigma: standard deviation, in the same unit.
@@ -67,12 +67,12 @@ class Block:
         """Root mean square of the misfit, in the output's unit."""
         return float(np.sqrt(np.mean(self.misfit**2)))
 
-    def among(self, columns: Sequence[int], width: int) -> Block:
+    def among(self, columns: Sequence[int], width: int) -> ResidualBlock:
         """The block with a jacobian of `width` columns, its own at these places, if any, and 0 elsewhere."""
         jacobian = np.zeros((self.residual.size, width))
         if columns:
             jacobian[:, columns] = self.jacobian
-        return Block(
+        return ResidualBlock(
             self.experiment, self.output, self.rows, self.misfit, self.sigma, self.residual, jacobian, self.taken,
             self.slope, self.spare, self.profile,
         )  # fmt: skip
@@ -132,10 +132,10 @@ def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> ND
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class ComparedRecord:
     """What of an output's record is compared with every run: (m,) rows, and values in its unit at instants in s.
 
-    whole: whether it is every row. profile: (m,) as in `Block`.
+    whole: whether it is every row. profile: (m,) as in `ResidualBlock`.
     """
 
     output: str
@@ -146,17 +146,17 @@ class Record:
     profile: Array | None = None
 
 
-def records(experiment: Experiment, guard: float = 0.0) -> tuple[Record, ...]:
+def records(experiment: Experiment, guard: float = 0.0) -> tuple[ComparedRecord, ...]:
     """One record for each measured output. guard: as in `compared_rows`. Raises StudyError where nothing can be compared."""
     return tuple(_record(experiment, o, guard) for o in experiment.outputs)
 
 
-def _record(experiment: Experiment, output: str, guard: float) -> Record:
+def _record(experiment: Experiment, output: str, guard: float) -> ComparedRecord:
     rows = compared_rows(experiment, output, guard)
     assert experiment.measured is not None
     values, time = experiment.measured[output][rows], experiment.time[rows]
     profile = experiment.noise_profile.get(output)
-    return Record(
+    return ComparedRecord(
         output, rows, values, time, rows.size == experiment.time.size, None if profile is None else profile[rows]
     )
 
@@ -166,14 +166,14 @@ class Treatment:
     """What is done to misfits before they are residuals.
 
     whitening: the noise model by output. guard: rows this close to a break of an input are left out, s. band: Hz; given,
-    residuals are the misfit's spectrum within it; None, they are samples in time. rounding: by output whose record is
+    residuals are the misfit's spectrum within it; None, they are samples in time. quantised_noise: by output whose record is
     rounded; its residuals are samples in time and not whitened.
     """
 
     whitening: FrozenMap[AR] = field(default_factory=FrozenMap)
     guard: float = 0.0
     band: Band | None = None
-    rounding: FrozenMap[Rounding] = field(default_factory=FrozenMap)
+    quantised_noise: FrozenMap[QuantisedNoise] = field(default_factory=FrozenMap)
 
     def applied(self, signal: Array, time: Array, output: str, where: str) -> Array:
         """The signal over the compared instants, (m,) or (m, p), as a residual: (n,) or (n, p)."""
@@ -182,9 +182,9 @@ class Treatment:
             signal = whitened(signal, model, segments(time, where))
         return signal if self.band is None else transformed(signal, time, self.band, where)
 
-    def rounded(self, output: str) -> Rounding | None:
-        """How an output is rounded, where its residuals are to know of it: not in a spectrum, nor where they are whitened."""
-        known = self.rounding.get(output)
+    def quantised(self, output: str) -> QuantisedNoise | None:
+        """The quantised noise of an output, where its residuals are to know of it: not in a spectrum, nor where they are whitened."""
+        known = self.quantised_noise.get(output)
         return None if self.band is not None or any(self.whitening.get(output, ())) else known
 
 
@@ -198,13 +198,13 @@ def residual_blocks(
     nuisance: Mapping[str, float] | None = None,
     treatment: Treatment | None = None,
     derivatives: bool = True,
-    loose: Sequence[str] = (),
-    compared: Sequence[Record] | None = None,
-) -> tuple[Block, ...]:
+    unknown_starts: Sequence[str] = (),
+    compared: Sequence[ComparedRecord] | None = None,
+) -> tuple[ResidualBlock, ...]:
     """One block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
 
     sigma: standard deviation by output, in its unit. derivatives: whether jacobians are wanted; else they have no column.
-    loose: states, given starts by the experiment, that are taken for unknown and eliminated (`fit.unsettled`).
+    unknown_starts: states, given starts by the experiment, that are taken for unknown and eliminated (`fit.initial_states`).
     compared: the experiment's records with the treatment's guard, where they are at hand.
     Raises SimulationError where the run fails, StudyError where nothing can be compared.
     """
@@ -212,17 +212,24 @@ def residual_blocks(
     wanted = sensitivities if derivatives else ()
     k = len(wanted)
     given = dict(nuisance or {})
-    seen = observe(simulator, experiment, values, (*wanted, *loose), given, derivatives=derivatives or bool(loose))
+    seen = observe(
+        simulator,
+        experiment,
+        values,
+        (*wanted, *unknown_starts),
+        given,
+        derivatives=derivatives or bool(unknown_starts),
+    )
     blocks, raw = [], []
     for record in compared if compared is not None else records(experiment, treatment.guard):
         output, weight = record.output, sigma[record.output]
         y, dy = seen.values[output], seen.gradient[output]
         misfit = record.values - (y if record.whole else y[record.rows])
         slopes = -(dy if record.whole else dy[record.rows])
-        rounding = treatment.rounded(output) if record.profile is None else None
-        if rounding is not None:
-            residual, slope = rounding.residual(misfit)
-            jacobian, spare = slopes * slope[:, None], rounding.spare
+        quantised = treatment.quantised(output) if record.profile is None else None
+        if quantised is not None:
+            residual, slope = quantised.residual(misfit)
+            jacobian, spare = slopes * slope[:, None], quantised.spare
         else:
             both = np.empty((misfit.size, 1 + slopes.shape[1]))
             both[:, 0] = per_deviation(misfit, weight, record.profile)
@@ -235,10 +242,10 @@ def residual_blocks(
                 )
             treated = treatment.applied(both, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
-        block = Block(
+        block = ResidualBlock(
             experiment.name, output, record.rows, misfit, weight, residual, jacobian, slope=slope, spare=spare,
             profile=record.profile,
         )  # fmt: skip
         blocks.append(block)
-        raw.append(slopes[:, k : k + len(loose)])
-    return freed(blocks, raw, slice(k, k + len(loose))) if loose else tuple(blocks)
+        raw.append(slopes[:, k : k + len(unknown_starts)])
+    return freed(blocks, raw, slice(k, k + len(unknown_starts))) if unknown_starts else tuple(blocks)

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.special import chdtrc
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 
 
-def residual_tests(blocks: Sequence[Block], experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:
+def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:
     """The tests by output and experiment; p is the chance of such a value from white noise, None where not defined.
 
     Each: n, mean and std (in sigma), ljung_box {statistic, lags, p}, runs {runs, expected, p},
@@ -26,7 +26,7 @@ def residual_tests(blocks: Sequence[Block], experiments: Sequence[Experiment]) -
     return table
 
 
-def _tests(block: Block, experiment: Experiment) -> dict[str, Any]:
+def _tests(block: ResidualBlock, experiment: Experiment) -> dict[str, Any]:
     r = block.residual
     inputs = {}
     for name, signal in experiment.inputs.items():

@@ -22,8 +22,8 @@ POINTS = 4001
 
 
 @dataclass(frozen=True)
-class Rounding:
-    """Rounding to multiples of `step`, of values with white noise of standard deviation `noise`; both in the output's unit."""
+class QuantisedNoise:
+    """QuantisedNoise to multiples of `step`, of values with white noise of standard deviation `noise`; both in the output's unit."""
 
     step: float
     noise: float

@@ -13,7 +13,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError
-from hvdc_ident.fit.optimiser import OptimiserResult, Outcome
+from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserStatus
 from hvdc_ident.fit.problem import Problem
 
 
@@ -22,7 +22,7 @@ class BudgetSpentError(Exception):
 
 
 @dataclass
-class Search:
+class OptimiserRun:
     """One run of a library's method. limit: evaluations it may take, of the whole set of experiments."""
 
     problem: Problem
@@ -138,7 +138,7 @@ class Search:
             return OptimiserResult(
                 self.start, None, "failed", f"no point could be simulated: {self.failure}", self.evaluations
             )
-        status: Outcome = "converged" if converged else "stopped"
+        status: OptimiserStatus = "converged" if converged else "stopped"
         more = f"; {self.failures} of {self.evaluations} points could not be simulated" if self.failures else ""
         return OptimiserResult(self.best, self.cost, status, message + more, self.evaluations)
 

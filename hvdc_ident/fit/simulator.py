@@ -10,7 +10,7 @@ from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.sensitivity import SENSITIVITY_ERROR
 
 
-class Simulation(Protocol):
+class SimulationRun(Protocol):
     """One run: the outputs and, where asked for, their derivatives by parameters."""
 
     @property
@@ -34,7 +34,7 @@ class Simulator(Protocol):
 
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
-    ) -> Simulation:
+    ) -> SimulationRun:
         """A run of the experiment; parameters not in `values` keep their own.
 
         Raises SimulationError where it fails, SteadyStateError where it cannot begin.

@@ -10,14 +10,14 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 
 DISTINCT = 1.92
 """Half the 95 % quantile of chi-square with one degree of freedom: costs that differ by less are as good."""
 
 
 @dataclass(frozen=True, eq=False)
-class Optimum:
+class LocalMinimum:
     """An optimum: (p,) theta and its cost."""
 
     theta: Array
@@ -28,7 +28,7 @@ TIE = 1e-6
 """Costs that differ by this share differ by what no number of rows makes a likelihood notice (half of it a row)."""
 
 
-def best_first(ends: Sequence[Optimum]) -> list[Optimum]:
+def best_first(ends: Sequence[LocalMinimum]) -> list[LocalMinimum]:
     """The ends by their cost; the first one stays first where no other is lower by more than rounding.
 
     So of optima that are one but for the names of their unknowns, as two time constants that may change places, the one
@@ -40,7 +40,7 @@ def best_first(ends: Sequence[Optimum]) -> list[Optimum]:
     return ordered
 
 
-def latin_hypercube(spread: Sequence[Free], rest: Sequence[Free], count: int, seed: int) -> list[Array]:
+def latin_hypercube(spread: Sequence[FitParameter], rest: Sequence[FitParameter], count: int, seed: int) -> list[Array]:
     """`count` starts, (p,) each: `spread` over the bounds (even in the logarithm where scaled so), `rest` at their own.
 
     Nuisances are the rest: they are small by nature, and far off they only lead a run astray.
@@ -54,20 +54,20 @@ def latin_hypercube(spread: Sequence[Free], rest: Sequence[Free], count: int, se
     return [np.array([*(u.draw(float(s)) for u, s in zip(spread, row, strict=True)), *own]) for row in shares]
 
 
-def distinct(problem: Problem, ends: Sequence[Optimum], worth: float = 1.0) -> list[Optimum]:
+def distinct(problem: Problem, ends: Sequence[LocalMinimum], worth: float = 1.0) -> list[LocalMinimum]:
     """The ends that are optima of their own, best first; of the others the best of each basin.
 
     Two are one where no coordinate differs by a thousandth of its range, or where the cost between them on the straight
     line (in scaled coordinates) never rises by DISTINCT above the worse one. worth: independent samples per sample.
     """
-    kept: list[Optimum] = []
+    kept: list[LocalMinimum] = []
     for end in sorted(ends, key=lambda o: o.cost):
         if not any(_same(problem, end, other, worth) for other in kept):
             kept.append(end)
     return kept
 
 
-def _same(problem: Problem, a: Optimum, b: Optimum, worth: float) -> bool:
+def _same(problem: Problem, a: LocalMinimum, b: LocalMinimum, worth: float) -> bool:
     space = problem.coordinates
     x, y = space.scaled(a.theta), space.scaled(b.theta)
     if (np.abs(x - y) <= 1e-3 * space.ranges).all():

@@ -20,7 +20,7 @@ DEFAULT = "set-point-step-simulation"
 
 
 @dataclass(frozen=True)
-class Profile:
+class ToleranceProfile:
     """A tolerance profile.
 
     windows: lengths in s by name (`LENGTHS`), settling as a share. limits: by window and kind of error, in `unit`.
@@ -43,7 +43,7 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")))
 
 
-def tolerance(name: str = DEFAULT, folder: Path | None = None) -> Profile:
+def tolerance(name: str = DEFAULT, folder: Path | None = None) -> ToleranceProfile:
     """The profile of a name, or of a TOML file at a path from `folder`.
 
     Raises UnknownNameError for a name that is not shipped, StudyError for a file that is missing or wrong.
@@ -64,7 +64,7 @@ def tolerance(name: str = DEFAULT, folder: Path | None = None) -> Profile:
         ) from None
 
 
-def _profile(content: bytes, where: str) -> Profile:
+def _profile(content: bytes, where: str) -> ToleranceProfile:
     try:
         table = tomllib.loads(content.decode("utf-8"))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
@@ -78,7 +78,7 @@ def _profile(content: bytes, where: str) -> Profile:
     for name in WINDOWS:
         _keys(limits[name], ERRORS, f"{where}, limits.{name}")
     words = {k: str(table[k]) for k in ("name", "version", "title", "source", "notes")}
-    return Profile(
+    return ToleranceProfile(
         **words,
         windows=_numbers(windows, f"{where}, windows"),
         limits=FrozenMap({n: _numbers(limits[n], f"{where}, limits.{n}") for n in WINDOWS}),

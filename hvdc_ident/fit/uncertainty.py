@@ -12,7 +12,7 @@ from scipy.linalg import solve_banded
 from hvdc_ident.data import Array
 from hvdc_ident.fit.noise import MISFIT
 from hvdc_ident.fit.problem import stacked
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
 
 
 def uncertainty(
-    blocks: Sequence[Block],
+    blocks: Sequence[ResidualBlock],
     names: Sequence[str],
     spans: Array,
     source: Mapping[str, str],
@@ -178,7 +178,7 @@ def _reduced(rows: Array) -> Array:
     return rows
 
 
-def _samples(blocks: Sequence[Block], p: int) -> tuple[dict[str, float], dict[str, float]]:
+def _samples(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float], dict[str, float]]:
     """AR(1) coefficient and effective number of samples by output."""
     total = sum(b.residual.size for b in blocks)
     rho, effective = {}, {}

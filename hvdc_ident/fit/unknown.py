@@ -19,7 +19,7 @@ LARGEST_LOG = 345.0
 
 
 @dataclass(frozen=True)
-class Free:
+class FitParameter:
     """An unknown of a fit, everything in its own unit.
 
     start: first guess. min, max: bounds of the search (infinite: none). scale: a typical size, 0 means |start|, or 1.
@@ -50,7 +50,7 @@ class Free:
             )
 
     @classmethod
-    def of(cls, name: str, parameter: Parameter, **changes: float) -> Free:
+    def of(cls, name: str, parameter: Parameter, **changes: float) -> FitParameter:
         """The unknown that a model's parameter is, given and begun at its value; with some of the fields changed."""
         value = changes.get("given", parameter.value)
         fields = {"start": value, "given": value}
@@ -119,7 +119,7 @@ def _even_in_log(far: float, size: float, share: float) -> float:
 class Coordinates:
     """The scaled coordinates x of some unknowns: x = ln(theta) or theta/span, of order 1 each."""
 
-    unknowns: tuple[Free, ...]
+    unknowns: tuple[FitParameter, ...]
 
     @cached_property
     def log(self) -> Array:

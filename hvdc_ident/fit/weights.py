@@ -13,7 +13,7 @@ from hvdc_ident.errors import SimulationError, unknown_name
 from hvdc_ident.fit.noise import MISFIT, floor_of, source_of
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.starts import Optimum, best_first, distinct
+from hvdc_ident.fit.starts import LocalMinimum, best_first, distinct
 from hvdc_ident.fit.whitening import autoregression, before_event
 from hvdc_ident.immutable import FrozenMap
 
@@ -35,7 +35,9 @@ def prepared(problem: Problem, whiten: str) -> Problem:
     return replace(problem, rho=FrozenMap(before_event(problem.fitted_experiments, problem.outputs_in_time)))
 
 
-def weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tuple[Problem, Optimum, list[Optimum]]:
+def weighted(
+    problem: Problem, ends: Sequence[LocalMinimum], method: Optimiser
+) -> tuple[Problem, LocalMinimum, list[LocalMinimum]]:
     """The problem with the misfit's weights where noise is not given, its best optimum and the other candidates.
 
     ends: the best first. One output: the optimum does not depend on its weight. Several: fitted again until the weights
@@ -46,26 +48,26 @@ def weighted(problem: Problem, ends: Sequence[Optimum], method: Optimiser) -> tu
         return problem, ends[0], list(ends[1:])
     best = ends[0]
     once = len(problem.outputs) == 1 and problem.loss.linear and not problem.priors
-    rivals: list[Optimum] | None = None
+    rivals: list[LocalMinimum] | None = None
     for _ in range(20):
         weights = misfit_weights(problem, best.theta, open_outputs)
         settled = all(abs(weights[o] / problem.weights.get(o, np.inf) - 1.0) < 0.01 for o in open_outputs)
         problem = problem.with_(weights={**problem.weights, **weights})
         if rivals is None:  # in the first weights, which are far too large, every end is as good as any other
-            at = [Optimum(e.theta, c) for e in ends if (c := cost_of(problem, e.theta)) is not None]
+            at = [LocalMinimum(e.theta, c) for e in ends if (c := cost_of(problem, e.theta)) is not None]
             rivals = [r for r in distinct(problem, at) if not np.array_equal(r.theta, best.theta)][:3]
         if once or settled:
             break
         again = method.run(problem, best.theta)
         if again.status == "failed" or again.cost is None:
             break
-        best = Optimum(again.theta, again.cost)
+        best = LocalMinimum(again.theta, again.cost)
     return _again(problem, best, rivals or [], method)
 
 
 def whitened_by_residuals(
-    problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser
-) -> tuple[Problem, Optimum, list[Optimum]]:
+    problem: Problem, best: LocalMinimum, rivals: Sequence[LocalMinimum], method: Optimiser
+) -> tuple[Problem, LocalMinimum, list[LocalMinimum]]:
     """The problem whitened by the model of its own residuals, fitted again until that model stands (twice at most)."""
     for _ in range(2):
         blocks = replace(problem, rho=FrozenMap()).blocks(best.theta, derivatives=False, in_time=True)
@@ -80,8 +82,8 @@ def whitened_by_residuals(
 
 
 def _again(
-    problem: Problem, best: Optimum, rivals: Sequence[Optimum], method: Optimiser
-) -> tuple[Problem, Optimum, list[Optimum]]:
+    problem: Problem, best: LocalMinimum, rivals: Sequence[LocalMinimum], method: Optimiser
+) -> tuple[Problem, LocalMinimum, list[LocalMinimum]]:
     """The optima found again in the problem's weights, best first; of the rivals those that are optima there.
 
     Raises SimulationError where no simulation succeeds at any of them, though those that led there did.
@@ -91,7 +93,7 @@ def _again(
         runs[0].theta if runs[0].cost is not None else best.theta,
         *(m.theta for m in runs[1:] if m.status in ("converged", "stalled")),
     ]
-    at = [Optimum(t, c) for t in candidates if (c := cost_of(problem, t)) is not None]
+    at = [LocalMinimum(t, c) for t in candidates if (c := cost_of(problem, t)) is not None]
     if not at:
         problem.residual(candidates[0])  # raises what the simulation fails with
         raise SimulationError("a simulation at the optimum failed, and another of the same values did not")

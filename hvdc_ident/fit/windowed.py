@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.fit.assessment import Curve
-from hvdc_ident.fit.tolerance import WINDOWS, Profile
+from hvdc_ident.fit.tolerance import WINDOWS, ToleranceProfile
 
 Span = tuple[float, float]
 
@@ -21,7 +21,7 @@ Span = tuple[float, float]
 def windowed_errors(
     found: Mapping[str, Mapping[str, Curve]],
     experiments: tuple[Experiment, ...],
-    profile: Profile,
+    profile: ToleranceProfile,
     units: Mapping[str, str],
 ) -> dict[str, Any]:
     """The errors by output and experiment, with the profile they are held against.
@@ -39,7 +39,7 @@ def windowed_errors(
     return {"profile": {**head, "notes": profile.notes, "unit": profile.unit}, "errors": table}
 
 
-def _errors(e: Experiment, output: str, curve: Curve, profile: Profile, unit: str) -> dict[str, Any]:
+def _errors(e: Experiment, output: str, curve: Curve, profile: ToleranceProfile, unit: str) -> dict[str, Any]:
     if e.event is None:
         return {"event": None, "reason": "no event: no input moves and none is given"}
     end, source = event_end(e, curve.measured, profile.windows["settling"])
@@ -73,7 +73,7 @@ def _window(
     return {**line, **found, "within": within}
 
 
-def windows(e: Experiment, end: float, profile: Profile) -> dict[str, Span]:
+def windows(e: Experiment, end: float, profile: ToleranceProfile) -> dict[str, Span]:
     """From and to, in s, of each window around an event that is over at `end`; one that is empty ends before it begins."""
     assert e.event is not None
     w = profile.windows

@@ -10,11 +10,11 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.fit import FitResult, Free, Problem, Simulator
+from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.noise import unknown_noise
-from hvdc_ident.fit.profile import Walk
+from hvdc_ident.fit.profile import ProfileOptions
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability import narrow, verdicts
 from hvdc_ident.identifiability.evidence import pair_of, thresholds, told_by_noise
@@ -39,13 +39,13 @@ TELLING = 4.0
 def identifiability(
     subject: Model | Simulator,
     experiments: Iterable[Experiment],
-    candidates: Iterable[Free],
+    candidates: Iterable[FitParameter],
     *,
     starts: int = 8,
     seed: int = 0,
     held: Mapping[str, float] | None = None,
     pair: tuple[str, str] | None = None,
-    walk: Walk | None = None,
+    profile_options: ProfileOptions | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> IdentifiabilityReport:
@@ -59,7 +59,7 @@ def identifiability(
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates), held=FrozenMap(held or {}))
-    so_far = Findings(problem, seed, walk or Walk(), progress)
+    so_far = Findings(problem, seed, profile_options or ProfileOptions(), progress)
     _check(so_far)
     so_far.tell("structure")
     structure = structure_of(_equations(subject), problem, seed)

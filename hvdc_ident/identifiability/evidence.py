@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile
@@ -90,15 +90,15 @@ def told_by_noise(whole: Optimum, kept: Sequence[str], others: Sequence[str]) ->
     return found
 
 
-def _room(free: Free, value: float) -> float:
+def _room(free: FitParameter, value: float) -> float:
     """Half of the range between the bounds as the unknown is scaled, in its unit at `value`; infinite without bounds."""
     return 0.5 * (value * math.log(free.max / free.min) if free.log else free.max - free.min)
 
 
-def range_of(free: Free, value: float, reach: float) -> tuple[float, float]:
+def range_of(free: FitParameter, value: float, reach: float) -> tuple[float, float]:
     """The range that a verdict speaks of: the bounds; where there is none, as far from the value as profiles are walked.
 
-    reach: in typical sizes, or times the value, as in `Walk`.
+    reach: in typical sizes, or times the value, as in `ProfileOptions`.
     """
     low = free.min if math.isfinite(free.min) else value - reach * free.size
     high = free.max if math.isfinite(free.max) else value * reach if free.log else value + reach * free.size

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from hvdc_ident.executor import Progress
-from hvdc_ident.fit import Free, Problem
-from hvdc_ident.fit.profile import Walk
+from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.profile import ProfileOptions
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.optima import OtherOptimum
 from hvdc_ident.identifiability.pilot import Optimum
@@ -26,7 +26,7 @@ class Findings:
 
     problem: Problem
     seed: int = 0
-    walk: Walk = field(default_factory=Walk)
+    profile_options: ProfileOptions = field(default_factory=ProfileOptions)
     progress: Progress | None = None
     found: dict[str, Verdict] = field(default_factory=dict)
     held: dict[str, str] = field(default_factory=dict)
@@ -41,7 +41,7 @@ class Findings:
     optima: tuple[OtherOptimum, ...] = ()
 
     def __post_init__(self) -> None:
-        self.free: dict[str, Free] = {f.name: f for f in self.problem.free}
+        self.free: dict[str, FitParameter] = {f.name: f for f in self.problem.free}
         self.units = {n: self.problem.simulator.parameters[n].unit for n in self.free}
 
     def tell(self, text: str) -> None:

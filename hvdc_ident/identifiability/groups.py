@@ -9,7 +9,7 @@ from typing import Any
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.individual import Group, part_of
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.identifiability.assess import identifiability
@@ -24,7 +24,7 @@ from hvdc_ident.simulate import ModelSimulator
 def identifiability_by_group(
     subject: Model | Simulator,
     experiments: Iterable[Experiment],
-    candidates: Iterable[Free],
+    candidates: Iterable[FitParameter],
     groups: Sequence[Group],
     *,
     pair: tuple[str, str] | None = None,

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit.objective import LeastSquares
-from hvdc_ident.fit.profile import Profile, Profiles, Walk, profiles, trend_profiles
+from hvdc_ident.fit.profile import Profile, ProfileOptions, Profiles, profiles, trend_profiles
 from hvdc_ident.fit.rough import LUCK, Trend, roughness, trend_of
 from hvdc_ident.identifiability import verdicts
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
@@ -66,7 +66,7 @@ def insensitive(so_far: Findings, optimum: Optimum) -> Optimum | None:
     out: dict[str, str] = {}
     for i, n in enumerate(names):
         limit, free = so_far.thresholds[n], so_far.free[n]
-        ends = range_of(free, optimum.value(n), so_far.walk.reach)
+        ends = range_of(free, optimum.value(n), so_far.profile_options.reach)
         unbounded = not math.isfinite(free.max - free.min)
         if (unbounded and matrix[i, i] > 0) or rise_over_range(
             matrix[i, i] / optimum.slope[i] ** 2, ends[1] - ends[0]
@@ -122,7 +122,7 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
             profiles,
             LeastSquares.of(optimum.problem),
             physical=physical,
-            walk=_no_finer(so_far.walk, rough / min(limits.values())),
+            options=_no_finer(so_far.profile_options, rough / min(limits.values())),
             executor=executor,
             progress=so_far.progress,
         )
@@ -168,9 +168,9 @@ def profiled(so_far: Findings, optimum: Optimum | None, executor: Executor | Non
     return None
 
 
-def _no_finer(walk: Walk, rough: float) -> Walk:
-    """The walk, its crossings no finer than the roughness of the cost, as a share of the threshold."""
-    return walk if rough <= walk.tolerance else replace(walk, tolerance=rough)
+def _no_finer(options: ProfileOptions, rough: float) -> ProfileOptions:
+    """Return the options with crossings no finer than the roughness of the cost, as a share of the threshold."""
+    return options if rough <= options.tolerance else replace(options, tolerance=rough)
 
 
 def _of_trend(
@@ -194,7 +194,7 @@ def _note_of(trend: Trend) -> str:
 
 def _undetermined(so_far: Findings, optimum: Optimum, profile: Profile) -> bool:
     free = so_far.free[profile.name]
-    return undetermined(optimum, profile, range_of(free, profile.value, so_far.walk.reach))
+    return undetermined(optimum, profile, range_of(free, profile.value, so_far.profile_options.reach))
 
 
 def _locally(so_far: Findings, judged: Verdict, profile: Profile) -> Verdict:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.objective import LeastSquares, Reached, descend
+from hvdc_ident.fit.objective import DescentResult, LeastSquares, descend
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.immutable import FrozenMap
 
@@ -54,7 +54,7 @@ def other_optima(
         if _new(space.scaled(theta), known) and not teeth(theta):
             known.append(space.scaled(theta))
             begins.append(theta)
-    found: list[Reached] = []
+    found: list[DescentResult] = []
     reached = [space.scaled(best.theta)]
     for theta in begins:
         try:

@@ -16,7 +16,7 @@ from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, source_of
 from hvdc_ident.fit.nuisance import unknown_of
 from hvdc_ident.fit.objective import LeastSquares, descend
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.rough import Trend
 from hvdc_ident.fit.simulator import sensitivity_error
@@ -45,7 +45,7 @@ class Optimum:
         return sensitivity_error(self.problem.simulator)
 
     @cached_property
-    def blocks(self) -> tuple[Block, ...]:
+    def blocks(self) -> tuple[ResidualBlock, ...]:
         """Residuals and derivatives there."""
         return self.problem.blocks(self.theta)
 

@@ -10,7 +10,7 @@ from typing import Literal
 from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import Profile
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 
 VerdictName = Literal[
     "structurally-unidentifiable",
@@ -96,7 +96,7 @@ def structural(
 
 
 def insensitive(
-    free: Free, ends: tuple[float, float], rise: float, threshold: float, unit: str, also: str = ""
+    free: FitParameter, ends: tuple[float, float], rise: float, threshold: float, unit: str, also: str = ""
 ) -> Verdict:
     """Its whole range moves the outputs by less than noise may. rise: of the cost at the worse end. also: a remark."""
     span = f"Anywhere between {ends[0]:.4g} and {_with_unit(ends[1], unit)}"
@@ -145,7 +145,7 @@ def lost(name: str, words: str, value: float, unit: str) -> Verdict:
     return Verdict(name, "practically-unidentifiable", f"In these experiments {words}.", value, unit)
 
 
-def at_bound(profile: Profile, free: Free, physical: bool, unit: str) -> Verdict:
+def at_bound(profile: Profile, free: FitParameter, physical: bool, unit: str) -> Verdict:
     """Its optimum lies on a bound; the other end is its one-sided limit."""
     low = profile.value <= free.min
     limit = profile.upper.limit if low else profile.lower.limit
@@ -162,7 +162,7 @@ def at_bound(profile: Profile, free: Free, physical: bool, unit: str) -> Verdict
 
 
 def closed(
-    profile: Profile, free: Free, std: float, collinearity: float, partner: str, best: str, unit: str
+    profile: Profile, free: FitParameter, std: float, collinearity: float, partner: str, best: str, unit: str
 ) -> Verdict:
     """Weak or identifiable: its interval is known. std: in its unit. best: the experiment that tells most about it."""
     low, high = profile.ci95
@@ -202,7 +202,7 @@ def _where(profile: Profile, span: str, share: float) -> str:
     return f"These data do not narrow its physical bounds, {span}"
 
 
-def scale_of(free: Free, value: float) -> tuple[float, str]:
+def scale_of(free: FitParameter, value: float) -> tuple[float, str]:
     """Return the scale that a width is compared with, in the parameter's unit, and what that is in words.
 
     The value where it is positive by its bounds, else the range; without bounds the value too, or the card's typical size

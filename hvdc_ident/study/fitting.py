@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.fit import FitResult, Free, Group, Problem, fit, fit_each, fit_individually
+from hvdc_ident.fit import FitParameter, FitResult, Group, Problem, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.frequency_data import with_responses
 from hvdc_ident.fit.individual import part_of
@@ -129,7 +129,7 @@ def _one_by_one(
     return table
 
 
-def _from(free: Free, value: float) -> Free:
+def _from(free: FitParameter, value: float) -> FitParameter:
     return replace(free, start=min(max(value, free.min), free.max))
 
 

@@ -26,7 +26,7 @@ from hvdc_ident.data import (
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit.noise import MISFIT, source_of
 from hvdc_ident.fit.nuisance import observe, unknowns
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import ModelSimulator
 
@@ -351,7 +351,7 @@ def run_of(
 
 
 def freed(
-    simulator: ModelSimulator, e: Experiment, candidates: Sequence[Free], own: Sequence[Comparison]
+    simulator: ModelSimulator, e: Experiment, candidates: Sequence[FitParameter], own: Sequence[Comparison]
 ) -> list[Comparison]:
     """The comparisons with the runs at the ends of every candidate's range, and at the corners that move a level most."""
     found = list(own)

@@ -27,7 +27,7 @@ from scipy.stats import norm
 
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import ModelSimulator, engine_of
 from hvdc_ident.study.level_comparison import (
@@ -123,7 +123,7 @@ def quiescent_levels(study: Study) -> QuiescentLevels:
 
 
 def compare_levels(
-    model: AnyModel, experiments: Sequence[Experiment], candidates: Sequence[Free] = ()
+    model: AnyModel, experiments: Sequence[Experiment], candidates: Sequence[FitParameter] = ()
 ) -> QuiescentLevels:
     """The recorded levels and movements of every experiment against the model's, at the model's own values.
 
@@ -164,7 +164,7 @@ def compare_levels(
 def _judged(
     simulator: ModelSimulator,
     experiments: Mapping[str, Experiment],
-    candidates: Sequence[Free],
+    candidates: Sequence[FitParameter],
     comparisons: Sequence[Comparison],
     sure: float,
 ) -> list[QuiescentLevel]:
@@ -316,7 +316,7 @@ class Cause:
 def common_cause(
     simulator: ModelSimulator,
     e: Experiment,
-    candidates: Sequence[Free],
+    candidates: Sequence[FitParameter],
     own: Sequence[Comparison],
     odds: float,
     doubted: bool,

@@ -14,7 +14,7 @@ from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model, recording
@@ -44,7 +44,7 @@ class Study(Shown):
     name: str
     path: Path
     model: AnyModel
-    candidates: FrozenMap[Free]
+    candidates: FrozenMap[FitParameter]
     experiments: tuple[Experiment, ...]
     noise: FrozenMap[FrozenMap[NoiseNote]]
     settings: schema.StudyFile
@@ -276,7 +276,7 @@ def _is_path(source: str) -> bool:
     return "/" in source or "\\" in source or Path(source).suffix in (".toml", ".fmu", ".py")
 
 
-def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[Free]:
+def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[FitParameter]:
     """Return the parameters that may be estimated. Raises StudyError or UnknownNameError."""
     found = {}
     for name, line in settings.parameters.items():
@@ -370,13 +370,13 @@ def with_nuisances(
     return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own))), search=search) for e in experiments)
 
 
-def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> Free:
+def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> FitParameter:
     """The unknown of a fit that a line of [parameters] describes; what it leaves out is the model's, its given value too.
 
     Raises StudyError where the bounds do not hold the start.
     """
     stated = {k: v for k in ("start", "min", "max") if (v := getattr(line, k)) is not None}
-    return Free.of(name, model.parameters[name], **stated)
+    return FitParameter.of(name, model.parameters[name], **stated)
 
 
 def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> FrozenMap[Prior]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Experiment, InputSignal, experiment
-from hvdc_ident.fit import Free, Problem, fit, fit_each
+from hvdc_ident.fit import FitParameter, Problem, fit, fit_each
 from hvdc_ident.fit.bootstrap import cluster_sandwich
 from hvdc_ident.fit.per_experiment import half_width, spread
 from hvdc_ident.immutable import FrozenMap
@@ -114,9 +114,9 @@ EQUAL = 1e-3
 """Standard deviation in pu that weighs the three outputs alike in the simultaneous fits: a plain sum of squares."""
 
 
-def free(names: Iterable[str]) -> tuple[Free, ...]:
+def free(names: Iterable[str]) -> tuple[FitParameter, ...]:
     """The unknowns as Table II sets them up."""
-    return tuple(Free(n, TABLE_2[n][2], TABLE_2[n][0], TABLE_2[n][1]) for n in names)
+    return tuple(FitParameter(n, TABLE_2[n][2], TABLE_2[n][0], TABLE_2[n][1]) for n in names)
 
 
 def link() -> ModelSimulator:

@@ -26,7 +26,7 @@ from common.work import processes  # noqa: E402
 from hvdc_ident import load_study, simulate  # noqa: E402
 from hvdc_ident.data import Experiment, Trajectory  # noqa: E402
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
-from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
+from hvdc_ident.fit import FitParameter, Problem, fit  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.simulate import ModelSimulator  # noqa: E402
 
@@ -41,7 +41,7 @@ TRIED = {  # the effect that explains most, at each of the places where it does,
 }
 
 
-def setup() -> tuple[Model, Experiment, tuple[Free, ...]]:
+def setup() -> tuple[Model, Experiment, tuple[FitParameter, ...]]:
     """The link with the ratings of the authors' model, the P step on an even grid, and the gains begun where they were."""
     study = load_study(STUDY)
     (given,) = study.experiments
@@ -76,7 +76,9 @@ def refits() -> dict[str, Any]:
         for place, at in places.items():
             more = model.with_effects([{"effect": effect, "at": at, "parameters": {"T": 1e-3}}])
             (name,) = (n for n in more.parameters if n not in model.parameters)
-            result = fit(Problem(ModelSimulator(more), (e,), (*free, Free(name, 1e-3, 1e-4, 1e-2))), starts=4, seed=0)
+            result = fit(
+                Problem(ModelSimulator(more), (e,), (*free, FitParameter(name, 1e-3, 1e-4, 1e-2))), starts=4, seed=0
+            )
             found[f"{effect} at {place}"] = _row(more, e, result, name)
     return found
 

@@ -17,18 +17,18 @@ import numpy as np
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.optimisers import catalogue, is_global, optimiser
 from hvdc_ident.simulate import ModelSimulator
 
 TRUE = {"KIP": 30.0, "KPP": 0.0, "KIQ": 30.0, "KPQ": 0.0, "KPVDC": 24.0, "KIVDC": 734.7}
 FREE = (
-    Free("KIP", 25, 5, 50),
-    Free("KPP", 5, 0, 10),
-    Free("KIQ", 25, 10, 50),
-    Free("KPQ", 5, 0, 10),
-    Free("KPVDC", 20, 10, 40),
-    Free("KIVDC", 750, 550, 950),
+    FitParameter("KIP", 25, 5, 50),
+    FitParameter("KPP", 5, 0, 10),
+    FitParameter("KIQ", 25, 10, 50),
+    FitParameter("KPQ", 5, 0, 10),
+    FitParameter("KPVDC", 20, 10, 40),
+    FitParameter("KIVDC", 750, 550, 950),
 )
 STEPS = {"Pref2": (0.4, 0.5), "Qref1": (0.0, 0.1), "Vdcref1": (1.0, 1.019)}
 OUTPUTS = ("Irorder1", "Irorder2", "Iiorder1")

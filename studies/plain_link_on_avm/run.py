@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.data import Experiment, InputSignal, experiment
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import ModelSimulator, simulate
 
@@ -39,7 +39,7 @@ def fitted(source: str) -> dict[str, float]:
     simulator = ModelSimulator(load_model("vsc-hvdc-link"))
     found: dict[str, float] = {}
     for step, (_, _, _, output, gains) in STEPS.items():
-        free = tuple(Free(name, start, low, high) for name, (start, low, high) in gains.items())
+        free = tuple(FitParameter(name, start, low, high) for name, (start, low, high) in gains.items())
         result = fit(Problem(simulator, (recording(source, step),), free), starts=3, seed=0)
         found |= {name: result.estimates[name].value for name in gains}
         found[f"rmse {output}"] = result.rmse[output][step] or 0.0

@@ -18,7 +18,7 @@ from scipy.stats import binom
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.identifiability.evidence import thresholds
@@ -26,7 +26,7 @@ from hvdc_ident.identifiability.pilot import pilot
 from hvdc_ident.simulate import ModelSimulator
 
 TRUE = {"KPVDC": 24.0, "KIVDC": 734.7}
-FREE = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950))
+FREE = (FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", 750, 550, 950))
 NOISE = 1e-2  # pu: intervals of several per cent, so that the problem is not linear over their width
 TIME = np.round(np.arange(0, 0.4001, 1e-3), 9)
 

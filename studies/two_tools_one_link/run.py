@@ -25,7 +25,7 @@ from common.work import processes  # noqa: E402
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory, experiment  # noqa: E402  # noqa: E402
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
-from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
+from hvdc_ident.fit import FitParameter, Problem, fit  # noqa: E402
 from hvdc_ident.formats import read_waveforms  # noqa: E402
 from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model, read_card  # noqa: E402
@@ -161,7 +161,7 @@ def _rms(x: Array) -> float:
 def calibrated() -> dict[str, Any]:
     """The card's parameters from Eurostag's P ramp and dc voltage step, begun a quarter off, and how well it then predicts."""
     model = card()
-    free = tuple(Free(n, 1.25 * model.values[n], model.values[n] / 3, 3 * model.values[n]) for n in CALIBRATED)
+    free = tuple(FitParameter(n, 1.25 * model.values[n], model.values[n] / 3, 3 * model.values[n]) for n in CALIBRATED)
     result = fit(Problem(ModelSimulator(model), experiments(), free), starts=2, seed=0)
     return {
         "status": result.status,
@@ -173,7 +173,7 @@ def calibrated() -> dict[str, Any]:
 def named(part: str, executor: Any = None) -> dict[str, Any]:
     """What the diagnosis says where the card lacks a part, told nothing; the gains begin at the card's."""
     model = card().with_values(LEFT_OUT[part])
-    free = tuple(Free(n, model.values[n], model.values[n] / 3, 3 * model.values[n]) for n in GAINS)
+    free = tuple(FitParameter(n, model.values[n], model.values[n] / 3, 3 * model.values[n]) for n in GAINS)
     fitted, held_out = ROLES.get(part, ROLES[""])
     chosen = [
         e.with_(role="fit" if e.name in fitted else "holdout")

@@ -23,7 +23,7 @@ from common.ending import markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
 from hvdc_ident.data import Experiment, InputSignal, experiment  # noqa: E402
-from hvdc_ident.fit import Free, Problem, fit  # noqa: E402
+from hvdc_ident.fit import FitParameter, Problem, fit  # noqa: E402
 from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.models import load_model, vsc_hvdc_avm  # noqa: E402
@@ -110,7 +110,7 @@ def planted() -> dict[str, Any]:
     lagged = load_model(paper.LINK).with_effects([LAGGED])
     experiments = [recorded(lagged, name) for name in PLANTED]
     plain = fit(Problem(paper.link(), tuple(experiments), paper.free(MOVED)), starts=4)
-    begun = (*paper.free(MOVED), Free(LAG_NAME, 5e-4, 1e-5, 1e-2))
+    begun = (*paper.free(MOVED), FitParameter(LAG_NAME, 5e-4, 1e-5, 1e-2))
     whole = fit(Problem(ModelSimulator(lagged), tuple(experiments), begun), starts=4)
     return {
         "plain link": {n: plain.values[n] for n in MOVED} | {"status": plain.status},
@@ -160,9 +160,9 @@ def fitted(model: Model) -> dict[str, float]:
     return found
 
 
-def wide(names: Sequence[str]) -> tuple[Free, ...]:
+def wide(names: Sequence[str]) -> tuple[FitParameter, ...]:
     """Table II's starts with bounds that no result here touches."""
-    return tuple(Free(n, paper.TABLE_2[n][2], 0.0, 4.0 * paper.TABLE_2[n][1]) for n in names)
+    return tuple(FitParameter(n, paper.TABLE_2[n][2], 0.0, 4.0 * paper.TABLE_2[n][1]) for n in names)
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:

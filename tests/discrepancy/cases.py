@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Model, Trajectory
 from hvdc_ident.data import Array
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 
@@ -41,7 +41,7 @@ TRUE = {"Kp": 2.0, "Ki": 12.0, "J": 0.2, "b": 0.3}
 TIME = np.round(np.arange(300) * 4e-3, 9)
 EVENT = 0.2
 SIGMA = {"w": 2e-3, "torque": 4e-3}
-FREE = (Free("Kp", 2.4, 0.4, 10.0), Free("Ki", 10.0, 2.0, 60.0))
+FREE = (FitParameter("Kp", 2.4, 0.4, 10.0), FitParameter("Ki", 10.0, 2.0, 60.0))
 RUNS = {
     "fit-1": ("fit", {"ref": [(EVENT, 0.6), (0.7, -0.9)]}),
     "fit-2": ("fit", {"load": [(EVENT, 0.5), (0.75, -0.4)]}),

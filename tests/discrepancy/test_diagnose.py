@@ -14,7 +14,7 @@ from hvdc_ident import Experiment, InputSignal, Trajectory, load_model, simulate
 from hvdc_ident.data import experiment
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 
 FEW = ["lag", "delay", "limit", "gain", "offset", "deadband", "second-order"]
@@ -180,7 +180,7 @@ def test_nothing_moves_nothing_is_excited() -> None:
     found = diagnose(
         model(),
         [still],
-        [Free("b", 0.3, 0.1, 1.0)],
+        [FitParameter("b", 0.3, 0.1, 1.0)],
         effects=["lag", "delay", "limit"],
         options=DiagnosisOptions(fallback=False),
     )

@@ -12,7 +12,7 @@ from hvdc_ident import Experiment, Trajectory
 from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.refits.refit import METHOD
 from hvdc_ident.effects import EffectUse
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -39,7 +39,7 @@ def _chi2(problem: Problem, uses: dict[str, tuple[EffectUse, str, tuple[float, f
         before = set(subject.parameters)
         subject = subject.with_effects([use])
         own = next(n for n in subject.parameters if n not in before and n.endswith(name))
-        free.append(Free(own, start, low, high))
+        free.append(FitParameter(own, start, low, high))
         theta.append(start)
     whole = replace(problem, simulator=ModelSimulator(subject), free=tuple(free))
     end = METHOD.run(whole, np.array(theta))
@@ -61,7 +61,7 @@ def _both(problem: Problem) -> tuple[float, float]:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_rounding_alone_rewards_no_offset(seed: int) -> None:
     found = _start(seed)
-    assert set(found.problem.rounding) == set(SIGMA)
+    assert set(found.problem.quantised_noise) == set(SIGMA)
     chi2, gain = _both(found.problem)
     rows = sum(b.residual.size for b in found.blocks)
     assert gain < 10.0  # two parameters of chi2: the chance of more is 0.7 %
@@ -70,5 +70,5 @@ def test_rounding_alone_rewards_no_offset(seed: int) -> None:
 
 def test_taken_for_white_noise_it_rewards_them_more() -> None:
     problems = [_start(seed).problem for seed in (0, 1, 2)]
-    plain = sum(_both(replace(p, rounding=FrozenMap()))[1] for p in problems)
+    plain = sum(_both(replace(p, quantised_noise=FrozenMap()))[1] for p in problems)
     assert plain > 2.0 * sum(_both(p)[1] for p in problems)

@@ -9,7 +9,7 @@ from hvdc_ident import Experiment, InputSignal
 from hvdc_ident.data import Trajectory
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.discrepancy.findings.sizes import size_curves
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 
@@ -58,7 +58,7 @@ def test_a_size_that_leaves_no_steady_state_is_left_out():
         record([1.05, 0.5, 1.15, 1.3], "fit", 2),
         record([1.1, 1.35, 0.8], "holdout", 3),
     ]
-    found = diagnose(LOOP, data, (Free("T", 0.08, 0.01, 1.0),), effects=["limit", "lag", "gain"])
+    found = diagnose(LOOP, data, (FitParameter("T", 0.08, 0.01, 1.0),), effects=["limit", "lag", "gain"])
     assert [(e.effect, e.at) for e in found.effects] == [("limit", ("u",))], found.text
     shown = size_curves(LOOP, data, found)
     assert shown is not None and shown["chosen"] is not None

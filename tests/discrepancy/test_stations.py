@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.signatures.candidates import own_sources
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 
@@ -103,7 +103,7 @@ def test_the_same_droop_of_both_stations_is_one_effect_with_one_size() -> None:
     told = diagnose(
         parse_card(CARD),
         records(),
-        [Free("K", 20.0, 5.0, 120.0)],
+        [FitParameter("K", 20.0, 5.0, 120.0)],
         effects=["coupling", "droop", "gain", "lag"],
         options=DiagnosisOptions(fallback=False),
     )

@@ -9,7 +9,7 @@ import pytest
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import EffectUse, SlotSignal, alone, clearance, effects, probes, resistances, sources
-from hvdc_ident.fit.unknown import Free
+from hvdc_ident.fit.unknown import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
@@ -54,7 +54,9 @@ def test_probes_lie_inside_the_bounds_of_their_refit(name):
             assert q.min <= low < p.values[n] < high <= q.max and math.isfinite(high - low)
             scale = q.min >= 0 and q.measure in ("time", "time*R", "rate", "range", "peak", "range/time", "of T2")
             if scale and q.near is None:
-                assert Free(n, p.values[n], low, high).log, "a size of unknown order is searched by its logarithm"
+                assert FitParameter(n, p.values[n], low, high).log, (
+                    "a size of unknown order is searched by its logarithm"
+                )
 
 
 @pytest.mark.parametrize("name", NAMES)

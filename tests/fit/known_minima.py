@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from tests.fit.simulators import Closed, decay, parameters, recorded
 from tests.fit.test_nist import MISRA_X, MISRA_Y, misra1a
 
@@ -27,7 +27,7 @@ class Known:
 
 def _exact() -> Problem:
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
-    free = (Free("a", 1.0, 0.1, 10.0), Free("k", 4.0, 0.0, 20.0))
+    free = (FitParameter("a", 1.0, 0.1, 10.0), FitParameter("k", 4.0, 0.0, 20.0))
     return Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
 
 
@@ -36,7 +36,7 @@ BOUND = 1.2
 
 def _bounded() -> Problem:
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
-    free = (Free("a", 1.0, 0.1, 10.0), Free("k", 0.5, 0.0, BOUND))
+    free = (FitParameter("a", 1.0, 0.1, 10.0), FitParameter("k", 0.5, 0.0, BOUND))
     return Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
 
 
@@ -55,14 +55,14 @@ def _rosenbrock(t, p):
 
 def _valley() -> Problem:
     simulator = Closed(parameters(x1=-1.2, x2=1.0), {"y": _rosenbrock})
-    free = (Free("x1", -1.2, -3, 3), Free("x2", 1.0, -3, 3))
+    free = (FitParameter("x1", -1.2, -3, 3), FitParameter("x2", 1.0, -3, 3))
     return Problem(simulator, (recorded("e", np.arange(2.0), {"y": 1.0}, y=np.zeros(2)),), free)
 
 
 def _misra() -> Problem:
     """NIST StRD Misra1a from its first start, weighted by the certified residual standard deviation."""
     simulator = Closed(parameters(b1=500.0, b2=1e-4), {"y": misra1a})
-    free = (Free("b1", 500.0, 50, 1000), Free("b2", 1e-4, 1e-5, 1e-2))
+    free = (FitParameter("b1", 500.0, 50, 1000), FitParameter("b2", 1e-4, 1e-5, 1e-2))
     noise = {"y": 1.0187876330e-1}
     return Problem(simulator, (recorded("nist", np.array(MISRA_X), noise, y=np.array(MISRA_Y)),), free)
 
@@ -74,7 +74,7 @@ def _line_only(t, p):
 
 def _single() -> Problem:
     simulator = Closed(parameters(a=1.0), {"y": _line_only})
-    return Problem(simulator, (recorded("e", T, {"y": 1.0}, y=0.5 * T + 1.0),), (Free("a", 4.0, -5, 5),))
+    return Problem(simulator, (recorded("e", T, {"y": 1.0}, y=0.5 * T + 1.0),), (FitParameter("a", 4.0, -5, 5),))
 
 
 def _single_answer() -> tuple[tuple[float], float]:
@@ -92,7 +92,7 @@ def _waves(t, p):
 
 def _rough() -> Problem:
     simulator = Closed(parameters(x1=0.0, x2=0.0), {"y": _waves})
-    free = (Free("x1", -1.9, -2.0, 3.0), Free("x2", -1.9, -2.0, 3.0))
+    free = (FitParameter("x1", -1.9, -2.0, 3.0), FitParameter("x2", -1.9, -2.0, 3.0))
     data = recorded("e", np.arange(2.0), {"y": 0.1}, y=np.array([2.4, 2.4]))
     return Problem(simulator, (data,), free)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from tests.fit.simulators import Closed, coloured, line, parameters, recorded
 
 T = np.linspace(0.0, 1.0, 200)
-FREE = (Free("a", 0.0, -50, 50), Free("b", 0.0, -50, 50))
+FREE = (FitParameter("a", 0.0, -50, 50), FitParameter("b", 0.0, -50, 50))
 LINE = Closed(parameters(a=0.0, b=0.0), {"y": line})
 
 
@@ -106,7 +106,7 @@ def test_the_interval_of_a_positive_parameter_does_not_go_below_zero():
     y = 0.02 + white(1)
     for own, search in ((Parameter(1.0, min=0.0), (-50, 50)), (Parameter(1.0), (0.0, 50.0))):
         plant = Closed({"a": own, "b": Parameter(0.0)}, {"y": line})
-        free = (Free("a", 1.0, *search), Free("b", 0.0, -50, 50))
+        free = (FitParameter("a", 1.0, *search), FitParameter("b", 0.0, -50, 50))
         a = fit(Problem(plant, (recorded("e", T, {"y": 0.1}, y=y),), free), starts=1).estimates["a"]
         assert a.ci95[0] == 0.0 < a.value < a.ci95[1]
         assert a.value - 1.96 * a.std < 0.0
@@ -117,7 +117,7 @@ def test_a_second_optimum_as_good_is_told_beside_each_estimate_that_it_moves():
         return p["a"] ** 2 + p["b"] * t, {"a": 2 * p["a"] + 0 * t, "b": t}
 
     plant = Closed(parameters(a=1.0, b=0.0), {"y": squared})
-    free = (Free("a", 1.0, -3, 3), Free("b", 0.0, -5, 5))
+    free = (FitParameter("a", 1.0, -3, 3), FitParameter("b", 0.0, -5, 5))
     result = fit(Problem(plant, (recorded("e", T, {"y": 0.1}, y=1 + T + white(1)),), free))
     assert result.status == "two-optima"
     assert "another optimum, as good, has" in result.estimates["a"].reason

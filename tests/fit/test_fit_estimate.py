@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded, step_response
 
 T = np.linspace(0.0, 3.0, 61)
@@ -21,7 +21,7 @@ RNG = np.random.default_rng
 def decaying(noise=0.01, seed=1, given=True, bounds=(0.0, 5.0), **rest) -> Problem:
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay}, **rest)
     y = 2.0 * np.exp(-1.5 * T) + noise * RNG(seed).normal(size=T.size)
-    free = (Free("a", 1.0, 0.1, 10), Free("k", max(1.0, bounds[0]), *bounds))
+    free = (FitParameter("a", 1.0, 0.1, 10), FitParameter("k", max(1.0, bounds[0]), *bounds))
     return Problem(simulator, (recorded("e", T, {"y": noise} if given else {}, y=y),), free)
 
 
@@ -29,7 +29,7 @@ def test_exact_data_give_exact_parameters_and_say_what_the_noise_is():
     t = np.linspace(0, 1, 201)
     truth = {"w": 20.0, "z": 0.35, "gain": 2.0}
     simulator = Closed(parameters(w=10.0, z=0.7, gain=1.0), {"y": step_response})
-    free = (Free("w", 10, 2, 100), Free("z", 0.7, 0.05, 0.95), Free("gain", 1, 0.1, 10))
+    free = (FitParameter("w", 10, 2, 100), FitParameter("z", 0.7, 0.05, 0.95), FitParameter("gain", 1, 0.1, 10))
     result = fit(Problem(simulator, (recorded("e", t, y=step_response(t, truth)[0]),), free))
     assert result.status == "converged"
     for name, value in truth.items():
@@ -66,7 +66,7 @@ def test_outputs_of_unlike_units_are_weighed_by_their_own_misfit():
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay, "big": big})
     y = 2.0 * np.exp(-1.5 * T)
     data = {"y": y + 0.1 * rng.normal(size=T.size), "big": 1e5 * (y + 0.001 * rng.normal(size=T.size))}
-    free = (Free("a", 1.0, 0.1, 10), Free("k", 1.0, 0, 5))
+    free = (FitParameter("a", 1.0, 0.1, 10), FitParameter("k", 1.0, 0, 5))
     result = fit(Problem(simulator, (recorded("e", T, **data),), free))
     assert result.status == "converged"
     assert result.sigma["e"]["y"] == pytest.approx(0.1, rel=0.3)
@@ -90,7 +90,7 @@ def test_the_one_sided_limit_is_where_the_profile_has_risen_enough():
     problem = Problem(
         Closed(parameters(a=1.0, b=0.1), {"y": line}),
         (recorded("e", T, {"y": 0.1}, y=1.0 - 0.01 * T + 0.1 * RNG(1).normal(size=T.size)),),
-        (Free("a", 1.0, -5, 5), Free("b", 0.1, 0, 5)),
+        (FitParameter("a", 1.0, -5, 5), FitParameter("b", 0.1, 0, 5)),
     )
     limit = fit(problem).estimates["b"].ci95[1]
     r0 = fit(problem).cost
@@ -100,7 +100,7 @@ def test_the_one_sided_limit_is_where_the_profile_has_risen_enough():
 
 def test_two_estimates_on_bounds_have_no_limits():
     simulator = Closed(parameters(a=1.0, b=1.0), {"y": line})
-    free = (Free("a", 1.0, 0.5, 2), Free("b", 1.0, 0.5, 2))
+    free = (FitParameter("a", 1.0, 0.5, 2), FitParameter("b", 1.0, 0.5, 2))
     result = fit(Problem(simulator, (recorded("e", T, {"y": 1.0}, y=0 * T),), free))
     assert result.status == "at-bound"
     assert [e.ci95 for e in result.estimates.values()] == [None, None]
@@ -117,7 +117,7 @@ def squared(t, p):
 def test_two_optima_that_are_as_good_are_said_to_be_two(y, status):
     simulator = Closed(parameters(a=1.0, small=0.0), {"y": squared})
     low = -3.0 if y == 0.0 else -1.0
-    problem = Problem(simulator, (recorded("e", T, {"y": 0.1}, y=y + 0 * T),), (Free("a", 0.5, low, 3.0),))
+    problem = Problem(simulator, (recorded("e", T, {"y": 0.1}, y=y + 0 * T),), (FitParameter("a", 0.5, low, 3.0),))
     result = fit(problem, starts=8, seed=2)
     assert result.status == status
     if status == "two-optima":
@@ -129,7 +129,7 @@ def test_two_optima_that_are_as_good_are_said_to_be_two(y, status):
 def test_a_worse_optimum_is_no_rival():
     simulator = Closed(parameters(a=1.0, small=0.5), {"y": lambda t, p: doubled(t, p)})
     problem = Problem(
-        simulator, (recorded("e", T, {"y": 0.1, "z": 0.1}, y=0 * T, z=1 + 0 * T),), (Free("a", -1, -3, 3),)
+        simulator, (recorded("e", T, {"y": 0.1, "z": 0.1}, y=0 * T, z=1 + 0 * T),), (FitParameter("a", -1, -3, 3),)
     )
     problem.simulator.outputs["z"] = lambda t, p: (p["a"] + 0 * t, {"a": 1 + 0 * t})
     result = fit(problem)
@@ -152,7 +152,7 @@ def product(t, p):
 def test_directions_that_data_do_not_determine_have_a_reason_and_no_std():
     simulator = Closed(parameters(a=2.0, b=3.0, c=0.5, d=1.0), {"y": product})
     y = 6.0 * (1 + T) + 0.7 * T**2 + 0.01 * RNG(2).normal(size=T.size)
-    free = tuple(Free(n, v, 0.1, 20) for n, v in (("a", 1.0), ("b", 1.0), ("c", 1.0), ("d", 1.0)))
+    free = tuple(FitParameter(n, v, 0.1, 20) for n, v in (("a", 1.0), ("b", 1.0), ("c", 1.0), ("d", 1.0)))
     result = fit(Problem(simulator, (recorded("e", T, {"y": 0.01}, y=y),), free))
     e = result.estimates
     assert result.status == "converged"
@@ -168,7 +168,9 @@ def test_directions_that_data_do_not_determine_have_a_reason_and_no_std():
 
 def test_as_many_rows_as_unknowns_say_nothing_about_the_noise():
     simulator = Closed(parameters(a=1.0, b=1.0), {"y": line})
-    problem = Problem(simulator, (recorded("e", T[:2], y=T[:2]),), (Free("a", 1, -5, 5), Free("b", 1.5, -5, 5)))
+    problem = Problem(
+        simulator, (recorded("e", T[:2], y=T[:2]),), (FitParameter("a", 1, -5, 5), FitParameter("b", 1.5, -5, 5))
+    )
     result = fit(problem)
     assert result.chi2_per_dof is None
     assert result.estimates["a"].std is None
@@ -258,7 +260,7 @@ def test_the_result_is_json_and_toml_of_full_precision():
 def test_residual_tests_tell_noise_from_a_missing_effect():
     rest = {"inputs": {"u": InputSignal.step(1.0, 0.0, 1.0)}}
     simulator = Closed(parameters(a=1.0, b=1.0), {"y": line})
-    free = (Free("a", 1, -5, 5), Free("b", 1, -5, 5))
+    free = (FitParameter("a", 1, -5, 5), FitParameter("b", 1, -5, 5))
     t = np.linspace(0, 3, 301)
     noise = 0.1 * RNG(7).normal(size=t.size)
     clean = fit(Problem(simulator, (recorded("e", t, {"y": 0.1}, rest, y=t + noise),), free), starts=1)
@@ -315,7 +317,7 @@ def test_individual_groups_are_no_better_than_their_worst():
 
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
     e = recorded("e", T, {"y": 0.01}, y=2.0 * np.exp(-1.5 * T))
-    problem = Problem(simulator, (e,), (Free("a", 1.0, 0.1, 10), Free("k", 1.0, 0.0, 1.2)))
+    problem = Problem(simulator, (e,), (FitParameter("a", 1.0, 0.1, 10), FitParameter("k", 1.0, 0.0, 1.2)))
     groups = [Group(("a",)), Group(("k",))]
     assert fit_individually(problem, groups, starts=1).status == "at-bound"
     assert (

@@ -7,12 +7,12 @@ import pytest
 
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError, SimulationError, SteadyStateError, StudyError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.residual import whitened
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded, step_response
 
 T = np.linspace(0.0, 2.0, 41)
-FREE = (Free("a", 2.0, 0.5, 4.0), Free("k", 1.0, 0.1, 5.0))
+FREE = (FitParameter("a", 2.0, 0.5, 4.0), FitParameter("k", 1.0, 0.1, 5.0))
 DECAY = Closed(parameters(a=2.0, k=1.0), {"y": decay})
 
 
@@ -40,7 +40,7 @@ def test_the_jacobian_is_the_residuals_derivative(rho):
     two.outputs["z"] = lambda t, p: with_zero(line(t, p), "k", t)
     first = recorded("one", T, {"y": 0.1, "z": 0.2}, y=T, z=T**2)
     second = recorded("two", T[::2], {"y": 0.3}, {"window": (0.5, 1.5)}, y=np.cos(T[::2]))
-    free = (*FREE, Free("b", 0.3, -1, 1))
+    free = (*FREE, FitParameter("b", 0.3, -1, 1))
     problem = Problem(two, (first, second), free, rho={"y": rho})
     r, jacobian = problem.residual(problem.start)
     assert r.size == 2 * T.size + int(((T[::2] >= 0.5) & (T[::2] <= 1.5)).sum())
@@ -79,7 +79,7 @@ def test_held_out_experiments_only_appear_in_the_table_of_errors():
 
 def test_a_value_that_is_not_finite_is_a_failed_simulation():
     broken = Closed(parameters(a=1.0), {"y": lambda t, p: (np.full_like(t, np.inf), {"a": t})})
-    problem = Problem(broken, (recorded("e", T, y=T),), (Free("a", 1.0, 0, 2),))
+    problem = Problem(broken, (recorded("e", T, y=T),), (FitParameter("a", 1.0, 0, 2),))
     with pytest.raises(SimulationError, match="not finite"):
         problem.residual(problem.start)
     assert problem.rmse(problem.start) == {"y": {"e": None}}
@@ -89,7 +89,7 @@ def test_a_missing_steady_start_is_a_failed_simulation():
     def lost(t, p):
         raise SteadyStateError("no steady state")
 
-    problem = Problem(Closed(parameters(a=1.0), {"y": lost}), (recorded("e", T, y=T),), (Free("a", 1.0, 0, 2),))
+    problem = Problem(Closed(parameters(a=1.0), {"y": lost}), (recorded("e", T, y=T),), (FitParameter("a", 1.0, 0, 2),))
     result = fit(problem, starts=2)
     assert result.status == "failed"
     assert "no steady start" in result.starts[0].message
@@ -101,7 +101,7 @@ def second_order(shift: float, nuisance: tuple[str, ...] = ("time-shift",)):
     t = np.linspace(0.0, 1.5, 301)
     y, _ = step_response(t - shift, {"w": 12.0, "z": 0.4, "gain": 1.5})
     rest = {"inputs": {"u": InputSignal.step(0.1, 0.0, 1.0)}, "nuisance": nuisance}
-    free = (Free("w", 10.0, 5, 30), Free("z", 0.5, 0.1, 0.9), Free("gain", 1.0, 0.2, 5))
+    free = (FitParameter("w", 10.0, 5, 30), FitParameter("z", 0.5, 0.1, 0.9), FitParameter("gain", 1.0, 0.2, 5))
     return Problem(simulator, (recorded("e", t, rest=rest, y=y),), free)
 
 
@@ -130,7 +130,7 @@ def test_a_nuisance_that_is_not_known_is_refused():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"free": (Free("c", 1.0),)}, "no parameter 'c'"),
+        ({"free": (FitParameter("c", 1.0),)}, "no parameter 'c'"),
         ({"held": {"a": 1.0}}, "stands twice"),
         ({"free": ()}, "nothing to fit"),
         ({"experiments": (recorded("e", T, y=T), recorded("e", T, y=T))}, "two experiments of one name"),
@@ -145,6 +145,6 @@ def test_a_problem_whose_parts_do_not_fit_is_refused(change, message):
 
 def test_bounds_that_do_not_hold_the_start_are_refused():
     with pytest.raises(StudyError, match="'a' are wrong"):
-        Free("a", 5.0, 0.0, 1.0)
+        FitParameter("a", 5.0, 0.0, 1.0)
     with pytest.raises(StudyError, match="the noise of 'y' is wrong"):
         fit(Problem(DECAY, (recorded("e", T, {"y": -1.0}, y=T),), FREE))

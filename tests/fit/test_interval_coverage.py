@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import binom
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.fit import Free, Group, Problem, fit, fit_each, fit_individually
+from hvdc_ident.fit import FitParameter, Group, Problem, fit, fit_each, fit_individually
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded
 
 T = np.linspace(0.0, 1.0, 200)
-FREE = (Free("a", 0.0, -50, 50), Free("b", 0.0, -50, 50))
+FREE = (FitParameter("a", 0.0, -50, 50), FitParameter("b", 0.0, -50, 50))
 LINE = Closed(parameters(a=0.0, b=0.0), {"y": line})
 
 
@@ -72,7 +72,12 @@ def pair() -> Problem:
         rng = np.random.default_rng(i)
         data = {n: f(T, truth)[0] + 0.01 * rng.normal(size=T.size) for n, f in (("y", first), ("z", second))}
         runs.append(recorded(f"e{i}", T, {"y": 0.01, "z": 0.01}, **data))
-    free = (Free("a", 1, 0.1, 10), Free("k", 1, 0, 5), Free("b", 0, -3, 3), Free("c", 0, -3, 3))
+    free = (
+        FitParameter("a", 1, 0.1, 10),
+        FitParameter("k", 1, 0, 5),
+        FitParameter("b", 0, -3, 3),
+        FitParameter("c", 0, -3, 3),
+    )
     return Problem(simulator, tuple(runs), free)
 
 

@@ -12,7 +12,7 @@ import pytest
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.fit import Free, Problem, fit, fit_each
+from hvdc_ident.fit import FitParameter, Problem, fit, fit_each
 from hvdc_ident.simulate import ModelSimulator
 from tests.fit.link import STEPS, TIME, TRUTH, link, step
 
@@ -29,7 +29,7 @@ def table_2() -> dict[str, dict[str, float]]:
 def test_the_truth_comes_back_from_every_start_of_table_2(start):
     """Within 0.1 %, of the range where the truth is 0; a test value below the range widens it."""
     lines = table_2()
-    free = tuple(Free(n, v[start], min(v["min"], v["test"]), v["max"]) for n, v in lines.items())
+    free = tuple(FitParameter(n, v[start], min(v["min"], v["test"]), v["max"]) for n, v in lines.items())
     assert set(lines) == set(TRUTH)
     result = fit(Problem(link(), tuple(step(s) for s in STEPS), free), starts=1)
     assert result.status in ("converged", "at-bound"), result.message
@@ -46,7 +46,7 @@ def test_each_controller_alone_gives_its_gains_too():
         (("KIQ", "KPQ"), "Qref1", "Iiorder1"),
         (("KPVDC", "KIVDC"), "Vdcref1", "Irorder1"),
     ):
-        free = tuple(Free(n, lines[n]["start"], lines[n]["min"], lines[n]["max"]) for n in names)
+        free = tuple(FitParameter(n, lines[n]["start"], lines[n]["min"], lines[n]["max"]) for n in names)
         result = fit(Problem(link(), (step(setpoint, (output,)),), free), starts=1)
         for f in free:
             assert abs(result.values[f.name] - TRUTH[f.name]) < 1e-6 * (TRUTH[f.name] or f.span)
@@ -55,7 +55,7 @@ def test_each_controller_alone_gives_its_gains_too():
 def test_capacitance_and_settling_time_are_found_in_place_of_the_gains():
     """24 and 734.69 follow from J = 0.4 s and Ts = 0.1 s; with the published 734.7 they come out within its rounding."""
     physical = ModelSimulator(load_model("vsc-hvdc-link").parameterised("physical"))
-    free = (Free("J", 0.25, 0.1, 1.0), Free("Ts", 0.2, 0.02, 0.5))
+    free = (FitParameter("J", 0.25, 0.1, 1.0), FitParameter("Ts", 0.2, 0.02, 0.5))
     result = fit(Problem(physical, (step("Vdcref1", ("Irorder1",)),), free), starts=3)
     assert result.status == "converged"
     assert result.values["J"] == pytest.approx(0.4, rel=1e-4)
@@ -67,7 +67,7 @@ def test_a_tie_makes_two_gains_one_unknown():
     model = load_model("vsc-hvdc-link")
     tied = ModelSimulator(model.tied({"KIQ2": "KIQ", "KIVDC": "KPVDC * 734.7 / 24"}))
     assert "KIQ2" not in tied.parameters
-    free = (Free("KIQ", 20, 10, 50), Free("KPVDC", 20, 10, 40))
+    free = (FitParameter("KIQ", 20, 10, 50), FitParameter("KPVDC", 20, 10, 40))
     data = (step("Qref1"), step("Vdcref1"))
     one = fit(Problem(tied, data, free), starts=1)
     assert [one.values[n] for n in ("KIQ", "KPVDC")] == pytest.approx([30.0, 24.0], rel=1e-6)
@@ -101,7 +101,7 @@ def test_a_block_on_its_own_is_driven_by_what_was_recorded():
     )
     # another dc side than the recording's does not matter to the block
     other = replace(link(), model=link().model.with_values({"C1": 0.35}))
-    free = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950))
+    free = (FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", 750, 550, 950))
     result = fit(Problem(other, (driven,), free), starts=1)
     assert result.nuisance["driven"]["xv"].value == pytest.approx(-0.39981, abs=1e-3)
     assert result.values["KPVDC"] == pytest.approx(24.0, rel=2e-3)
@@ -113,7 +113,7 @@ def test_a_block_on_its_own_is_driven_by_what_was_recorded():
 def test_a_recording_chain_is_taken_into_account_and_biases_where_it_is_not():
     chain = {"Irorder2": {"window-mean": 0.02, "delay": 0.001}}
     seen = step("Pref2", ("Irorder2",), hidden={"instrument": chain})
-    free = (Free("KIP", 25, 5, 50),)
+    free = (FitParameter("KIP", 25, 5, 50),)
     right = fit(Problem(link(), (seen.with_(instrument=chain),), free), starts=1)
     assert right.values["KIP"] == pytest.approx(30.0, rel=1e-6)
     wrong = fit(Problem(link(), (seen,), free), starts=1)
@@ -130,7 +130,7 @@ def test_a_late_clock_is_found_and_biases_where_it_is_not_looked_for():
         outputs=("Irorder1",),
     )
     late = late.with_(measured=trajectory(TIME, {"Irorder1": moved["Irorder1"]}))
-    free = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950))
+    free = (FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", 750, 550, 950))
     found = fit(Problem(link(), (late.with_(nuisance=("time-shift",)),), free), starts=1)
     assert found.nuisance[late.name]["time-shift"].value == pytest.approx(0.0033, abs=2e-4)
     assert found.values["KPVDC"] == pytest.approx(24.0, rel=0.01)
@@ -139,7 +139,7 @@ def test_a_late_clock_is_found_and_biases_where_it_is_not_looked_for():
 
 def test_intervals_of_two_gains_cover_and_the_band_holds_the_samples():
     """95 % intervals over noisy records of the link; the statistical tests of the report's profiles are elsewhere."""
-    free = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950))
+    free = (FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", 750, 550, 950))
     hits, inside = {"KPVDC": 0, "KIVDC": 0}, []
     runs = 60
     for seed in range(runs):
@@ -159,8 +159,8 @@ def test_statistics_over_experiments_are_the_same_whatever_runs_them():
     from concurrent.futures import ThreadPoolExecutor
 
     problem = Problem(link(), tuple(replace(step("Vdcref1", noise=1e-3, seed=k), name=f"e{k}") for k in range(3)), (
-        Free("KPVDC", 20, 10, 40),
-        Free("KIVDC", 750, 550, 950),
+        FitParameter("KPVDC", 20, 10, 40),
+        FitParameter("KIVDC", 750, 550, 950),
     ))  # fmt: skip
     with ThreadPoolExecutor(2) as pool:
         assert fit_each(problem, executor=pool) == fit_each(problem)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hvdc_ident.fit import FitResult, Free, Problem, fit
+from hvdc_ident.fit import FitParameter, FitResult, Problem, fit
 from tests.fit.simulators import Closed, parameters, recorded
 
 MISRA_X = [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0]
@@ -39,7 +39,7 @@ def check(result: FitResult, certified: dict[str, tuple[float, float]], squares:
 @pytest.mark.parametrize("starts", [1, 8])
 def test_misra1a(start, starts):
     simulator = Closed(parameters(b1=start[0], b2=start[1]), {"y": misra1a})
-    free = (Free("b1", start[0], 50, 1000), Free("b2", start[1], 1e-5, 1e-2))
+    free = (FitParameter("b1", start[0], 50, 1000), FitParameter("b2", start[1], 1e-5, 1e-2))
     result = fit(Problem(simulator, (recorded("nist", np.array(MISRA_X), y=np.array(MISRA_Y)),), free), starts=starts)
     certified = {"b1": (2.3894212918e2, 2.7070075241), "b2": (5.5015643181e-4, 7.2668688436e-6)}
     check(result, certified, 1.2455138894e-1, 14)
@@ -55,14 +55,14 @@ CERTIFIED_MGH09 = {
 
 @pytest.mark.parametrize("start", [(25.0, 39.0, 41.5, 39.0), (0.25, 0.39, 0.415, 0.39)])
 def test_mgh09(start):
-    free = tuple(Free(f"b{i + 1}", s, 0, 100) for i, s in enumerate(start))
+    free = tuple(FitParameter(f"b{i + 1}", s, 0, 100) for i, s in enumerate(start))
     simulator = Closed(parameters(**{f.name: f.start for f in free}), {"y": mgh09})
     result = fit(Problem(simulator, (recorded("nist", np.array(MGH_X), y=np.array(MGH_Y)),), free))
     check(result, CERTIFIED_MGH09, 3.0750560385e-4, 11)
 
 
 def test_mgh09_has_an_interval_of_students_t():
-    free = tuple(Free(n, v, 0, 1) for n, (v, _) in CERTIFIED_MGH09.items())
+    free = tuple(FitParameter(n, v, 0, 1) for n, (v, _) in CERTIFIED_MGH09.items())
     simulator = Closed(parameters(**{f.name: f.start for f in free}), {"y": mgh09})
     result = fit(Problem(simulator, (recorded("nist", np.array(MGH_X), y=np.array(MGH_Y)),), free), starts=1)
     estimate = result.estimates["b1"]
@@ -75,7 +75,7 @@ def test_mgh09_has_an_interval_of_students_t():
 @pytest.mark.parametrize("start", [(500.0, 1e-4), (250.0, 5e-4), (1.0, 0.01)])
 def test_misra1a_without_bounds_does_not_depend_on_the_start(start):
     simulator = Closed(parameters(b1=start[0], b2=start[1]), {"y": misra1a}, lambda p: p["b2"] < -0.5)
-    free = (Free("b1", start[0]), Free("b2", start[1]))
+    free = (FitParameter("b1", start[0]), FitParameter("b2", start[1]))
     result = fit(Problem(simulator, (recorded("nist", np.array(MISRA_X), y=np.array(MISRA_Y)),), free))
     certified = {"b1": (2.3894212918e2, 2.7070075241), "b2": (5.5015643181e-4, 7.2668688436e-6)}
     check(result, certified, 1.2455138894e-1, 14)

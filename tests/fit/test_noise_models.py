@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.loss import LOSSES, loss
 from hvdc_ident.fit.prior import Prior
 from hvdc_ident.fit.spectrum import transformed
@@ -23,7 +23,7 @@ from tests.fit.simulators import Closed, coloured, decay, line, parameters, reco
 RNG = np.random.default_rng
 T = np.linspace(0.0, 1.0, 200)
 LINE = Closed(parameters(a=0.0, b=0.0), {"y": line})
-FREE = (Free("a", 0.0, -50, 50), Free("b", 0.0, -50, 50))
+FREE = (FitParameter("a", 0.0, -50, 50), FitParameter("b", 0.0, -50, 50))
 
 
 def ar(rng: np.random.Generator, n: int, model: tuple[float, ...], sigma: float = 1.0) -> np.ndarray:
@@ -156,7 +156,7 @@ def test_a_band_leaves_a_disturbance_outside_of_it_out():
     t = np.arange(300) / 100.0
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
     y = 2.0 * np.exp(-1.5 * t) + 0.5 * np.sin(2 * np.pi * 20.0 * t)
-    free = (Free("a", 1.0, 0.1, 10), Free("k", 1.0, 0.1, 5))
+    free = (FitParameter("a", 1.0, 0.1, 10), FitParameter("k", 1.0, 0.1, 5))
     problem = Problem(simulator, (recorded("e", t, {"y": 0.01}, y=y),), free)
     whole, band = fit(problem, starts=1), fit(replace(problem, band=(0.0, 15.0)), starts=1)
     off = [abs(r.estimates["k"].value - 1.5) for r in (whole, band)]
@@ -252,7 +252,7 @@ def test_a_prior_joins_the_data_by_their_weights():
     problem = Problem(
         Closed(parameters(a=0.0), {"y": constant}),
         (recorded("e", np.arange(50.0), {"y": 0.5}, y=y),),
-        (Free("a", 0.0, -10, 10),),
+        (FitParameter("a", 0.0, -10, 10),),
         priors={"a": Prior(2.0, 0.1)},
     )
     result = fit(problem, starts=1)
@@ -267,7 +267,7 @@ def test_a_prior_may_be_of_a_nuisance_and_has_to_name_an_unknown():
     t = np.linspace(0.0, 3.0, 61)
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
     e = recorded("e", t, {"y": 0.1}, {"nuisance": ("a",)}, y=2.0 * np.exp(-1.5 * t))
-    problem = Problem(simulator, (e,), (Free("k", 1.0, 0.1, 5),), priors={"e:a": Prior(2.5, 1e-6)})
+    problem = Problem(simulator, (e,), (FitParameter("k", 1.0, 0.1, 5),), priors={"e:a": Prior(2.5, 1e-6)})
     assert fit(problem, starts=1).nuisance["e"]["a"].value == pytest.approx(2.5, abs=1e-4)
     with pytest.raises(UnknownNameError, match="did you mean 'k'"):
         replace(problem, priors={"kk": Prior(0.0, 1.0)})

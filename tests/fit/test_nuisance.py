@@ -8,13 +8,13 @@ import pytest
 from hvdc_ident import Model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.nuisance import unit_of
 from hvdc_ident.simulate import ModelSimulator
 from tests.fit.link import STEPS, TIME, TRUTH, link, step
 from tests.fit.simulators import Closed, decay, parameters, recorded
 
-GAINS = (Free("KPVDC", 20, 10, 40), Free("KIVDC", 750, 550, 950), Free("KIP", 25, 5, 50))
+GAINS = (FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", 750, 550, 950), FitParameter("KIP", 25, 5, 50))
 
 
 @pytest.mark.parametrize("setpoint", ["Pref2", "Vdcref1"])
@@ -81,7 +81,9 @@ def test_a_free_start_is_estimated_in_every_experiment():
         y = trajectory(t, {"y": x0 * np.exp(-1.7 * t)})
         return experiment(name, t, measured=y, nuisance=("x_start",), role=role)
 
-    problem = Problem(tank(), (run("a", 2.0), run("b", -0.5), run("c", 4.0, "holdout")), (Free("k", 1.0, 0.1, 5),))
+    problem = Problem(
+        tank(), (run("a", 2.0), run("b", -0.5), run("c", 4.0, "holdout")), (FitParameter("k", 1.0, 0.1, 5),)
+    )
     result = fit(problem, starts=2)
     assert result.status == "converged"
     assert result.estimates["k"].value == pytest.approx(1.7, rel=1e-6)
@@ -96,11 +98,11 @@ def test_a_parameter_may_have_a_value_of_its_own_in_every_experiment():
     t = np.linspace(0.0, 3.0, 61)
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay})
     two = [recorded(n, t, rest={"nuisance": ("a",)}, y=a * np.exp(-1.5 * t)) for n, a in (("e", 2.0), ("f", 3.0))]
-    result = fit(Problem(simulator, tuple(two), (Free("k", 1.0, 0.1, 5),)), starts=2)
+    result = fit(Problem(simulator, tuple(two), (FitParameter("k", 1.0, 0.1, 5),)), starts=2)
     assert result.fitted == ("k",)
     assert [result.nuisance[n]["a"].value for n in ("e", "f")] == pytest.approx([2.0, 3.0], rel=1e-6)
     with pytest.raises(StudyError, match="stands twice"):
-        Problem(simulator, tuple(two), (Free("k", 1.0, 0.1, 5), Free("a", 1.0, 0.1, 5)))
+        Problem(simulator, tuple(two), (FitParameter("k", 1.0, 0.1, 5), FitParameter("a", 1.0, 0.1, 5)))
 
 
 def test_a_nuisance_at_the_end_of_its_range_is_a_fit_on_a_bound():
@@ -124,11 +126,11 @@ def test_a_driven_slot_may_have_an_offset_too():
         measured=trajectory(TIME, {"Irorder2": plant["Irorder2"]}),
         event=0.1,
     )
-    result = fit(Problem(link(), (driven,), (Free("KIP", 25, 5, 50),)), starts=1)
+    result = fit(Problem(link(), (driven,), (FitParameter("KIP", 25, 5, 50),)), starts=1)
     assert result.status == "converged"
     assert result.nuisance["driven"]["Vac2"].value == pytest.approx(-0.02, abs=1e-5)
     assert result.values["KIP"] == pytest.approx(30.0, rel=2e-3)
-    blind = fit(Problem(link(), (driven.with_(nuisance=()),), (Free("KIP", 25, 5, 50),)), starts=1)
+    blind = fit(Problem(link(), (driven.with_(nuisance=()),), (FitParameter("KIP", 25, 5, 50),)), starts=1)
     assert abs(blind.values["KIP"] - 30.0) > 3 * abs(result.values["KIP"] - 30.0)
 
 

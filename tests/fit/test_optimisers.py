@@ -84,9 +84,9 @@ def test_where_nothing_can_be_simulated_the_run_fails_without_a_number(name):
 
 def decaying(fails):
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay}, fails)
-    from hvdc_ident.fit import Free, Problem
+    from hvdc_ident.fit import FitParameter, Problem
 
-    free = (Free("a", 1.0, 0.1, 10.0), Free("k", 1.0, 0.0, 20.0))
+    free = (FitParameter("a", 1.0, 0.1, 10.0), FitParameter("k", 1.0, 0.0, 20.0))
     return Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.rough import SLIGHT, TWO_SIDED, roughness, trend_of
 from hvdc_ident.identifiability.assess import identifiability
 from tests.fit.simulators import Closed, decay, parameters, recorded
@@ -16,7 +16,7 @@ from tests.fit.simulators import Closed, decay, parameters, recorded
 T = np.linspace(0.0, 3.0, 31)
 SIGMA = 0.02
 TRUTH = {"a": 2.0, "k": 1.5}
-FREE = (Free("a", 1.0, 0.1, 10.0), Free("k", 1.0, 0.1, 20.0))
+FREE = (FitParameter("a", 1.0, 0.1, 10.0), FitParameter("k", 1.0, 0.1, 20.0))
 
 
 @dataclass

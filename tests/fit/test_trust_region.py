@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import UnknownNameError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers import catalogue, optimiser
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
@@ -21,7 +21,7 @@ def problem(fails=lambda p: False, **bounds) -> Problem:
     """The decay 2 exp(-1.5 t) to be found, without noise."""
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": decay}, fails)
     limits = {"a": (0.1, 10.0), "k": (0.0, 20.0)} | bounds
-    free = (Free("a", 1.0, *limits["a"]), Free("k", 1.0, *limits["k"]))
+    free = (FitParameter("a", 1.0, *limits["a"]), FitParameter("k", 1.0, *limits["k"]))
     return Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
 
 
@@ -63,7 +63,7 @@ def test_bounded_linear_problems_end_as_an_exhaustive_search_does(seed):
         return matrix @ [values[n] for n in names], {n: matrix[:, i] for i, n in enumerate(names)}
 
     simulator = Closed(parameters(**dict.fromkeys(names, 0.0)), {"y": product})
-    free = tuple(Free(n, 0.0, -0.1, 0.1) for n in names)
+    free = tuple(FitParameter(n, 0.0, -0.1, 0.1) for n in names)
     one = Problem(simulator, (recorded("e", np.arange(12.0), {"y": 1.0}, y=y),), free)
     run = TrustRegion().run(one, one.start)
     best = lsq_linear(matrix, y, (-0.1, 0.1), method="bvls", tol=1e-14)
@@ -103,7 +103,7 @@ def test_sensitivities_that_are_wrong_do_not_pass_as_an_optimum():
         return y, {n: -v for n, v in g.items()}
 
     simulator = Closed(parameters(a=0.0, b=0.0), {"y": wrong})
-    free = (Free("a", 0.0, -5, 5), Free("b", 0.0, -5, 5))
+    free = (FitParameter("a", 0.0, -5, 5), FitParameter("b", 0.0, -5, 5))
     one = Problem(simulator, (recorded("e", T, {"y": 1.0}, y=1 + T),), free)
     run = TrustRegion().run(one, one.start)
     assert run.status == "stalled"
@@ -120,7 +120,7 @@ def clipped(t, p):
 def limited(start: float, truth: float = 0.3) -> Problem:
     y = clipped(T, {"g": truth})[0] + 1e-3 * np.random.default_rng(1).standard_normal(T.size)
     simulator = Closed(parameters(g=start), {"y": clipped})
-    return Problem(simulator, (recorded("e", T, {"y": 1e-3}, y=y),), (Free("g", start, -100.0, 100.0),))
+    return Problem(simulator, (recorded("e", T, {"y": 1e-3}, y=y),), (FitParameter("g", start, -100.0, 100.0),))
 
 
 def test_a_start_on_a_plateau_did_not_converge_and_the_others_decide():
@@ -151,7 +151,7 @@ def jagged(t, p):
 def test_a_cost_that_scatters_by_the_simulations_own_error_is_minimised_to_within_it(sigma):
     y = 2 * np.exp(-1.5 * T) + 0.1 * sigma * np.random.default_rng(3).standard_normal(T.size)
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": jagged})
-    free = (Free("a", 1.0, 0.1, 10), Free("k", 1.0, 0, 20))
+    free = (FitParameter("a", 1.0, 0.1, 10), FitParameter("k", 1.0, 0, 20))
     one = Problem(simulator, (recorded("e", T, {"y": sigma}, y=y),), free)
     run = TrustRegion().run(one, one.start)
     assert run.status == "converged", run.message
@@ -180,13 +180,13 @@ def test_the_lowest_cost_is_the_answer_whatever_stopped_the_run_that_reached_it(
 
 
 def test_scaling_follows_the_bounds():
-    assert Free("a", 2.0, 1.0, 11.0).log
-    assert not Free("a", 2.0, 1.0, 9.0).log
-    assert not Free("a", 2.0, 0.0, 9.0).log
-    assert Free("a", 2.0, 0.0, 8.0).span == 8.0
-    assert Free("a", 2.0).span == 2.0
-    assert Free("a", 1.0, 0.01, 100.0).draw(0.5) == pytest.approx(1.0)
-    assert Free("a", 1.0, 0.0).drawn == (0.0, 11.0)
+    assert FitParameter("a", 2.0, 1.0, 11.0).log
+    assert not FitParameter("a", 2.0, 1.0, 9.0).log
+    assert not FitParameter("a", 2.0, 0.0, 9.0).log
+    assert FitParameter("a", 2.0, 0.0, 8.0).span == 8.0
+    assert FitParameter("a", 2.0).span == 2.0
+    assert FitParameter("a", 1.0, 0.01, 100.0).draw(0.5) == pytest.approx(1.0)
+    assert FitParameter("a", 1.0, 0.0).drawn == (0.0, 11.0)
 
 
 def test_a_point_whose_sensitivities_overflow_is_walked_round():
@@ -195,7 +195,7 @@ def test_a_point_whose_sensitivities_overflow_is_walked_round():
         return y, {n: s * (1e200 if p["k"] > 1.2 else 1.0) for n, s in slopes.items()}
 
     simulator = Closed(parameters(a=1.0, k=1.0), {"y": blowing})
-    free = (Free("a", 1.0, 0.1, 10.0), Free("k", 1.0, 0.0, 20.0))
+    free = (FitParameter("a", 1.0, 0.1, 10.0), FitParameter("k", 1.0, 0.0, 20.0))
     found = Problem(simulator, (recorded("e", T, {"y": 0.1}, y=2 * np.exp(-1.5 * T)),), free)
     run = TrustRegion().run(found, np.array([1.0, 1.0]))
     assert run.status == "failed" and "grows beyond all bounds" in run.message
@@ -213,7 +213,7 @@ def test_without_bounds_a_start_far_off_in_size_finds_the_optimum(start):
     t = np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
     simulator = Closed(parameters(b1=start[0], b2=start[1]), {"y": saturating}, lambda p: p["b2"] < -30)
     y = saturating(t, {"b1": 214.0, "b2": 0.55})[0] + np.array([-5.0, 20.0, -20.0, 5.0, 3.0, -3.0])
-    free = (Free("b1", start[0]), Free("b2", start[1]))
+    free = (FitParameter("b1", start[0]), FitParameter("b2", start[1]))
     result = fit(Problem(simulator, (recorded("e", t, y=y),), free))
     from scipy.optimize import curve_fit
 
@@ -223,13 +223,13 @@ def test_without_bounds_a_start_far_off_in_size_finds_the_optimum(start):
 
 
 def test_starts_without_bounds_spread_over_the_sizes():
-    draws = [Free("a", 2.0).draw(s) for s in np.linspace(0, 1, 41)]
+    draws = [FitParameter("a", 2.0).draw(s) for s in np.linspace(0, 1, 41)]
     assert draws == sorted(draws) and min(draws) == pytest.approx(-18.0) and max(draws) == pytest.approx(22.0)
     sizes = np.abs(draws)
     assert (np.array(draws) > 0).mean() == pytest.approx(0.75, abs=0.03)
     assert (sizes < 0.2).sum() > 8 and (sizes > 2.0).sum() > 8
-    assert all(v >= 0 for v in (Free("a", 2.0, 0.0).draw(s) for s in (0.0, 0.5, 1.0)))
-    assert all(v <= 0 for v in (Free("a", -2.0, max=0.0).draw(s) for s in (0.0, 0.5, 1.0)))
+    assert all(v >= 0 for v in (FitParameter("a", 2.0, 0.0).draw(s) for s in (0.0, 0.5, 1.0)))
+    assert all(v <= 0 for v in (FitParameter("a", -2.0, max=0.0).draw(s) for s in (0.0, 0.5, 1.0)))
 
 
 def test_of_optima_that_differ_by_names_alone_the_one_next_to_the_start_is_told():
@@ -241,7 +241,7 @@ def test_of_optima_that_differ_by_names_alone_the_one_next_to_the_start_is_told(
     y = pair(T, {"k1": 0.5, "k2": 3.0})[0] + 0.01 * np.random.default_rng(1).standard_normal(T.size)
     for given in ({"y": 0.01}, {}):
         for start, first in (((0.4, 4.0), 0.5), ((4.0, 0.4), 3.0)):
-            free = (Free("k1", start[0], 0.01, 50), Free("k2", start[1], 0.01, 50))
+            free = (FitParameter("k1", start[0], 0.01, 50), FitParameter("k2", start[1], 0.01, 50))
             result = fit(Problem(simulator, (recorded("e", T, given, y=y),), free), starts=12)
             assert result.status == "two-optima"
             assert result.values["k1"] == pytest.approx(first, rel=0.1)

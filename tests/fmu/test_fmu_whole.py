@@ -14,7 +14,7 @@ from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.model import parse_card
 
@@ -146,7 +146,7 @@ def test_what_is_missing_at_an_input_is_found_there(whole):
         seen = np.column_stack([run[o] for o in ("y", "c")]) + 5e-3 * random.normal(size=(time.size, 2))
         measured = Trajectory(time, seen, ("y", "c"), ("", ""))
         records.append(experiment(name, time, {"r": r}, measured=measured, noise={"y": 5e-3, "c": 5e-3}))
-    free = [Free("kp", 2.5, 0.5, 8.0), Free("ki", 8.0, 2.0, 40.0)]
+    free = [FitParameter("kp", 2.5, 0.5, 8.0), FitParameter("ki", 8.0, 2.0, 40.0)]
     found = diagnose(load_model(whole.parent / "pi.fmu"), records, free, effects=["lag"], places=["r"])
     (effect,) = found.effects
     low, high = effect.parameters["T"].ci95

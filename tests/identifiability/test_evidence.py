@@ -10,7 +10,7 @@ from scipy.optimize import brentq, lsq_linear
 from scipy.stats import binom
 
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.bootstrap import bootstrap, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
@@ -25,7 +25,7 @@ from tests.fit.simulators import coloured, decay, line, recorded
 from tests.identifiability.cases import T, closed, measured, saturating
 
 LINE = closed(line, a=0.0, b=0.0)
-FREE = (Free("a", 0, -50, 50), Free("b", 0, -50, 50))
+FREE = (FitParameter("a", 0, -50, 50), FitParameter("b", 0, -50, 50))
 
 
 def slopes(values, noise=0.05, seed=0):
@@ -69,7 +69,7 @@ def test_bootstrap_and_sandwich_see_the_scatter_between_experiments() -> None:
 
 def test_a_pair_profile_of_a_quadratic_is_its_ellipse() -> None:
     a = np.array([[3.0, 1, 0.5], [1, 2, 0.2], [0, 0.3, 1], [1, 1, 1]])
-    unknowns = tuple(Free(n, 0, -9, 9) for n in "xyz")
+    unknowns = tuple(FitParameter(n, 0, -9, 9) for n in "xyz")
     grid = np.linspace(-1, 1, 5)
     found = profile_pair(LeastSquares(unknowns, lambda t: (a @ t, a)), np.zeros(3), ("x", "y"), grid, grid, enough=1e-9)
     inverse = np.linalg.inv(np.linalg.inv(a.T @ a)[:2, :2])
@@ -91,7 +91,7 @@ def test_null_directions_in_words(direction, words) -> None:
 def coverage(rho: float, given: bool, runs: int) -> dict[str, int]:
     """How often the profile's interval holds the truth; closed in every run."""
     plant = closed(decay, a=1.0, k=1.0)
-    free = (Free("a", 2, 0.1, 20), Free("k", 3, 0.1, 30))
+    free = (FitParameter("a", 2, 0.1, 20), FitParameter("k", 3, 0.1, 30))
     truth = {"a": 2.0, "k": 3.0}
     hits = dict.fromkeys(truth, 0)
     for seed in range(runs):
@@ -122,7 +122,7 @@ def test_profile_intervals_hold_the_truth_in_coloured_noise() -> None:
 def test_two_on_their_bounds_together_get_limits_that_cover() -> None:
     """y = a + b t with a, b >= 0 and both 0: the limit of b, from a bootstrap, holds 0 always and is not too wide."""
     plant = closed(line, a=Parameter(0.1, min=0.0), b=Parameter(0.1, min=0.0))
-    free = [Free("a", 0.1, 0.0, 9.0), Free("b", 0.1, 0.0, 9.0)]
+    free = [FitParameter("a", 0.1, 0.0, 9.0), FitParameter("b", 0.1, 0.0, 9.0)]
     for seed in range(40):
         report = identifiability(plant, [measured(plant, {"a": -0.02, "b": -0.02}, 0.05, seed)], free, starts=1)
         if all(v.verdict == "at-bound" for v in report.parameters.values()):
@@ -138,7 +138,7 @@ def test_two_on_their_bounds_together_get_limits_that_cover() -> None:
 
 def test_the_bootstrap_of_one_on_its_bound_is_the_known_quantile() -> None:
     plant = closed(line, a=0.0, b=Parameter(0.1, min=0.0))
-    free = (Free("a", 0.0, -9, 9), Free("b", 0.1, 0.0, 9.0))
+    free = (FitParameter("a", 0.0, -9, 9), FitParameter("b", 0.1, 0.0, 9.0))
     optimum, _ = pilot(Problem(plant, (measured(plant, {"a": 1, "b": 0.0}, 0.05),), free), starts=1)
     assert bootstrap_rise(optimum, "b", 5.0) == pytest.approx(1.353, rel=0.15)
 
@@ -156,7 +156,7 @@ def test_a_limit_far_from_its_bound_is_not_read_at_the_bound_where_several_are_o
     y = 2.0 - 0.02 * t + 0.02 * np.random.default_rng(5).normal(size=t.size)
     y[:3] += 0.02  # no slower than a step
     data = recorded("e", t, {"y": 0.02}, y=y)
-    free = [Free("a", 1, 0.1, 10), Free("k", 1e5, 1e-3, 1e5), Free("c", 0.1, 0.0, 5.0)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 1e5, 1e-3, 1e5), FitParameter("c", 0.1, 0.0, 5.0)]
     report = identifiability(closed(plateau, a=1.0, **physical), [data], free, starts=4)
     assert {n for n, v in report.parameters.items() if v.verdict == "at-bound"} == {"k", "c"}
 
@@ -177,7 +177,7 @@ def test_identify_and_fit_call_the_same_misfit_larger_than_the_noise(tone, flagg
     record = measured(simulator, {"a": 2.0, "k": 3.0}, 0.01)
     y = record.measured["y"] + 0.01 * tone * np.sin(2 * np.pi * 7.0 * record.time)
     record = recorded("e", record.time, {"y": 0.01}, y=y)
-    problem = Problem(simulator, (record,), (Free("a", 2.0, 0.1, 10.0), Free("k", 3.0, 0.1, 20.0)))
+    problem = Problem(simulator, (record,), (FitParameter("a", 2.0, 0.1, 10.0), FitParameter("k", 3.0, 0.1, 20.0)))
     result = fit(problem, starts=1)
     at = Optimum(problem, np.array([result.values["a"], result.values["k"]]))
     assert at.excess == pytest.approx(result.adequacy.widening)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
 from hvdc_ident.errors import UnknownNameError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import line
@@ -25,7 +25,7 @@ def both(plant, data, free, force=()):
 
 def test_members_of_a_combination_are_conditional_on_the_held() -> None:
     plant = closed(product, a=2.0, b=3.0, c=1.0)
-    free = [Free("a", 2, 0.1, 20), Free("b", 3, 0.1, 20), Free("c", 1, -5, 5)]
+    free = [FitParameter("a", 2, 0.1, 20), FitParameter("b", 3, 0.1, 20), FitParameter("c", 1, -5, 5)]
     _, found = both(plant, [measured(plant, {"a": 2.5}, 0.01)], free)
     assert found.fitted == ("a", "c") and found.status == "converged"
     assert "structurally-unidentifiable, held at 3" in found.held["b"]
@@ -35,7 +35,7 @@ def test_members_of_a_combination_are_conditional_on_the_held() -> None:
 
 def test_weak_ones_have_an_interval_and_no_std() -> None:
     plant = closed(line, a=1.0, b=1.0)
-    free = [Free("a", 1, 0.1, 50), Free("b", 1, 0.01, 50)]
+    free = [FitParameter("a", 1, 0.1, 50), FitParameter("b", 1, 0.01, 50)]
     report, found = both(plant, [measured(plant, {"a": 5, "b": 1.5}, 2.0, t=np.linspace(0, 1, 80))], free)
     b = found.estimates["b"]
     assert b.std is None and b.std_raw is None and b.method == "profile" and b.reason.startswith("weak")
@@ -45,7 +45,7 @@ def test_weak_ones_have_an_interval_and_no_std() -> None:
 
 def test_one_at_a_bound_stands_there_with_its_limit() -> None:
     plant = closed(line, a=Parameter(1.0), b=Parameter(0.5, min=0.0))
-    free = [Free("a", 1, -5, 5), Free("b", 0.5, 0.0, 5.0)]
+    free = [FitParameter("a", 1, -5, 5), FitParameter("b", 0.5, 0.0, 5.0)]
     _, found = both(plant, [measured(plant, {"a": 1, "b": -0.05}, 0.05)], free)
     assert found.fitted == ("a",) and "b" in found.held
     b = found.estimates["b"]
@@ -54,7 +54,7 @@ def test_one_at_a_bound_stands_there_with_its_limit() -> None:
 
 def test_forced_ones_are_fitted_and_marked() -> None:
     plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
-    free = [Free("a", 0, -5, 5), Free("b", 0, -5, 5), Free("c", 1.0, -100, 100)]
+    free = [FitParameter("a", 0, -5, 5), FitParameter("b", 0, -5, 5), FitParameter("c", 1.0, -100, 100)]
     data = [measured(plant, {"a": 1, "b": 2}, 0.01)]
     report, found = both(plant, data, free, force=("c",))
     assert set(found.fitted) == {"a", "b", "c"} and "forced" in found.estimates["c"].reason
@@ -65,7 +65,7 @@ def test_forced_ones_are_fitted_and_marked() -> None:
 
 def test_nothing_identifiable_is_no_success() -> None:
     plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
-    free = [Free("c", 1.0, -100, 100)]
+    free = [FitParameter("c", 1.0, -100, 100)]
     _, found = both(plant, [measured(plant, {}, 0.01)], free)
     assert found.status == "failed" and found.fitted == () and "insensitive" in found.held["c"]
 

@@ -8,7 +8,7 @@ import pytest
 
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit import Free, Group
+from hvdc_ident.fit import FitParameter, Group
 from hvdc_ident.identifiability import identifiability, identifiability_by_group
 from tests.identifiability.cases import on_model, pi_loop
 
@@ -18,7 +18,7 @@ GROUPS = [Group(("a", "b"), ("y",)), Group(("kp", "ki"), ("control",))]
 
 def case(outputs=("y", "control")):
     model = pi_loop()
-    free = [Free(n, v, v / 10, v * 10) for n, v in model.values.items()]
+    free = [FitParameter(n, v, v / 10, v * 10) for n, v in model.values.items()]
     return model, [on_model(model, "e", STEP, list(outputs), 1e-3)], free
 
 
@@ -41,7 +41,7 @@ def test_every_group_is_judged_on_its_own_data() -> None:
 
 def test_later_groups_hold_what_earlier_ones_found() -> None:
     model, data, free = case()
-    begun = [Free("a", 0.4, 0.08, 8), Free("b", 0.9, 0.15, 15), *free[2:]]
+    begun = [FitParameter("a", 0.4, 0.08, 8), FitParameter("b", 0.9, 0.15, 15), *free[2:]]
     report = identifiability_by_group(model, data, begun, GROUPS, starts=2)
     first = {n: report.parameters[n].value for n in ("a", "b")}
     seen = [data[0].with_(measured=data[0].measured.select(["control"]))]
@@ -52,7 +52,7 @@ def test_later_groups_hold_what_earlier_ones_found() -> None:
 
 def test_one_report_in_json_with_advice_for_who_needs_it() -> None:
     model, _, free = case()
-    still = [Free("a", 0.8, 0.799, 0.801), *free[1:]]  # its range is too small to be seen in coarse data
+    still = [FitParameter("a", 0.8, 0.799, 0.801), *free[1:]]  # its range is too small to be seen in coarse data
     coarse = [on_model(model, "e", STEP, ["y", "control"], 0.05)]
     groups = [Group(("kp", "ki"), ("control",)), Group(("b", "a"), ("y",))]
     report = identifiability_by_group(model, coarse, still, groups, pair=("a", "kp"), starts=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import identifiability
 from tests.fit.simulators import recorded
 from tests.identifiability.cases import T, closed
@@ -20,7 +20,7 @@ def growing(t, p):
 
 def test_runs_that_overflow_when_squared_are_passed_over() -> None:
     y = 2.0 * np.exp(-3.0 * T) + 1e-3 * np.random.default_rng(0).normal(size=T.size)
-    free = [Free("a", -1.0, -10.0, 700.0), Free("b", 1.0, 0.1, 10.0)]
+    free = [FitParameter("a", -1.0, -10.0, 700.0), FitParameter("b", 1.0, 0.1, 10.0)]
     report = identifiability(closed(growing, a=-1.0, b=1.0), [recorded("e", T, {"y": 1e-3}, y=y)], free, starts=6)
     for name, truth in (("a", -3.0), ("b", 2.0)):
         verdict = report.parameters[name]
@@ -38,7 +38,7 @@ def narrow_pass(t, p):
 def test_a_weak_parameter_is_held_at_another_value_where_its_given_one_cannot_be_run() -> None:
     """At its start, 4, the others cannot be at their optimum, b = 5."""
     y = 1.0 + 5.0 * T + 1e-2 * np.random.default_rng(0).normal(size=T.size)
-    free = [Free("a", 0.0, -5.0, 5.0), Free("b", 1.0, 0.1, 20.0), Free("c", 4.0, 0.01, 7.0)]
+    free = [FitParameter("a", 0.0, -5.0, 5.0), FitParameter("b", 1.0, 0.1, 20.0), FitParameter("c", 4.0, 0.01, 7.0)]
     report = identifiability(
         closed(narrow_pass, a=0.0, b=1.0, c=4.0), [recorded("e", T, {"y": 1e-2}, y=y)], free, starts=6
     )

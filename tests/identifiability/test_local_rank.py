@@ -11,7 +11,7 @@ import pytest
 
 from hvdc_ident.data import Experiment, InputSignal
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.combinations import held_of
@@ -52,7 +52,7 @@ def sampled_loop():
 
 
 def problem_on(model, outputs):
-    free = tuple(Free(n, 1.2 * v, v / 2, v * 2) for n, v in model.values.items())
+    free = tuple(FitParameter(n, 1.2 * v, v / 2, v * 2) for n, v in model.values.items())
     data = on_model(model, "e", {"r": STEPS}, outputs, 1e-3, rows=121)
     return Problem(ModelSimulator(model), (data,), free)
 
@@ -73,7 +73,9 @@ def test_delays_and_sampling_are_decided_by_numbers_and_labelled_local(make) -> 
 def test_the_report_says_local_where_it_is() -> None:
     model = delayed_loop()
     data = on_model(model, "e", {"r": STEPS}, ["y"], 1e-3, rows=121)
-    report = identifiability(model, [data], [Free(n, v, v / 2, v * 2) for n, v in model.values.items()], starts=1)
+    report = identifiability(
+        model, [data], [FitParameter(n, v, v / 2, v * 2) for n, v in model.values.items()], starts=1
+    )
     assert report.parameters["ki"].reason.startswith("At every point tried, only")
     assert report.to_dict()["structural"]["method"] == "numerical, local"
     assert any("Structure decided: from the sensitivities at random points" in n for n in report.notes)
@@ -103,7 +105,7 @@ PUSH = InputSignal.corners([(0, 0.0), (1, 0.0), (1, 1.0), (4, 1.0), (4, -0.5)])
 def test_both_routes_hold_the_last_listed_that_will_do(order) -> None:
     """k, m and d are seen in two ratios: any one will do to hold, however much more strongly another is seen."""
     data = on_model(SPRING, "e", {"u": PUSH}, ["y"], 1e-3, rows=121)
-    free = tuple(Free(n, SPRING.values[n], SPRING.values[n] / 3, SPRING.values[n] * 3) for n in order)
+    free = tuple(FitParameter(n, SPRING.values[n], SPRING.values[n] / 3, SPRING.values[n] * 3) for n in order)
     problem = Problem(ModelSimulator(SPRING), (data,), free)
     by_equations, by_numbers = structure(SPRING, problem), numerical_structure(problem)
     assert by_equations.method == "prime field" and by_numbers.method == "numerical, local"
@@ -150,7 +152,7 @@ def test_differences_with_their_error_stated_see_what_exact_sensitivities_see() 
     exact = closed(product, a=2.0, b=3.0, c=1.0)
     rough = Differences(exact)
     assert sensitivity_error(exact) == 1e-6 and sensitivity_error(rough) == 1e-4
-    free = (Free("a", 2, 0.5, 5), Free("b", 3, 0.5, 5), Free("c", 1, -5, 5))
+    free = (FitParameter("a", 2, 0.5, 5), FitParameter("b", 3, 0.5, 5), FitParameter("c", 1, -5, 5))
     data = measured(exact, {"a": 2.5}, 0.01)
     found = local_rank(Problem(rough, (data,), free))
     assert found.points == 6 and found.independent == ("a", "c") and "good to 0.0001" in found.note
@@ -168,7 +170,7 @@ def test_differences_with_their_error_stated_see_what_exact_sensitivities_see() 
 def test_points_that_cannot_be_simulated_are_counted() -> None:
     exact = closed(product, a=2.0, b=3.0, c=1.0)
     data = measured(exact, {"a": 2.5}, 0.01)
-    free = (Free("a", 2, 0.5, 5), Free("b", 3, 0.5, 5), Free("c", 1, -5, 5))
+    free = (FitParameter("a", 2, 0.5, 5), FitParameter("b", 3, 0.5, 5), FitParameter("c", 1, -5, 5))
     exact.fails = lambda p: p["c"] > 0
     found = local_rank(Problem(exact, (data,), free))
     assert 0 < found.points < 5 and f"{5 - found.points} of 5 random points could not be simulated" in found.note

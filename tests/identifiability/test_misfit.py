@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident.data import InputSignal
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.model import Model
@@ -30,7 +30,12 @@ def curves(t, p):
 
 
 PLANT = closed(curves, a=1.0, b=1.0, c=0.0, d=0.0)
-FREE = (Free("a", 1, -5, 5), Free("b", 1, -5, 5), Free("c", 0.0, -1, 1), Free("d", 0.0, -1, 1))
+FREE = (
+    FitParameter("a", 1, -5, 5),
+    FitParameter("b", 1, -5, 5),
+    FitParameter("c", 0.0, -1, 1),
+    FitParameter("d", 0.0, -1, 1),
+)
 
 
 def report_on(hidden):
@@ -116,7 +121,7 @@ def test_a_damping_that_the_misfit_hides_is_right_beside_the_effect_that_is_name
         machine_record("down", [(1.0, 0.56)]),
         machine_record("other", [(1.0, 0.68), (12.0, 0.63)], role="holdout"),
     ]
-    free = [Free("H", 5.0, 0.5, 20), Free("D", 2.0, 0.1, 3), Free("R", 0.06, 0.005, 0.5)]
+    free = [FitParameter("H", 5.0, 0.5, 20), FitParameter("D", 2.0, 0.1, 3), FitParameter("R", 0.06, 0.005, 0.5)]
     report = identifiability(MACHINE, data, free, starts=2)
     assert "D" in report.not_judged
     found = diagnose(MACHINE, data, free, effects=["deadband", "gain", "coupling"], report=report.to_dict())
@@ -148,7 +153,9 @@ def test_a_misfit_is_told_first_and_beside_every_interval() -> None:
 def test_a_weak_verdict_that_the_misfit_makes_says_so_and_takes_no_bound_for_a_finding(high) -> None:
     plant = closed(lambda t, p: (p["k"] * t, {"k": t}), k=Parameter(1.0, min=0.1, max=high))
     y = 2.0 * T + 0.2 * np.sin(12.0 * T) + NOISE * np.random.default_rng(1).normal(size=T.size)
-    report = identifiability(plant, [recorded("e", T, {"y": NOISE}, y=y)], [Free("k", 1.0, 0.1, high)], starts=2)
+    report = identifiability(
+        plant, [recorded("e", T, {"y": NOISE}, y=y)], [FitParameter("k", 1.0, 0.1, high)], starts=2
+    )
     k = report.parameters["k"]
     assert k.verdict == "weak" and k.ci95[0] == 0.1
     whole = k.ci95[1] == high

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import recorded
@@ -23,7 +23,7 @@ COLUMNS = np.column_stack([np.ones_like(T), T, 1e-6 * T**2])
 def test_the_start_does_not_decide(start) -> None:
     """Intervals of a linear model are those of the normal equations, however far off the search began."""
     plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
-    report = identifiability(plant, [DATA], [Free(n, start) for n in "abc"], starts=3)
+    report = identifiability(plant, [DATA], [FitParameter(n, start) for n in "abc"], starts=3)
     covariance = NOISE**2 * np.linalg.inv(COLUMNS.T @ COLUMNS)
     best = np.linalg.lstsq(COLUMNS, Y)[0]
     for i, (n, verdict) in enumerate(zip("abc", ["identifiable", "identifiable", "weak"], strict=True)):
@@ -42,7 +42,7 @@ def silent(t, p):
 @pytest.mark.parametrize(("low", "said"), [(0.0, "Anywhere between 0 and"), (-math.inf, "Anywhere between -")])
 def test_one_without_effect_is_said_to_have_none_over_a_range_that_is_told(low, said) -> None:
     plant = closed(silent, a=1.0, c=Parameter(1.0, min=low))
-    report = identifiability(plant, [DATA], [Free("a", 1.0), Free("c", 1.0, low)], starts=1)
+    report = identifiability(plant, [DATA], [FitParameter("a", 1.0), FitParameter("c", 1.0, low)], starts=1)
     reason = report.parameters["c"].reason
     assert report.parameters["c"].verdict == "insensitive"
     assert reason.startswith(said) and "the outputs do not change at all" in reason
@@ -59,7 +59,7 @@ def test_a_positive_rate_without_upper_bound_is_walked_in_its_logarithm() -> Non
     t = np.linspace(0.2, 1.0, 41)
     y = 2.0 + 0.02 * np.random.default_rng(0).normal(size=t.size)
     plant = closed(decades, a=1.0, k=Parameter(10.0, min=1e-3))
-    free = [Free("a", 1, 0.1, 10), Free("k", 30.0, 1e-3)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 30.0, 1e-3)]
     report = identifiability(plant, [recorded("e", t, {"y": 0.02}, y=y)], free, starts=1)
     k = report.parameters["k"]
     assert k.verdict == "practically-unidentifiable" and k.ci95[1] is None
@@ -69,7 +69,7 @@ def test_a_positive_rate_without_upper_bound_is_walked_in_its_logarithm() -> Non
 def test_an_interval_stays_within_the_bounds() -> None:
     plant = closed(line_and_nothing, a=1.0, b=Parameter(1.0, min=0.0), c=0.0)
     y = 1.0 + 0.005 * T + NOISE * np.random.default_rng(4).normal(size=T.size)
-    free = (Free("a", 1.0), Free("b", 1.0, 0.0))
+    free = (FitParameter("a", 1.0), FitParameter("b", 1.0, 0.0))
     result = fit(Problem(plant, (recorded("e", T, {"y": NOISE}, y=y),), free), starts=1)
     b = result.estimates["b"]
     assert b.value > 0 and b.value - 1.96 * b.std < 0

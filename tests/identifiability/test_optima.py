@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.identifiability import gated_fit, identifiability
 from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
@@ -25,7 +25,7 @@ LAGS = Model(
     states={"x": "(k*u - x)/T1", "y": "(x - y)/T2"},
     outputs={"between": "x", "out": "y"},
 )
-FREE = (Free("T1", 0.4, 0.05, 5.0), Free("T2", 0.7, 0.05, 5.0), Free("k", 1.0, 0.1, 10.0))
+FREE = (FitParameter("T1", 0.4, 0.05, 5.0), FitParameter("T2", 0.7, 0.05, 5.0), FitParameter("k", 1.0, 0.1, 10.0))
 
 
 def step_record(*outputs):
@@ -75,7 +75,7 @@ def test_a_sign_that_does_not_show_is_said_where_the_bounds_admit_it(low, verdic
     y = 4.0 * TIME + 1.0 + 0.01 * np.random.default_rng(0).normal(size=TIME.size)
     data = recorded("e", TIME, {"y": 0.01}, y=y)
     report = identifiability(
-        closed(squared, a=1.0, b=0.0), [data], [Free("a", 1, low, 10), Free("b", 0, -5, 5)], starts=1
+        closed(squared, a=1.0, b=0.0), [data], [FitParameter("a", 1, low, 10), FitParameter("b", 0, -5, 5)], starts=1
     )
     a = report.parameters["a"]
     assert a.verdict == verdict and a.value == pytest.approx(2.0, abs=0.01)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.merit import half_widths, merit
@@ -20,7 +20,7 @@ from hvdc_ident.simulate import ModelSimulator
 from tests.fit.simulators import line
 from tests.identifiability.cases import closed, measured, on_model, pi_loop
 
-FREE = [Free("a", 0.9, 0.1, 8), Free("k", 1.2, 0.1, 15)]
+FREE = [FitParameter("a", 0.9, 0.1, 8), FitParameter("k", 1.2, 0.1, 15)]
 
 
 def two_inputs():
@@ -50,7 +50,7 @@ def test_the_input_that_shows_what_is_not_seen_is_recommended() -> None:
 def test_the_predicted_interval_is_what_the_experiment_gives() -> None:
     """Made as advised, the recommended experiment gives the half-width that was predicted (k is held at its true value)."""
     model = two_inputs()
-    free = [FREE[0], Free("k", 1.5, 0.1, 15)]
+    free = [FREE[0], FitParameter("k", 1.5, 0.1, 15)]
     first = on_model(model, "e", {"u": InputSignal.step(1.0, 0.0, 1.0)}, ["y"], 1e-3)
     report = identifiability(model, [first], free, starts=2)
     trial = report.recommended.best.trial
@@ -64,7 +64,7 @@ def test_the_predicted_interval_is_what_the_experiment_gives() -> None:
 
 def test_a_signal_is_recommended_where_only_it_tells_a_combination_apart() -> None:
     model = pi_loop()
-    free = [Free(n, 1.3 * v, v / 10, v * 10) for n, v in model.values.items()]
+    free = [FitParameter(n, 1.3 * v, v / 10, v * 10) for n, v in model.values.items()]
     found = report_of(model, {"r": InputSignal.step(1.0, 0.0, 1.0)}, free=free).recommended
     assert found.best.new == ("control",) and found.best.then.seen == 4 > found.now.seen
     assert "recording control besides" in found.text
@@ -123,7 +123,7 @@ def test_a_simulator_without_inputs_has_nothing_to_recommend() -> None:
     plant = closed(line, a=0.0, b=0.0)
     data = measured(plant, {"a": 1, "b": 2}, 0.1)
     assert inputs_of(plant, [data]) == {}
-    report = identifiability(plant, [data], [Free("a", 1, -50, 50), Free("b", 1, -50, 50)], starts=1)
+    report = identifiability(plant, [data], [FitParameter("a", 1, -50, 50), FitParameter("b", 1, -50, 50)], starts=1)
     assert report.recommended is None and report.to_dict()["recommended_experiment"] is None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.model import Model, State
 from hvdc_ident.parameters import Parameter
@@ -35,7 +35,7 @@ def behind_an_integrator(name, output, **values):
 
 def judged(model, data, **ranges):
     """The report on candidates with (start, min, max)."""
-    return identifiability(model, [data], [Free(n, *r) for n, r in ranges.items()], starts=4)
+    return identifiability(model, [data], [FitParameter(n, *r) for n, r in ranges.items()], starts=4)
 
 
 def test_a_level_that_the_record_shows_as_a_flat_top_is_told() -> None:

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import ComputationError, UnknownNameError
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import identifiability
 from tests.fit.simulators import line
 from tests.identifiability.cases import closed, line_and_nothing, measured
 
 mpl.use("Agg")
 LINE = closed(line, a=0.0, b=0.0)
-FREE = (Free("a", 0, -50, 50), Free("b", 0, -50, 50))
+FREE = (FitParameter("a", 0, -50, 50), FitParameter("b", 0, -50, 50))
 
 
 def runs(slopes, noise=0.05):
@@ -26,7 +26,7 @@ def runs(slopes, noise=0.05):
 @pytest.fixture(scope="module")
 def report():
     plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
-    free = [Free("a", 0.5, 0.1, 5), Free("b", 0, -5, 5), Free("c", 1.0, -100, 100)]
+    free = [FitParameter("a", 0.5, 0.1, 5), FitParameter("b", 0, -5, 5), FitParameter("c", 1.0, -100, 100)]
     return identifiability(plant, [measured(plant, {"a": 1, "b": 2}, 0.01)], free, starts=1)
 
 

@@ -10,7 +10,7 @@ import pytest
 from hvdc_ident import load_model
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError, SimulationError, StudyError
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import decay, line
@@ -30,7 +30,10 @@ from tests.identifiability.cases import (
 def test_identifiable() -> None:
     plant = closed(decay, a=1.0, k=1.0)
     report = identifiability(
-        plant, [measured(plant, {"a": 2, "k": 3}, 0.01)], [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)], starts=3
+        plant,
+        [measured(plant, {"a": 2, "k": 3}, 0.01)],
+        [FitParameter("a", 1, 0.1, 10), FitParameter("k", 1, 0.1, 10)],
+        starts=3,
     )
     assert [v.verdict for v in report.parameters.values()] == ["identifiable"] * 2
     assert report.identifiable == ("a", "k") and not report.held and not report.combinations
@@ -42,7 +45,7 @@ def test_identifiable() -> None:
 
 def test_structurally_unidentifiable_by_numbers() -> None:
     plant = closed(product, a=2.0, b=3.0, c=1.0)
-    free = [Free("a", 2, 0.1, 20), Free("b", 3, 0.1, 20), Free("c", 1, -5, 5)]
+    free = [FitParameter("a", 2, 0.1, 20), FitParameter("b", 3, 0.1, 20), FitParameter("c", 1, -5, 5)]
     report = identifiability(plant, [measured(plant, {"a": 2.5}, 0.01)], free, starts=3)
     assert {n: v.verdict for n, v in report.parameters.items()} == {
         "a": "structurally-unidentifiable",
@@ -58,7 +61,7 @@ def test_structurally_unidentifiable_by_numbers() -> None:
 @pytest.mark.parametrize("outputs", [["y"], ["y", "control"]])
 def test_structurally_unidentifiable_on_a_loop(outputs) -> None:
     model = pi_loop()
-    free = [Free(n, 1.3 * v, v / 10, v * 10) for n, v in model.values.items()]
+    free = [FitParameter(n, 1.3 * v, v / 10, v * 10) for n, v in model.values.items()]
     report = identifiability(model, [on_model(model, "e", {"r": STEPS}, outputs, 1e-3)], free, starts=4)
     if outputs == ["y"]:
         assert {n for n, v in report.parameters.items() if v.verdict == "structurally-unidentifiable"} == {
@@ -80,7 +83,7 @@ def test_structurally_unidentifiable_on_a_loop(outputs) -> None:
 
 def test_insensitive_is_confirmed_at_both_ends() -> None:
     plant = closed(line_and_nothing, a=1.0, b=1.0, c=0.0)
-    free = [Free("a", 0, -5, 5), Free("b", 0, -5, 5), Free("c", 1.0, -100, 100)]
+    free = [FitParameter("a", 0, -5, 5), FitParameter("b", 0, -5, 5), FitParameter("c", 1.0, -100, 100)]
     report = identifiability(plant, [measured(plant, {"a": 1, "b": 2}, 0.01)], free, starts=2)
     c = report.parameters["c"]
     assert c.verdict == "insensitive" and c.value == 1.0 and report.held["c"][0] == 1.0
@@ -90,7 +93,7 @@ def test_insensitive_is_confirmed_at_both_ends() -> None:
 def test_practically_unidentifiable_where_the_profile_stays_open() -> None:
     plant = closed(saturating, a=1.0, k=20.0)
     t = np.linspace(0.2, 1.0, 41)
-    free = [Free("a", 1, 0.1, 10), Free("k", 10, 1, 1000)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 10, 1, 1000)]
     report = identifiability(plant, [measured(plant, {"a": 2, "k": 60}, 0.02, t=t)], free, starts=3)
     k = report.parameters["k"]
     assert k.verdict == "practically-unidentifiable" and "from above" in k.reason and k.ci95[1] is None
@@ -102,7 +105,7 @@ def test_practically_unidentifiable_where_the_profile_stays_open() -> None:
 def test_practically_unidentifiable_from_a_start_that_the_data_admit_is_held_there() -> None:
     plant = closed(saturating, a=1.0, k=20.0)
     t = np.linspace(0.2, 1.0, 41)
-    free = [Free("a", 1, 0.1, 10), Free("k", 250, 1, 1000)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 250, 1, 1000)]
     report = identifiability(plant, [measured(plant, {"a": 2, "k": 60}, 0.02, t=t)], free, starts=3)
     assert report.parameters["k"].verdict == "practically-unidentifiable"
     assert report.identifiable == ("a",) and report.held["k"][0] == 250.0
@@ -110,7 +113,7 @@ def test_practically_unidentifiable_from_a_start_that_the_data_admit_is_held_the
 
 def test_weak_is_fitted_but_has_no_std() -> None:
     plant = closed(line, a=1.0, b=1.0)
-    free = [Free("a", 1, 0.1, 50), Free("b", 1, 0.01, 50)]
+    free = [FitParameter("a", 1, 0.1, 50), FitParameter("b", 1, 0.01, 50)]
     report = identifiability(plant, [measured(plant, {"a": 5, "b": 1.5}, 2.0, t=np.linspace(0, 1, 80))], free, starts=2)
     b = report.parameters["b"]
     assert b.verdict == "weak" and b.std is None and b.relative_std is None and "known only to lie in" in b.reason
@@ -119,7 +122,7 @@ def test_weak_is_fitted_but_has_no_std() -> None:
 
 def test_at_bound_has_a_one_sided_limit_and_is_held() -> None:
     plant = closed(line, a=Parameter(1.0), b=Parameter(0.5, min=0.0))
-    free = [Free("a", 1, -5, 5), Free("b", 0.5, 0.0, 5.0)]
+    free = [FitParameter("a", 1, -5, 5), FitParameter("b", 0.5, 0.0, 5.0)]
     report = identifiability(plant, [measured(plant, {"a": 1, "b": -0.05}, 0.05)], free, starts=2)
     b = report.parameters["b"]
     assert b.verdict == "at-bound" and b.value == 0.0 and b.ci95[0] == 0.0 and 0 < b.ci95[1] < 0.1
@@ -130,7 +133,7 @@ def test_the_link_at_its_bound_and_with_a_flat_gain() -> None:
     model = load_model("vsc-hvdc-link")
     step = {"Pref2": InputSignal.step(0.1, 0.4, 0.5)}
     data = on_model(model, "p", step, ["Irorder2", "Iiorder2"], 1e-4, end=0.5, rows=251)
-    free = [Free("KIP", 25, 5, 50), Free("KPP", 0.1, 0, 2), Free("KIQ2", 20, 5, 50)]
+    free = [FitParameter("KIP", 25, 5, 50), FitParameter("KPP", 0.1, 0, 2), FitParameter("KIQ2", 20, 5, 50)]
     report = identifiability(model, [data], free, starts=3)
     assert {n: v.verdict for n, v in report.parameters.items()} == {
         "KIP": "identifiable",
@@ -146,7 +149,7 @@ def test_the_link_at_its_bound_and_with_a_flat_gain() -> None:
 def test_to_dict_is_the_json() -> None:
     plant = closed(decay, a=1.0, k=1.0)
     data = [measured(plant, {"a": 2, "k": 3}, 0.01, seed=s, name=f"e{s}") for s in range(3)]
-    free = [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 1, 0.1, 10)]
     found = identifiability(plant, data, free, starts=2).to_dict()
     wanted = "parameters identifiable combinations collinearity correlation structural misspecified experiments"
     assert {*wanted.split(), "recommended_experiment"} <= set(found)
@@ -159,7 +162,7 @@ def test_to_dict_is_the_json() -> None:
 def test_a_pair_has_a_common_profile_where_both_are_fitted() -> None:
     plant = closed(decay, a=1.0, k=1.0)
     data = [measured(plant, {"a": 2, "k": 3}, 0.01)]
-    free = [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 1, 0.1, 10)]
     found = identifiability(plant, data, free, starts=2, pair=("k", "a"))
     assert found.pair is not None and found.pair.names == ("k", "a")
     middle = found.pair.rises[6, 6]
@@ -172,7 +175,7 @@ def test_a_pair_has_a_common_profile_where_both_are_fitted() -> None:
 
 def test_data_without_noise_say_so() -> None:
     plant = closed(decay, a=1.0, k=1.0)
-    free = [Free("a", 1, 0.1, 10), Free("k", 1, 0.1, 10)]
+    free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 1, 0.1, 10)]
     report = identifiability(plant, [measured(plant, {"a": 2, "k": 3}, 0.0)], free, starts=2)
     assert any("no noise" in n for n in report.notes) and report.identifiable == ("a", "k")
     assert "no noise" in report.parameters["k"].reason
@@ -181,7 +184,7 @@ def test_data_without_noise_say_so() -> None:
 def test_no_excitation_says_so() -> None:
     model = pi_loop()
     data = on_model(model, "still", {"r": InputSignal.constant(0.0)}, ["y"], 1e-3)
-    report = identifiability(model, [data], [Free("a", 1, 0.1, 10), Free("kp", 1, 0.1, 10)], starts=2)
+    report = identifiability(model, [data], [FitParameter("a", 1, 0.1, 10), FitParameter("kp", 1, 0.1, 10)], starts=2)
     assert report.identifiable == () and any("No input moves" in n for n in report.notes)
     for v in report.parameters.values():
         assert v.verdict in ("insensitive", "structurally-unidentifiable")
@@ -190,10 +193,10 @@ def test_no_excitation_says_so() -> None:
 def test_more_unknowns_than_rows() -> None:
     plant = closed(line, a=1.0, b=1.0)
     data = measured(plant, {"a": 1, "b": 2}, 0.1, t=np.array([0.5]))
-    report = identifiability(plant, [data], [Free("a", 1, -50, 50), Free("b", 1, -50, 50)], starts=2)
+    report = identifiability(plant, [data], [FitParameter("a", 1, -50, 50), FitParameter("b", 1, -50, 50)], starts=2)
     assert len(report.identifiable) == 1 and any("1 measured values cannot" in n for n in report.notes)
     data = measured(plant, {"a": 1, "b": 2}, 0.1, t=np.array([0.0, 0.5]))
-    report = identifiability(plant, [data], [Free("a", 1, -50, 50), Free("b", 1, -50, 50)], starts=2)
+    report = identifiability(plant, [data], [FitParameter("a", 1, -50, 50), FitParameter("b", 1, -50, 50)], starts=2)
     assert any("2 measured values for as many unknowns" in n for n in report.notes)
 
 
@@ -203,7 +206,7 @@ def test_an_experiment_that_fails_is_named() -> None:
     with pytest.raises(
         SimulationError, match="experiment 'e', at the start values: nothing can be told: the run does"
     ) as e:
-        identifiability(plant, [measured(good, {}, 0.1)], [Free("a", 1, 0, 2)], starts=2)
+        identifiability(plant, [measured(good, {}, 0.1)], [FitParameter("a", 1, 0, 2)], starts=2)
     assert "leave it out" in e.value.hint
 
 
@@ -211,6 +214,6 @@ def test_nothing_measured_and_unknown_names_are_refused() -> None:
     plant = closed(line, a=1.0, b=1.0)
     data = measured(plant, {}, 0.1)
     with pytest.raises(InputError):
-        identifiability(plant, [data], [Free("c", 1, 0, 2)])
+        identifiability(plant, [data], [FitParameter("c", 1, 0, 2)])
     with pytest.raises(StudyError, match="nothing to fit"):
-        identifiability(plant, [data.with_(measured=None)], [Free("a", 1, 0, 2)])
+        identifiability(plant, [data.with_(measured=None)], [FitParameter("a", 1, 0, 2)])

@@ -14,7 +14,7 @@ import pytest
 
 from hvdc_ident import Model
 from hvdc_ident.data import experiment, trajectory
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.simulate import ModelSimulator
 
 OPTIMUM = 138.22199693517703
@@ -87,7 +87,7 @@ def jak_stat() -> Model:
 
 def problem(start: dict[str, float]) -> Problem:
     data = trajectory(np.array(TIME), {n: np.array(v) for n, v in DATA.items()})
-    free = tuple(Free(n, start[n], -5.0, 5.0) for n in PUBLISHED)
+    free = tuple(FitParameter(n, start[n], -5.0, 5.0) for n in PUBLISHED)
     return Problem(ModelSimulator(jak_stat()), (experiment("epo", TIME, measured=data),), free)
 
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
 
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.objective import LeastSquares, Smooth
-from hvdc_ident.fit.profile import Walk, profiles
+from hvdc_ident.fit.profile import ProfileOptions, profiles
 
-EXACT = Walk(tolerance=1e-10)
+EXACT = ProfileOptions(tolerance=1e-10)
 
 
 def free(*names):
-    return tuple(Free(n, 0.0) for n in names)
+    return tuple(FitParameter(n, 0.0) for n in names)
 
 
 def quadratic(t):
@@ -36,7 +36,7 @@ def rosenbrock(t):
 
 
 def ends(residual, names, start):
-    found = profiles(LeastSquares(free(*names), residual), np.array(start, float), threshold=2.0, walk=EXACT)
+    found = profiles(LeastSquares(free(*names), residual), np.array(start, float), threshold=2.0, options=EXACT)
     assert found.restarts == ()
     return {n: p.ci95 for n, p in found.by_name.items()}, found
 
@@ -76,13 +76,13 @@ def test_a_cost_given_with_its_gradient_alone_has_the_same_profile() -> None:
         r, j = rosenbrock(t)
         return float(r @ r), 2 * j.T @ r
 
-    found = profiles(Smooth(free("x1", "x2"), cost), np.array([1.0, 1.0]), ["x1"], threshold=4.0, walk=EXACT)
+    found = profiles(Smooth(free("x1", "x2"), cost), np.array([1.0, 1.0]), ["x1"], threshold=4.0, options=EXACT)
     assert found.by_name["x1"].ci95 == pytest.approx((-1, 3), abs=1e-6)
 
 
 def test_bounds_open_a_profile_and_physical_ones_end_it() -> None:
-    unknowns = (Free("x", 0.0, -0.5, 5.0),)
-    found = profiles(LeastSquares(unknowns, exponential), np.zeros(1), threshold=2.0, walk=EXACT).by_name["x"]
+    unknowns = (FitParameter("x", 0.0, -0.5, 5.0),)
+    found = profiles(LeastSquares(unknowns, exponential), np.zeros(1), threshold=2.0, options=EXACT).by_name["x"]
     assert found.lower.status == "open-at-bound" and found.lower.limit is None
     assert found.upper.limit == pytest.approx(log(3), abs=1e-9)
     own = {"x": (True, False)}
@@ -91,12 +91,12 @@ def test_bounds_open_a_profile_and_physical_ones_end_it() -> None:
 
 
 def test_at_a_bound_the_limit_is_one_sided() -> None:
-    unknowns = (Free("x", 0.0, 0.0, 50.0),)
+    unknowns = (FitParameter("x", 0.0, 0.0, 50.0),)
 
     def line(t):
         return t + 1.0, np.ones((1, 1))  # would like to be at -1
 
-    found = profiles(LeastSquares(unknowns, line), np.zeros(1), walk=EXACT).by_name["x"]
+    found = profiles(LeastSquares(unknowns, line), np.zeros(1), options=EXACT).by_name["x"]
     assert found.one_sided and found.lower.status == "open-at-bound"
     assert found.upper.limit == pytest.approx(sqrt(1 + 2 * 1.353) - 1, rel=1e-9)
 
@@ -105,7 +105,7 @@ def test_a_crossing_that_leans_on_a_search_bound_does_not_count() -> None:
     def pair(t):
         return np.array([10 * (t[0] - t[1]), 0.01 * t[1]]), np.array([[10.0, -10], [0, 0.01]])
 
-    unknowns = (Free("x", 0.0, -20, 20), Free("y", 0.0, -1, 1))
+    unknowns = (FitParameter("x", 0.0, -20, 20), FitParameter("y", 0.0, -1, 1))
     found = profiles(LeastSquares(unknowns, pair), np.zeros(2), ["x"]).by_name["x"]
     assert found.upper.status == "not-found" and "y cannot leave the bounds" in found.upper.reason
     found = profiles(LeastSquares(unknowns, pair), np.zeros(2), ["x"], physical={"y": (True, True)}).by_name["x"]
@@ -119,7 +119,7 @@ def test_a_better_optimum_on_the_way_starts_all_over_and_is_told() -> None:
             [32 * x * (x * x - 1) + 1.0 - 2 * (y - x), 2 * (y - x)]
         )
 
-    unknowns = (Free("x", 1.0, -3, 3), Free("y", 1.0, -3, 3))
+    unknowns = (FitParameter("x", 1.0, -3, 3), FitParameter("y", 1.0, -3, 3))
     found = profiles(Smooth(unknowns, wells), np.array([1.0, 1.0]), ["x"], threshold=20.0)
     assert found.theta[0] < -0.9 and len(found.restarts) == 1 and "profile of x" in found.restarts[0]
 
@@ -131,7 +131,7 @@ def test_many_parameters_cost_few_evaluations() -> None:
     def linear(t):
         return a @ t, a
 
-    found = profiles(LeastSquares(tuple(Free(f"p{i}", 0.0, -9, 9) for i in range(6)), linear), np.zeros(6))
+    found = profiles(LeastSquares(tuple(FitParameter(f"p{i}", 0.0, -9, 9) for i in range(6)), linear), np.zeros(6))
     inverse = np.linalg.inv(a.T @ a)
     for i, p in enumerate(found.by_name.values()):
         assert p.ci95[1] == pytest.approx(sqrt(2 * 1.92 * inverse[i, i]), rel=1e-3)

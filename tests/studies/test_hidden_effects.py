@@ -24,7 +24,7 @@ from hvdc_ident.discrepancy.trials.hops import hopped
 from hvdc_ident.discrepancy.trials.refit_jobs import job
 from hvdc_ident.discrepancy.trials.refitted import PROMISING, refitted
 from hvdc_ident.effects import EffectUse, Probe, effects
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 from tests.studies.study_module import STUDIES, load
@@ -185,10 +185,10 @@ def test_a_disturbance_is_seen_the_same_however_the_record_begins(plant, lead):
     inputs = {n: InputSignal.corners(p) for n, p in moves.items()}
     case = experiment("e", TIME, inputs, measured=measured, noise=noise)
     gain = plant.fitted[0]
-    problem = Problem(ModelSimulator(model), (case,), (Free(gain, plant.parameters[gain], 0.1, 10.0),))
-    settled, loose = (replace(problem, unsettled=u).cost(problem.start) for u in (False, True))
-    assert loose < 0.05, "no noise: nothing is left but what is not linear in the start"
-    assert settled > 100 * loose
+    problem = Problem(ModelSimulator(model), (case,), (FitParameter(gain, plant.parameters[gain], 0.1, 10.0),))
+    settled, free_start = (replace(problem, free_initial_states=u).cost(problem.start) for u in (False, True))
+    assert free_start < 0.05, "no noise: nothing is left but what is not linear in the start"
+    assert settled > 100 * free_start
 
 
 def test_designs_are_seeded_and_balanced():

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.profile import profiles
@@ -127,7 +127,7 @@ class Valley:
 
 
 def walked(valley, shelf):
-    unknowns = (Free("x", 0.0), Free("y", 0.0))
+    unknowns = (FitParameter("x", 0.0), FitParameter("y", 0.0))
     return profiles(LeastSquares(unknowns, valley), np.array([1.0, 1.0]), executor=KeptExecutor(shelf))
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from hvdc_ident import Model, load_model
 from hvdc_ident.cli import app
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.level_comparison import conversions
 from hvdc_ident.study.quiescent_levels import QuiescentLevels, compare_levels
@@ -31,7 +31,7 @@ x = {{derivative = "(u - x)/T"}}
 y = {{value = "k*x - {zero}", unit = "{unit}"}}
 """
 TIME = np.arange(0.0, 4.0, 0.02)
-T, CANDIDATES = 0.36, (Free("T", 0.3, 0.05, 2.0),)  # the plant's time constant is not the model's
+T, CANDIDATES = 0.36, (FitParameter("T", 0.3, 0.05, 2.0),)  # the plant's time constant is not the model's
 
 
 def card(folder: Path, unit: str = "pu", zero: float = 0.0, value: float = 1.02) -> Model:
@@ -134,7 +134,7 @@ def test_where_the_level_is_0_the_movement_tells(tmp_path: Path) -> None:
 
 
 def test_what_a_candidate_can_make_good_is_no_evidence(tmp_path: Path) -> None:
-    gain = (*CANDIDATES, Free("k", 1.0, 0.5, 3000.0))
+    gain = (*CANDIDATES, FitParameter("k", 1.0, 0.5, 3000.0))
     model = card(tmp_path, "MW")
     assert compare_levels(model, [record(1e3)], gain).lines == []
     assert compare_levels(model, [record(1.4)], gain).lines == []

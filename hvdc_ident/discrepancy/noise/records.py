@@ -16,8 +16,8 @@ from hvdc_ident.discrepancy.noise.colour import TANH, Colour, Likelihood, likeli
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit.noise import scatter_of
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import Block
-from hvdc_ident.fit.rounding import Rounding
+from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.fit.rounding import QuantisedNoise
 from hvdc_ident.fit.whitening import AR, autoregression, segments
 from hvdc_ident.immutable import FrozenMap
 
@@ -66,10 +66,10 @@ class OutputNoise:
         return float(max((self.std or 0.0) ** 2 - self.step**2 / 12.0, 0.0) ** 0.5)
 
     @property
-    def rounding(self) -> Rounding | None:
-        """Rounding of the record, where white noise does not hide it; else None."""
+    def quantised(self) -> QuantisedNoise | None:
+        """Quantised noise of the record where its white noise does not hide the steps; else None."""
         coarse = self.step > 0 and self.std is not None and not self.model and self.below < COARSE * self.step
-        return Rounding(self.step, max(self.below, FINEST * self.step)) if coarse else None
+        return QuantisedNoise(self.step, max(self.below, FINEST * self.step)) if coarse else None
 
 
 def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[OutputNoise]:
@@ -289,7 +289,7 @@ def _dither(records: Sequence[Array], step: float) -> float:
 
 def draws(
     problem: Problem,
-    blocks: Sequence[Block],
+    blocks: Sequence[ResidualBlock],
     noise: FrozenMap[OutputNoise],
     fitted: Sequence[Array],
     count: int,
@@ -317,14 +317,14 @@ def draws(
             e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
         if n.step:
             size = n.below * np.ones(count)
-            if n.rounding is not None:
+            if n.quantised is not None:
                 spread = np.random.default_rng([seed, 3, outputs.index(b.output)]).standard_normal(count)
                 size = size * np.exp(FLICKER * spread)
             placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
             e = np.round((placed + size * e) / n.step) * n.step - placed
-            rounding = problem.treatment.rounded(b.output)
-            if rounding is not None and b.profile is None:
-                found.append(rounding.residual(e)[0])
+            quantised = problem.treatment.quantised(b.output)
+            if quantised is not None and b.profile is None:
+                found.append(quantised.residual(e)[0])
                 continue
             e = b.scaled(e)
         found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))

@@ -11,7 +11,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import EffectUse, effects
-from hvdc_ident.fit import Free, Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator, Tolerance
@@ -66,10 +66,13 @@ def added(
     new = [n for n in larger.parameters if n not in model.parameters]
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
-    free = tuple(Free(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    unsettled = problem.unsettled or effects()[candidate.effect].restless
+    free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
+    free_initial_states = problem.free_initial_states or effects()[candidate.effect].restless
     more = replace(
-        problem, simulator=ModelSimulator(larger, PATIENCE), free=(*problem.free, *free), unsettled=unsettled
+        problem,
+        simulator=ModelSimulator(larger, PATIENCE),
+        free=(*problem.free, *free),
+        free_initial_states=free_initial_states,
     )
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
     return larger, more, placed, np.array([f.start for f in free])

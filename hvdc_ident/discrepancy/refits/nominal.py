@@ -13,8 +13,8 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.noise.records import OutputNoise, noise_of
 from hvdc_ident.errors import StudyError
 from hvdc_ident.executor import Executor
-from hvdc_ident.fit import Free, Problem, Simulator
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit import FitParameter, Problem, Simulator
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.identifiability.gate import gate, gated
 from hvdc_ident.identifiability.pilot import Optimum, pilot
 from hvdc_ident.immutable import FrozenMap
@@ -38,7 +38,7 @@ class Nominal:
     extra: Array | None = None
 
     @cached_property
-    def blocks(self) -> tuple[Block, ...]:
+    def blocks(self) -> tuple[ResidualBlock, ...]:
         """Residuals and derivatives at the optimum."""
         return self.problem.blocks(self.theta)
 
@@ -49,7 +49,7 @@ class Nominal:
 
     @property
     def chi2(self) -> float:
-        """The sum of squared residuals, as `Block.chi2`."""
+        """The sum of squared residuals, as `ResidualBlock.chi2`."""
         return float(self.residual @ self.residual) + sum(b.spare * b.residual.size for b in self.blocks)
 
     @cached_property
@@ -58,16 +58,16 @@ class Nominal:
         columns = np.vstack([b.jacobian for b in self.blocks])
         if self.extra is not None:
             columns = np.hstack([columns, self.extra])
-        if self.problem.unsettled:
-            columns = np.hstack([columns, self.problem.starts(self.theta)])
+        if self.problem.free_initial_states:
+            columns = np.hstack([columns, self.problem.initial_state_jacobian(self.theta)])
         return orthonormal(columns)
 
     @cached_property
     def starts(self) -> Array:
         """(N, k) orthonormal, and to the basis: what unknown starts of the states can make of the residual besides."""
-        if self.problem.unsettled:
+        if self.problem.free_initial_states:
             return np.zeros((self.residual.size, 0))
-        left = self.projected(unit_columns(self.problem.starts(self.theta)))
+        left = self.projected(unit_columns(self.problem.initial_state_jacobian(self.theta)))
         return orthonormal(left[:, np.linalg.norm(left, axis=0) > 1e-6])
 
     @property
@@ -108,7 +108,7 @@ def orthonormal(columns: Array) -> Array:
 def nominal(
     simulator: Simulator,
     experiments: Sequence[Experiment],
-    parameters: Sequence[Free],
+    parameters: Sequence[FitParameter],
     held: Mapping[str, float],
     report: Mapping[str, Any] | None,
     *,
@@ -133,8 +133,8 @@ def nominal(
         for e in problem.experiments
     )
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
-    rounding = {o: r for o, n in noise.items() if (r := n.rounding) is not None}
-    problem = replace(problem, experiments=told, rho=FrozenMap(models), rounding=FrozenMap(rounding))
+    quantised = {o: q for o, n in noise.items() if (q := n.quantised) is not None}
+    problem = replace(problem, experiments=told, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
     optimum, result = pilot(problem, starts=starts, seed=seed, executor=executor)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []

@@ -17,7 +17,7 @@ from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
-from hvdc_ident.fit.residual import Block
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
@@ -51,7 +51,7 @@ class RefitJob:
 class Refit:
     """Result of a refit. failure: why it has no result, empty where it has one.
 
-    chi2: sum of squared residuals (`Block.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
+    chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
     the same for parts of the fitted ones predicted from the rest. std: standard deviation of each effect parameter, by its
     name in the model. apart: of each effect, by how many standard deviations its parameters together are off doing
@@ -209,7 +209,7 @@ def judged(refit: Refit) -> Refit:
     )  # fmt: skip
 
 
-def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks: Sequence[Block]) -> float:
+def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks: Sequence[ResidualBlock]) -> float:
     """Distance of an effect's parameters from neutral, in standard deviations; 0 where that is not known."""
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
     fitted = [n for n, name in placed.names.items() if name in known.names]
@@ -233,7 +233,7 @@ def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks
     return math.sqrt(max(square, 0.0))
 
 
-def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[Block]) -> Array:
+def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[ResidualBlock]) -> Array:
     """The covariance of some unknowns; where only combinations of them are told, of those, and 0 along the others.
 
     The constant and the linear part of a loss are one where a signal has two levels, and are there all the same.
@@ -249,7 +249,7 @@ def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[Block]) 
     return np.asarray(told.T @ told / np.outer(scale, scale))
 
 
-def _correlation(blocks: Sequence[Block]) -> float:
+def _correlation(blocks: Sequence[ResidualBlock]) -> float:
     """The lag-1 autocorrelation of all residuals, 0 where it is negative or what chance gives."""
     power = sum(float(b.score @ b.score) for b in blocks)
     rows = sum(b.residual.size for b in blocks)
@@ -269,7 +269,7 @@ def holdout(problem: Problem, theta: Array) -> float | None:
     return float(np.sqrt(power / sum(b.residual.size for b in blocks)))
 
 
-def held_out(problem: Problem, theta: Array) -> tuple[Block, ...] | None:
+def held_out(problem: Problem, theta: Array) -> tuple[ResidualBlock, ...] | None:
     """The residuals of the held-out experiments; None where there are none, () where one cannot be run."""
     others = of_held_out(problem)
     if others is None:
@@ -290,7 +290,7 @@ def of_held_out(problem: Problem) -> Problem | None:
     return replace(problem, experiments=tuple(others)) if others else None
 
 
-def press(blocks: Sequence[Block], parts: int = 4) -> float | None:
+def press(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
     """Root mean square of each part's residuals predicted from the others, to first order (Allen's PRESS, by blocks).
 
     Parts: experiments; of a single one, stretches of its rows. None where nothing can be left out.

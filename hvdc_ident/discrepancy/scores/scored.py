@@ -23,7 +23,7 @@ from hvdc_ident.discrepancy.signatures.finite import LOOSE, SignatureColumn, Tas
 from hvdc_ident.discrepancy.signatures.response import Along, along
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import Executor, mapped
-from hvdc_ident.fit.residual import Block, Treatment
+from hvdc_ident.fit.residual import ResidualBlock, Treatment
 from hvdc_ident.model import AnyModel, Model
 
 Path = Along | Ends
@@ -190,10 +190,10 @@ class Whitening:
 
     name: str
     treatment: Treatment
-    parts: tuple[tuple[Block, int, Array], ...]
+    parts: tuple[tuple[ResidualBlock, int, Array], ...]
 
     @classmethod
-    def of(cls, blocks: Sequence[Block], experiment: Experiment, nominal: Nominal) -> Whitening:
+    def of(cls, blocks: Sequence[ResidualBlock], experiment: Experiment, nominal: Nominal) -> Whitening:
         slim = [replace(b, jacobian=b.jacobian[:0]) for b in blocks]  # a job is sent to where it is done
         parts = [(b, experiment.outputs.index(b.output), experiment.time[b.rows]) for b in slim]
         return cls(experiment.name, nominal.problem.treatment, tuple(parts))
@@ -202,7 +202,7 @@ class Whitening:
         """(rows, nc) of y (o, R, nc)."""
         return np.concatenate([self._rows(b, y[k, b.rows], time) for b, k, time in self.parts])
 
-    def _rows(self, b: Block, y: Array, time: Array) -> Array:
+    def _rows(self, b: ResidualBlock, y: Array, time: Array) -> Array:
         if b.slope is not None:
             return np.asarray(y * b.slope[:, None])
         return self.treatment.applied(b.scaled(y), time, b.output, self.name)

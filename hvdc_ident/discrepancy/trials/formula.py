@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.scores.scored import Path
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.trials.library import Term, along
 from hvdc_ident.effects import EffectUse
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -56,7 +56,7 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
     # Of a curve the largest value tells how large the others may become: one may begin at 0.
     most = max(map(abs, values.values())) if all(t.form == "hat" for t in chosen) else 0.0
     bounds = {n: (-WIDE * max(abs(v), most), WIDE * max(abs(v), most)) for n, v in values.items()}
-    free = tuple(Free(m, values[n], *bounds[n]) for n, m in zip(names, new, strict=True))
+    free = tuple(FitParameter(m, values[n], *bounds[n]) for n, m in zip(names, new, strict=True))
     problem = replace(before.problem, simulator=ModelSimulator(model), free=(*before.problem.free, *free))
     placed = Placed(
         CandidateEffect("term", (place,), ()),

@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Pick
 from hvdc_ident.effects import effects
-from hvdc_ident.fit import Free
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
@@ -91,11 +91,16 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         model = model.with_effects([use])
         new = [n for n in model.parameters if n not in before]
         names = dict(zip(p.names, new, strict=True))
-        free += [Free(names[n], values[n], *p.bounds[n]) for n in p.bounds]
+        free += [FitParameter(names[n], values[n], *p.bounds[n]) for n in p.bounds]
         moved = replace(p.candidate, at=use.at, source=use.source)
         again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    unsettled = any(effects()[p.use.effect].restless for p in placed)
-    problem = replace(here.problem, simulator=ModelSimulator(model, PATIENCE), free=tuple(free), unsettled=unsettled)
+    free_initial_states = any(effects()[p.use.effect].restless for p in placed)
+    problem = replace(
+        here.problem,
+        simulator=ModelSimulator(model, PATIENCE),
+        free=tuple(free),
+        free_initial_states=free_initial_states,
+    )
     nuisance = here.theta[len(here.problem.free) :]
     gains = [at[f.name] for f in first.problem.free]
     begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])

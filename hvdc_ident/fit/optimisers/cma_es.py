@@ -13,7 +13,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search, generator, missing
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator, missing
 
 NAME = "cma-es"
 SUMMARY = "evolution strategy with covariance adaptation (package cma, an extra), without derivatives"
@@ -41,7 +41,7 @@ class CmaEs:
                 import cma
         except ImportError:
             raise missing(PACKAGE, NAME) from None
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         random = generator(self.seed, search.start)
         p = search.start.size
         middle = np.append(search.cube, 0.5) if p == 1 else search.cube  # one dimension is not supported there

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search, generator
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator
 
 NAME = "differential-evolution"
 SUMMARY = "a population of differences over the whole range (SciPy), without derivatives"
@@ -31,7 +31,7 @@ class DifferentialEvolution:
         """Where the run ended; the start is one member of the first population."""
         from scipy.optimize import differential_evolution
 
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         try:
             end = differential_evolution(
                 search.at_cube,

@@ -14,7 +14,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.fit.objective import promised
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search, generator
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator
 
 NAME = "dual-annealing"
 SUMMARY = "simulated annealing with local descents over the whole range (SciPy)"
@@ -37,7 +37,7 @@ class DualAnnealing:
         """Where the run ended."""
         from scipy.optimize import dual_annealing
 
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         space = problem.coordinates
         ends = np.array([u.drawn for u in problem.unknowns])
         box = list(zip(space.scaled(ends[:, 0]), space.scaled(ends[:, 1]), strict=True))

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun
 
 NAME = "l-bfgs-b"
 SUMMARY = "quasi-Newton with bounds (SciPy), with exact gradients"
@@ -33,7 +33,7 @@ class LBfgsB:
         """Where the run from `start` ended."""
         from scipy.optimize import minimize
 
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         low, high = problem.coordinates.bounds
         try:
             first, _ = search.value_and_gradient(search.x0)

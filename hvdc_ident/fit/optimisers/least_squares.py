@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun
 
 NAME = "least-squares"
 SUMMARY = "SciPy's trust region reflective least squares, with exact sensitivities"
@@ -31,7 +31,7 @@ class LeastSquaresTrf:
         """Where the run from `start` ended."""
         from scipy.optimize import least_squares
 
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         low, high = problem.coordinates.bounds
         inside = np.clip(search.x0, low + 1e-9 * (1.0 + np.abs(low)), high - 1e-9 * (1.0 + np.abs(high)))
         try:

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun
 
 NAME = "nelder-mead"
 SUMMARY = "the simplex of Nelder and Mead (SciPy), without derivatives"
@@ -33,7 +33,7 @@ class NelderMead:
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Where the run from `start` ended."""
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         try:
             search.value(search.start)
             if search.cost is None:
@@ -49,7 +49,7 @@ class NelderMead:
             return search.spent()
         return search.ended(False, f"fresh simplexes still improve after {self.restarts} restarts")
 
-    def _descent(self, search: Search, x: Array, size: float) -> Array:
+    def _descent(self, search: OptimiserRun, x: Array, size: float) -> Array:
         """Where a simplex from x ends, in the unit cube."""
         from scipy.optimize import minimize
 

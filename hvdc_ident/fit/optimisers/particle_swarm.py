@@ -17,7 +17,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, Search, generator, missing
+from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator, missing
 
 NAME = "particle-swarm"
 SUMMARY = "a swarm of particles (package pyswarms, an extra), without derivatives"
@@ -44,7 +44,7 @@ class ParticleSwarm:
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Where the run ended; one particle begins at the start. Raises InputError where the package is missing."""
-        search = Search(problem, start, self.max_evaluations)
+        search = OptimiserRun(problem, start, self.max_evaluations)
         p = search.start.size
         random = generator(self.seed, search.start)
         first = np.vstack([search.cube, random.random((self.particles - 1, p))])

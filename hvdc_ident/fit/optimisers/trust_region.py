@@ -14,7 +14,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.optimiser import OptimiserResult, Outcome
+from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserStatus
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.rough import RUNS, roughness
 from hvdc_ident.fit.simulator import approximate
@@ -77,7 +77,7 @@ class _Walk:
     r: Array = field(init=False)
     jacobian: Array = field(init=False)
 
-    def go(self, start: Array) -> tuple[Outcome, str]:
+    def go(self, start: Array) -> tuple[OptimiserStatus, str]:
         """The status and the reason the walk ended for."""
         space = self.problem.coordinates
         low, high = space.bounds
@@ -141,7 +141,7 @@ class _Walk:
         scale = _norms(self.jacobian) * np.linalg.norm(self.r)
         return bool((np.abs(g) <= self.options.gradient * scale).all())
 
-    def _standstill(self, size: Array, low: Array, high: Array) -> tuple[Outcome, str]:
+    def _standstill(self, size: Array, low: Array, high: Array) -> tuple[OptimiserStatus, str]:
         """The outcome where steps are too small to count: an optimum, a failing region or a gradient that does not fit."""
         if self.failure:
             return "failed", f"every step down leads to where the simulation fails: {self.failure}"

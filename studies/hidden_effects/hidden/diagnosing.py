@@ -19,7 +19,7 @@ from hvdc_ident.data import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, read_card
 from hvdc_ident.simulate import ModelSimulator
@@ -58,10 +58,10 @@ def experiments_of(case: Case) -> tuple[Experiment, ...]:
     return tuple(found)
 
 
-def free_of(case: Case) -> tuple[Free, ...]:
+def free_of(case: Case) -> tuple[FitParameter, ...]:
     """The parameters that may be fitted, from where a user would start."""
     true = PLANTS[case.design.plant].parameters
-    return tuple(Free(n, v, true[n] / WIDTH, true[n] * WIDTH) for n, v in case.given.items())
+    return tuple(FitParameter(n, v, true[n] / WIDTH, true[n] * WIDTH) for n, v in case.given.items())
 
 
 def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
@@ -179,13 +179,13 @@ def _sindy(
     return {"augmented": misfit, "terms": float(terms)}
 
 
-def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: Sequence[Free]) -> float | None:
+def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: Sequence[FitParameter]) -> float | None:
     """The same for the model with what is truly there, fitted from the truth; None outside the catalogue and without effects."""
     known = effects()
     if not case.hidden or any(h.effect not in known for h in case.hidden):
         return None
     true = PLANTS[case.design.plant].parameters
-    unknown = [Free(f.name, true[f.name], f.min, f.max) for f in free]
+    unknown = [FitParameter(f.name, true[f.name], f.min, f.max) for f in free]
     for h in case.hidden:
         use = EffectUse(h.effect, (h.at,), FrozenMap(_numbers(h.parameters)), source=h.source)
         before = set(model.parameters)
@@ -198,7 +198,7 @@ def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: S
             if own in bounds:
                 low, high = bounds[own]
                 value = model.parameters[name].value
-                unknown.append(Free(name, value, min(low, value), max(high, value)))
+                unknown.append(FitParameter(name, value, min(low, value), max(high, value)))
     sigma = {o: float(case.sigma[k]) for o, k in zip(experiments[0].outputs, case.channels, strict=True)}
     coloured = case.design.noise in ("ar", "told-white")
     problem = Problem(ModelSimulator(model), tuple(experiments), tuple(unknown), weights=FrozenMap(sigma))

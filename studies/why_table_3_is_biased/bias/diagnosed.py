@@ -12,7 +12,7 @@ from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.effects import effects as catalogue
 from hvdc_ident.expression import parse
-from hvdc_ident.fit import Free, Problem, fit
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.models import load_model
@@ -63,9 +63,9 @@ def experiments(outputs: Sequence[str], noise: float = NOISE) -> tuple[Experimen
     return tuple(e for e in recorded(campaign) if e.name in (*FITTED, *HELD_OUT))
 
 
-def unknowns() -> tuple[Free, ...]:
+def unknowns() -> tuple[FitParameter, ...]:
     """The gains, begun at Table I's: what the vendor gave."""
-    return tuple(Free(n, paper.TABLE_1[n], paper.TABLE_1[n] / 4, 3 * paper.TABLE_1[n]) for n in FREE)
+    return tuple(FitParameter(n, paper.TABLE_1[n], paper.TABLE_1[n] / 4, 3 * paper.TABLE_1[n]) for n in FREE)
 
 
 def diagnosis(name: str, *, noise: float = NOISE, executor: Any = None) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def put_in(told: Mapping[str, Any], name: str) -> dict[str, Any]:
         [{"effect": best["effect"], "at": best["at"], "parameters": best["parameters"], **brought}]
     )
     own = dict(zip((n for n in model.parameters if n not in plain.parameters), best["parameters"], strict=True))
-    sizes = tuple(Free(n, v, v / 5, 5 * v) for n, q in own.items() if (v := best["parameters"][q]))
+    sizes = tuple(FitParameter(n, v, v / 5, 5 * v) for n, q in own.items() if (v := best["parameters"][q]))
     result = fit(Problem(ModelSimulator(model), experiments(ASKED[name].outputs), (*unknowns(), *sizes)), starts=1)
     if result.status not in ("converged", "at-bound"):
         raise RuntimeError(f"the fit with {best['effect']} ended without an estimate: {result.message}")

@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 
 from hvdc_ident import Model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
-from hvdc_ident.fit import Free, Problem
-from hvdc_ident.fit.unsettled import recentred
+from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.initial_states import recentred
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -35,15 +35,15 @@ def problem(coloured: bool = False, **more) -> Problem:
         noisy = {o: run[o] + e.noise[o] * rng.standard_normal(TIME.size) for o in ("x", "v")}
         found.append(e.with_(measured=trajectory(TIME, noisy)))
     rho = FrozenMap({"x": 0.5, "v": 0.3} if coloured else {})
-    free = (Free("k", 4.0, 1.0, 9.0), Free("d", 0.8, 0.1, 3.0))
+    free = (FitParameter("k", 4.0, 1.0, 9.0), FitParameter("d", 0.8, 0.1, 3.0))
     return Problem(ModelSimulator(SPRING), tuple(found), free, rho=rho, **more)
 
 
 @pytest.mark.parametrize("coloured", [False, True])
 def test_what_is_left_is_what_a_fit_of_the_starts_leaves(coloured):
-    loose = problem(coloured, unsettled=True)
+    free_start = problem(coloured, free_initial_states=True)
     theta = np.array([4.4, 0.7])
-    blocks = loose.blocks(theta)
+    blocks = free_start.blocks(theta)
     named = problem(coloured)
     named = named.with_(experiments=[e.with_(nuisance=("x", "v")) for e in named.experiments])
     fitted = least_squares(lambda s: named.residual(np.concatenate([theta, s]))[0], np.zeros(4), x_scale=1.0)
@@ -53,26 +53,26 @@ def test_what_is_left_is_what_a_fit_of_the_starts_leaves(coloured):
         np.testing.assert_allclose(own.misfit, other.misfit, atol=2e-6)
     assert [b.taken for b in blocks] == [2, 0, 2, 0]
     settled = problem(coloured).cost(theta)
-    assert settled > 5 * loose.cost(theta), "taken for a record that begins at rest it fits badly"
+    assert settled > 5 * free_start.cost(theta), "taken for a record that begins at rest it fits badly"
 
 
 def test_the_jacobian_is_that_of_the_eliminated_residual():
     """Kaufman's: its gradient is exact, itself is short of a part across the residual."""
-    loose = problem(unsettled=True)
+    free_start = problem(free_initial_states=True)
     theta = np.array([4.1, 0.9])
-    r, jacobian = loose.residual(theta)
+    r, jacobian = free_start.residual(theta)
     for i, h in enumerate((1e-4, 1e-4)):
         step = h * np.eye(2)[i]
-        slope = (loose.cost(theta + step) - loose.cost(theta - step)) / (2 * h)
+        slope = (free_start.cost(theta + step) - free_start.cost(theta - step)) / (2 * h)
         assert jacobian[:, i] @ r == pytest.approx(slope, rel=1e-4, abs=1e-3)
-    starts = loose.starts(theta)
+    starts = free_start.initial_state_jacobian(theta)
     assert starts.shape == (r.size, 4)
     assert np.abs(starts.T @ r).max() < 1e-6 * np.abs(starts).max() * np.linalg.norm(r)
     assert np.abs(starts.T @ jacobian).max() < 1e-6 * np.linalg.norm(starts) * np.linalg.norm(jacobian)
 
 
 def test_a_start_that_is_given_or_estimated_is_not_eliminated():
-    base = problem(unsettled=True)
+    base = problem(free_initial_states=True)
     known = [e.with_(starts={"x": 1.0, "v": 0.0}) for e in base.experiments]
     plain = problem().with_(experiments=known)
     theta = np.array([4.1, 0.9])

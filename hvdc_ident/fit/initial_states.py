@@ -21,13 +21,13 @@ from hvdc_ident.fit.simulator import Simulator, WithStates
 from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
-    from hvdc_ident.fit.residual import Block
+    from hvdc_ident.fit.residual import ResidualBlock
 
 TELLS = 1e-7
 """Singular value, relative to the largest of columns of length 1, from which a direction counts."""
 
 
-def loose_states(simulator: Simulator, experiment: Experiment) -> tuple[str, ...]:
+def unknown_initial_states(simulator: Simulator, experiment: Experiment) -> tuple[str, ...]:
     """The states whose start is neither given nor estimated; none of a simulator that does not show its states."""
     known = {*experiment.starts, *experiment.nuisance}
     return tuple(n for n in simulator.states if n not in known) if isinstance(simulator, WithStates) else ()
@@ -49,7 +49,7 @@ def centred(
     return experiment.with_(starts=experiment.starts | {n: float(at[n][0]) for n in states})
 
 
-def recentred(experiment: Experiment, blocks: Sequence[Block], states: Sequence[str]) -> Experiment:
+def recentred(experiment: Experiment, blocks: Sequence[ResidualBlock], states: Sequence[str]) -> Experiment:
     """The experiment with these states' starts moved to where its residuals are least, to first order.
 
     blocks: at the starts as they are; their first columns are by the starts. A start that the records hardly show is kept
@@ -66,20 +66,20 @@ def recentred(experiment: Experiment, blocks: Sequence[Block], states: Sequence[
     return experiment.with_(starts=experiment.starts | moved)
 
 
-def freed(blocks: Sequence[Block], raw: Sequence[Array], loose: slice) -> tuple[Block, ...]:
+def freed(blocks: Sequence[ResidualBlock], raw: Sequence[Array], columns: slice) -> tuple[ResidualBlock, ...]:
     """The blocks of one experiment without what the starts can make good.
 
-    loose: the jacobians' columns by the starts, which are gone from the result. raw: by block, (m, starts) the derivative
+    columns: the jacobians' columns by the starts, which are gone from the result. raw: by block, (m, starts) the derivative
     of its misfit by them, neither weighted nor whitened.
     """
-    columns = np.vstack([b.jacobian[:, loose] for b in blocks])
-    norms = np.linalg.norm(columns, axis=0)
+    slopes = np.vstack([b.jacobian[:, columns] for b in blocks])
+    norms = np.linalg.norm(slopes, axis=0)
     norms = np.where(norms > 0, norms, np.inf)
-    u, s, vt = np.linalg.svd(columns / norms, full_matrices=False)
+    u, s, vt = np.linalg.svd(slopes / norms, full_matrices=False)
     kept = s > TELLS * s.max(initial=0.0)
     u = u[:, kept]
     residual = np.concatenate([b.residual for b in blocks])
-    rest = np.vstack([np.delete(b.jacobian, loose, axis=1) for b in blocks])
+    rest = np.vstack([np.delete(b.jacobian, columns, axis=1) for b in blocks])
     start = -(vt[kept].T @ ((u.T @ residual) / s[kept])) / norms
     residual, rest = residual - u @ (u.T @ residual), rest - u @ (u.T @ rest)
     found, at = [], 0
