@@ -1,7 +1,7 @@
-"""The list of the studies with their headline numbers, from each one's expected.json: studies/README.md.
+"""The list of studies with their headline numbers from expected.json: studies/README.md.
 
 python studies/index.py            # writes the list
-A study is listed once it has a README; one without a headline here under its README's title.
+A study is listed if it has a README; one without a headline here is listed under its README's title.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from hvdc_ident.files import write_text  # noqa: E402
 HEAD = """\
 # Studies
 
-Each folder has one command, `python studies/NAME/run.py`, its figures in `expected.json` (checked by `tests/studies`), and
-a README that says what was done, what the paper has, and why the two differ. `--pin`, where there is one, writes what was
-computed into the folder. Reference waveforms: the average-value link, which stands in for EMTP-RV. This list is written by
-`python studies/index.py`.
+Each folder has one command, `python studies/NAME/run.py`, its numbers in `expected.json` (checked by `tests/studies`), and a
+README that states what was done, what the paper reports, and why the two differ. `--pin`, where it exists, writes the computed
+numbers into the folder. The reference waveforms come from the average-value link, a substitute for EMTP-RV. This list is written
+by `python studies/index.py`.
 
 """
 
@@ -72,12 +72,12 @@ def _table_4(e: dict[str, Any]) -> str:
 def _figure_5(e: dict[str, Any]) -> str:
     found = e["values"]["Vdc"]["estimates"]
     gains = ", ".join(f"{n} {number(v['value'])}" for n, v in found.items())
-    return f"four set-ups as study files; the Vdc one gives {gains}"
+    return f"four study files; the one for Vdc gives {gains}"
 
 
 def _figure_6(e: dict[str, Any]) -> str:
     v = e["values"]["KPVDC"]
-    return f"KPVDC has two humps: {number(np.mean(v['step']))} from steps, {number(np.mean(v['ramp']))} from ramps"
+    return f"KPVDC has two peaks: {number(np.mean(v['step']))} from steps, {number(np.mean(v['ramp']))} from ramps"
 
 
 def _figure_7(e: dict[str, Any]) -> str:
@@ -105,7 +105,7 @@ def _plain(e: dict[str, Any]) -> str:
 
 def _modes(e: dict[str, Any]) -> str:
     v = e["vsc-hvdc-avm"]
-    return f"each filtered measurement is {v['measurement_ms']} ms late; dc voltage control at {v['dc voltage control Hz']} Hz"
+    return f"each filtered measurement has a delay of {v['measurement_ms']} ms; dc voltage control at {v['dc voltage control Hz']} Hz"
 
 
 def _software(e: dict[str, Any]) -> str:
@@ -134,9 +134,9 @@ def _why(e: dict[str, Any]) -> str:
     found = e["values"]["put in"][finer]
     plain, named = (max(abs(found[k][n] / paper.TABLE_1[n] - 1.0) for n in found[k]) for k in ("refitted", "augmented"))
     return (
-        f"a lag of 1.6 ms left out gives {moved}, put in {back}; without filters and inner loop KIVDC is {inner}; told nothing, "
-        f"with all put in that is named where a twentieth of the noise counts, the gains are {100 * named:.1f} % off Table I "
-        f"at most (plain link {100 * plain:.0f} %)"
+        f"a lag of 1.6 ms that the model lacks gives {moved}, in the model {back}; without filters and inner loop KIVDC is "
+        f"{inner}; with the effects that `diagnose` finds if a twentieth of the noise is significant, the gains are at most "
+        f"{100 * named:.1f} % off Table I (plain link {100 * plain:.0f} %)"
     )
 
 
@@ -144,7 +144,7 @@ def _missing(e: dict[str, Any]) -> str:
     told, cases = e["values"]["told nothing"], e["values"]["refits"]
     plain, late = (cases[c]["rmse"]["Irorder2"] for c in ("fitted", "delay at Ir2"))
     return (
-        f"{told['verdict']} from one experiment; {1e3 * cases['delay at Ir2']['values']['T']:.2f} ms of delay would take "
+        f"{told['verdict']} from one experiment; a delay of {1e3 * cases['delay at Ir2']['values']['T']:.2f} ms would reduce "
         f"the RMSE of Irorder2 from {1e3 * plain:.2f}e-3 to {1e3 * late:.2f}e-3"
     )
 
@@ -158,8 +158,8 @@ def _tools(e: dict[str, Any]) -> str:
     droop = -found["droop of the ac voltage controls"]["k"]["value"]
     slew = found["slew of the power set-point"]["rate"]["value"]
     return (
-        f"the card follows Eurostag; Dynawo's dc voltage step only without the 10 ms measurement (RMSE of the current "
-        f"{1e3 * card:.0f}e-3 with, {1e3 * bare:.0f}e-3 without); what the card lacks comes out of Eurostag's record: "
+        f"the card follows Eurostag, and Dynawo's dc voltage step only without the 10 ms measurement (RMSE of the current "
+        f"{1e3 * card:.0f}e-3 with, {1e3 * bare:.0f}e-3 without); `diagnose` finds removed parts in Eurostag's record: "
         f"{late:.1f} ms (described 10), a droop of {droop:.4f} (0.1316), a slew of {slew:.4f} pu/s (0.0833)"
     )
 
@@ -171,9 +171,9 @@ def _optimisers(e: dict[str, Any]) -> str:
 
 
 HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
-    "software_to_software": ("Fig. 3: is the reference to be believed?", _software),
+    "software_to_software": ("Fig. 3: can the reference be trusted?", _software),
     "table_1": ("Table I: six gains from two numbers", _table_1),
-    "table_2": ("Table II: where the fits may go and where they begin", _table_2),
+    "table_2": ("Table II: bounds and start values of the fits", _table_2),
     "figure_5": ("Fig. 5: the set-up of a fit", _figure_5),
     "table_3": ("Table III: 30 experiments, fitted one by one and together", _table_3),
     "figure_6": ("Fig. 6: the histograms of Table III", _figure_6),
@@ -181,37 +181,37 @@ HEADLINES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "figure_7": ("Fig. 7: the waveforms with the fitted gains", _figure_7),
     "figure_8": ("Fig. 8: does KIVDC matter from 550 to 950?", _figure_8),
     "figure_9": ("Fig. 9: and from 250 to 1500?", _figure_9),
-    "plain_link_on_avm": ("What the gains do to make up for a missing delay", _plain),
-    "why_table_3_is_biased": ("Why Table III's gains are off Table I", _why),
+    "plain_link_on_avm": ("How the gains compensate for a missing delay", _plain),
+    "why_table_3_is_biased": ("Why the gains of Table III differ from Table I", _why),
     "avm_modes": ("The modes of the average-value link", _modes),
     "dymola_waveform": ("The phasor link on Dymola's waveforms", _dymola),
     "dymola_missing": ("What the phasor link lacks on Dymola's waveforms", _missing),
     "two_tools_one_link": ("One link in two tools", _tools),
     "optimisers": ("RaPId's optimisers on the link", _optimisers),
-    "profile_coverage": ("How often the profile's interval holds the truth", _coverage),
+    "profile_coverage": ("Coverage of the profile likelihood interval", _coverage),
 }
 
 
 def row(name: str) -> str:
-    """The line of one study; without a headline here, its README's title."""
+    """Return the row of one study; without a headline here, the title of its README."""
     folder = HERE / name
     if name in HEADLINES:
         title, headline = HEADLINES[name]
         found = headline(json.loads((folder / "expected.json").read_text(encoding="utf-8")))
     else:
         title = (folder / "README.md").read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
-        found = "see there"
+        found = "see the page"
     return f"| [{name}]({name}) | {title} | {found} |"
 
 
 def folders() -> list[str]:
-    """The studies that have a README, those with a headline first."""
+    """Return the studies that have a README, those with a headline first."""
     found = sorted(p.parent.name for p in HERE.glob("*/README.md"))
     return [n for n in HEADLINES if n in found] + [n for n in found if n not in HEADLINES]
 
 
 def text() -> str:
-    """The list as Markdown."""
+    """Return the list as Markdown."""
     rows = ["| study | what | headline |", "| --- | --- | --- |", *(row(n) for n in folders())]
     return HEAD + "\n".join(rows) + "\n"
 

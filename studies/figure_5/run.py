@@ -29,7 +29,7 @@ WHY = {
     "P": "a text file instead of a Simulink container",
     "Q": "the same",
     "Vdc": "the container of Fig. 5 itself",
-    "all three": "the same; each output compared in every experiment, weighted by its own misfit",
+    "all three": "the same; each output is compared in every experiment, weighted by its own misfit",
 }
 
 
@@ -68,7 +68,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
         theirs = "one set-up, not drawn" if setup == "all three" else "one of three set-ups, the Vdc one drawn"
         here = f"`{SETUPS[setup]}`: {', '.join(v['played in'])} in, {', '.join(v['compared'])} compared"
         rows.append([setup, theirs, here, WHY[setup], "; ".join(estimates), "; ".join(held) or "nothing"])
-    head = ["fitted", "paper", "here", "why they differ", "estimates (95 %)", "held back by the report"]
+    head = ["fitted", "paper", "here", "why they differ", "estimates (95 %)", "held"]
     return {"set-ups": markdown(head, rows)}
 
 

@@ -20,12 +20,12 @@ from common.ending import interval, markdown, number  # noqa: E402
 BINS = 10
 ORDER = ("KIP", "KPP", "KIQ", "KPQ", "KPVDC", "KIVDC")
 WHY = {
-    "KIP": "no scatter here but what the reference does",
+    "KIP": "no noise here: the scatter comes from the reference model",
     "KPP": "the same",
     "KIQ": "not reproduced (Table III)",
     "KPQ": "not reproduced (Table III)",
-    "KPVDC": "two humps here, steps and ramps; the mean depends on the mix",
-    "KIVDC": "steps and ramps agree; theirs is higher, as ours is from other operating points (Table III)",
+    "KPVDC": "two peaks here, steps and ramps; the mean depends on their proportion",
+    "KIVDC": "steps and ramps agree; the paper's is higher, as is ours from other operating points (Table III)",
 }
 
 

@@ -24,9 +24,9 @@ SETS = ("upper", "lower", "test")
 SHOWN = 450.0  # ms of the record drawn
 OTHERS = Campaign(source=paper.REFERENCE, count=2, noise=Noise(0.0), sample=paper.SAMPLE, at_rest=True, seed=7)
 WHY = {
-    "Irorder2": "a larger floor there (Table IV)",
-    "Iiorder1": "more is missing there in Q than a delay (Table IV)",
-    "Irorder1": "a larger floor there; ours is the delay and the inner current loop",
+    "Irorder2": "the paper's floor is higher (Table IV)",
+    "Iiorder1": "in the paper more is missing in Q than a delay (Table IV)",
+    "Irorder1": "the paper's floor is higher; ours is due to the delay and the inner current loop",
 }
 
 
@@ -70,7 +70,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
             ours = [number(e[s] / e["test"], 2) for s in SETS[:2]]
             cells = [*(number(e[s], 3) for s in SETS), ", ".join(paper_s), ", ".join(ours)]
             rows.append([o, name.split("-")[-1], *cells, WHY[o]])
-    head = ["output", "", *SETS, "upper, lower over test: paper", "here", "why they differ"]
+    head = ["output", "", *SETS, "upper, lower divided by test: paper", "here", "why they differ"]
     return {"overlays": markdown(head, rows)}
 
 

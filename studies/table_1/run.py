@@ -31,7 +31,7 @@ EXPLAINED = {
     "KPVDC": "Kp = 2 0.7 wn J",
     "KIP": "Ki = 3/Ts",
     "KIQ": "Ki = 3/Ts",
-    "KPP": "no proportional part: power follows its order at once",
+    "KPP": "no proportional part: power follows its order immediately",
     "KPQ": "the same",
 }
 
@@ -94,18 +94,18 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
         ["settling time Ts, s", "set by the user, not printed", number(back["Ts"]), "3/KIP"],
         ["capacitance J, s", "not printed", number(back["J"]), f"KPVDC Ts/6; C1 + C2 of the link is {total}"],
         ["damping z", "not printed", f"{back['damping']:.4f}", "3/(Ts sqrt(KIVDC/J))"],
-        ["wn of the dc voltage mode, rad/s", "-", number(mode_["wn"]), f"3/(0.7 Ts) = {wn}; the link has a line"],
+        ["wn of the dc voltage mode, rad/s", "-", number(mode_["wn"]), f"3/(0.7 Ts) = {wn}; the link also has a line"],
         ["its damping", "-", number(mode_["damping"]), "0.7"],
         [f"P2 {within}", "-", number(settled["P"]), "Ts"],
         [f"Q1 {within}", "-", number(settled["Q"]), "Ts"],
-        [f"Vdc1 {within}", "-", number(settled["Vdc"]), "near Ts, although the PI's zero makes it overshoot first"],
+        [f"Vdc1 {within}", "-", number(settled["Vdc"]), "near Ts, although the PI's zero causes an overshoot first"],
     ]
     for n, known in AUTHORS_GAINS.items():
         here = number(values["gains, authors' rating"][n], 6)
         loops.append([f"{n}, the authors' 1000 MVA link, J = {AUTHORS['J']} s", str(known), here, "the rule again"])
     return {
         "gains": markdown(["gain", "paper", "here, from J and Ts", "why"], rows),
-        "loops": markdown(["", "paper", "here", "why they differ, or where it comes from"], loops),
+        "loops": markdown(["", "paper", "here", "reason or source"], loops),
     }
 
 

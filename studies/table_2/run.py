@@ -88,11 +88,11 @@ def worst(distances: Iterable[Array]) -> float:
 
 NOTES = {
     "KIP": "test value on the lower bound",
-    "KPP": "truth and test value on the lower bound: no value ± std there",
+    "KPP": "true value and test value on the lower bound: no value ± std there",
     "KIQ": "test value on the lower bound",
-    "KPQ": "truth and test value on the lower bound: no value ± std there",
+    "KPQ": "true value and test value on the lower bound: no value ± std there",
     "KPVDC": "test value on the lower bound",
-    "KIVDC": "start 2 % beside the truth; test value outside the bounds, so that no fit can begin there",
+    "KIVDC": "start 2 % off the true value; test value outside the bounds, so that no fit can begin there",
 }
 
 
@@ -106,7 +106,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
         optimum = ", ".join(f"{n} {number(x if x > 1e-6 else 0.0)}" for n, x in v["optimum"].items())
         cells = [f"{v['to the optimum']} of {v['starts']}", lost(v), share(v["apart"]), share(v["off Table I"])]
         rows.append([data, setup, *cells, optimum, f"{low} to {high}"])
-    head = ["starts that end there", "the others", "apart by", "off Table I by", "optimum", "simulations"]
+    head = ["starts that end at the optimum", "other starts", "largest distance from it", "distance from Table I", "optimum", "simulations"]
     return {
         "bounds": markdown(["gain", "min", "max", "start", "test", "true", "here"], bounds),
         "ends": markdown(["waveforms of", "fitted", *head], rows),

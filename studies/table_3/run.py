@@ -80,26 +80,26 @@ def statistics(values: Mapping[str, list[float]]) -> dict[str, dict[str, float]]
 
 
 WHY = {
-    ("KIVDC", "II"): "both far above 734.7: the fit makes up for a delay. How far depends on the steps and ramps, "
-    "which the paper does not list; from other operating points {elsewhere} (last table)",
+    ("KIVDC", "II"): "both far above 734.7: the fit compensates for a delay. The amount depends on the steps and ramps, "
+    "which the paper does not list; {elsewhere} from other operating points (last table)",
     (
         "KIVDC",
         "SI",
-    ): "the same fall and widening. Here all of it comes from comparing Irorder1 in the P experiments too",
-    ("KPVDC", "II"): "steps give more than ramps (Fig. 6); the mix is ours",
-    ("KPVDC", "SI"): "here it falls and widens with KIVDC; theirs stays",
-    ("KIP", "II"): "very nearly the same delay; ours is the 1.46 ms of the measurement filters",
-    ("KIP", "SI"): "here Irorder1 in the P experiments pulls KIP too; theirs stays",
+    ): "the same decrease and widening. Here the only cause is that Irorder1 is compared in the P experiments too",
+    ("KPVDC", "II"): "steps give higher values than ramps (Fig. 6); the proportion is ours",
+    ("KPVDC", "SI"): "here it decreases and widens with KIVDC; the paper's does not",
+    ("KIP", "II"): "nearly the same delay; ours is the 1.46 ms of the measurement filters",
+    ("KIP", "SI"): "here Irorder1 in the P experiments affects KIP too; the paper's does not change",
     ("KPP", "II"): "true value 0",
-    ("KPP", "SI"): "0 there; here on that bound in {on_bound} of {runs} runs",
+    ("KPP", "SI"): "0 in the paper; here on this bound in {on_bound} of {runs} runs",
     (
         "KIQ",
         "II",
-    ): "not reproduced: theirs is below 30 and scatters, ours goes with KIP. Something in their Q loop works "
-    "against the delay",
+    ): "not reproduced: the paper's is below 30 and scatters, ours behaves as KIP. Something in the paper's Q loop "
+    "opposes the delay",
     ("KIQ", "SI"): "the same",
     ("KPQ", "II"): "true value 0",
-    ("KPQ", "SI"): "not reproduced: their 0.26 goes with their KIQ",
+    ("KPQ", "SI"): "not reproduced: the paper's 0.26 belongs to its KIQ",
 }
 
 
@@ -157,7 +157,7 @@ def intervals(values: Mapping[str, Any]) -> str:
         "mean, n = 6",
         "one more experiment",
         "all 30 in one fit",
-        "std a run claims",
+        "std of one fit (median)",
     ]
     return markdown(head, rows)
 
@@ -193,7 +193,7 @@ def choices(values: Mapping[str, Any]) -> str:
         "the other controllers' gains at Table II's starts": {
             "individual": values["individual, others at Table II's starts"]
         },
-        "operating points anywhere, not at 40 MW": values["other operating points"],
+        "random operating points instead of 40 MW": values["other operating points"],
         "reference without measurement filters": values["reference without filters"],
     }
     rows = [["the paper", label, *(plus(paper.TABLE_3[n][label]) for n in paper.GAINS)] for label in paper.MODES]

@@ -18,10 +18,10 @@ from common.ending import markdown, number  # noqa: E402
 ROWS = ("Irorder2", "Iiorder1", "Irorder1")  # the paper's order
 COLUMNS = ("upper II", "upper SI", "lower II", "lower SI", "EMTP", "test")
 WHY = {
-    "Irorder2": "the test value's asks for a larger step than ours or a shorter record; as a share of it their floor is "
+    "Irorder2": "the RMSE of the test value suggests a larger step than ours or a shorter record; relative to it the paper's floor is "
     "{ratio} ours",
-    "Iiorder1": "the same; as a share of the test value's their floor is {ratio} ours: more is missing in Q than a delay",
-    "Irorder1": "the test value's asks for a longer record than ours; as a share of it their floor is {ratio} ours",
+    "Iiorder1": "the same; relative to the test value's RMSE the paper's floor is {ratio} ours: more is missing in Q than a delay",
+    "Irorder1": "the RMSE of the test value suggests a longer record than ours; relative to it the paper's floor is {ratio} ours",
 }
 Ends = Mapping[str, Mapping[str, tuple[float, float]]]
 
@@ -69,7 +69,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
     last = "here, with the paper's own mean II"
     return {
         "rmse": markdown(["output", *(f"{c}: paper / here" for c in COLUMNS), "why they differ"], rows),
-        "shares": markdown(["over the test value's", *(f"{c}: paper / here" for c in COLUMNS[:-1]), last], shares),
+        "shares": markdown(["divided by the test value's", *(f"{c}: paper / here" for c in COLUMNS[:-1]), last], shares),
     }
 
 

@@ -220,7 +220,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
             }
         ),
         "named": markdown(
-            ["left out", "verdict", "put in", "as good", "gap held out: refitted, with it", "shrinks by, %"],
+            ["removed part", "verdict", "inserted effects", "equivalents", "held-out gap: refitted, with them", "improvement, %"],
             [_told(part, v) for part, v in values["named"].items()],
         ),
     }

@@ -184,7 +184,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
         "",
         "planted",
         "paper, Table III",
-        "plain link, computed elsewhere",
+        "plain link, independent computation",
         "plain link",
         "lag added, all refitted",
     ]

@@ -33,11 +33,11 @@ def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
         "recorded",
         "noise, pu",
         "verdict",
-        "said to be missing",
-        "delay of these, ms",
-        "as good",
-        "gap held out: given, refitted, with it",
-        "shrinks by, %",
+        "inserted effects",
+        "their delay, ms",
+        "equivalents",
+        "held-out gap: given, refitted, with them",
+        "improvement, %",
     ]
     rows = []
     for signals, t in told.items():
@@ -71,7 +71,7 @@ def _gains(told: Mapping[str, Any]) -> str:
     head = ["", "Table I", "paper, Table III"]
     columns = []
     for signals, t in told.items():
-        head += [f"plain link: {signals}", f"with {diagnosing.effects_of(t)}", "share of the bias gone, %"]
+        head += [f"plain link: {signals}", f"with {diagnosing.effects_of(t)}", "bias removed, %"]
         columns.append((t, diagnosed.share_gone(t)))
     rows = [
         [
