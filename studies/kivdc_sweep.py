@@ -1,4 +1,4 @@
-"""What figure_8 and figure_9 share: the error of Irorder1 over KIVDC, and what the curve alone does not tell.
+"""Shared by figure_8 and figure_9: the error of Irorder1 over KIVDC, with likelihood, verdicts and modes.
 
 Reference waveforms come from the average-value link in the paper's case, the model under test is the phasor link.
 """
@@ -35,7 +35,7 @@ RISE = 1.92  # of the negative log-likelihood at the ends of a 95 % interval
 
 
 def write_waveforms(folder: Path) -> None:
-    """Write the reference waveforms into the folder, one CSV an experiment."""
+    """Write the reference waveforms into the folder, one CSV file for each experiment."""
     time = np.round(np.arange(round(END / SAMPLE) + 1) * SAMPLE, 9)
     for name, (moved, before, after) in MOVES.items():
         signal = InputSignal.step(EVENT, before, after)
@@ -45,17 +45,17 @@ def write_waveforms(folder: Path) -> None:
 
 
 def correlation(study: Study, e: Experiment, values: dict[str, float]) -> float:
-    """The AR(1) coefficient of the residual at the values."""
+    """Return the AR(1) coefficient of the residual at the values."""
     assert e.measured is not None
     run = simulate(study.model, e, values, outputs=(OUTPUT,))[OUTPUT]
     return autocorrelation([e.measured[OUTPUT] - run], 1)
 
 
 def curve(study: Study, found: SweepResult, e: Experiment, noise: float = 0.0) -> dict[str, Any]:
-    """The rise of the negative log-likelihood along the sweep, n/2 log(rmse^2/rmse_min^2), and its 95 % interval.
+    """Return the rise of the negative log-likelihood along the sweep, n/2 log(rmse^2/rmse_min^2), and its 95 % interval.
 
-    n: independent samples the residual is worth. The misfit is correlated from row to row, noise is white: together
-    they are worth N (m^2 + s^2)/(m^2 (1 + rho)/(1 - rho) + s^2) of N rows, m the misfit's floor and s the noise.
+    n: effective number of independent samples. The misfit is correlated from row to row, the noise is white: together
+    n = N (m^2 + s^2)/(m^2 (1 + rho)/(1 - rho) + s^2) for N rows, with the misfit's floor m and the noise s.
     """
     x, squares = found.values("KIVDC"), found.error(OUTPUT, e.name) ** 2
     low = int(np.argmin(squares))
@@ -72,7 +72,7 @@ def curve(study: Study, found: SweepResult, e: Experiment, noise: float = 0.0) -
 
 
 def crossings(x: Array, rises: Array, low: int) -> list[float | None]:
-    """Where the rise passes 1.92 below and above the lowest row; None where it does not inside the sweep."""
+    """Return the values at which the rise exceeds 1.92 below and above the minimum; None outside the sweep."""
     ends: list[float | None] = []
     for side in (range(low, 0, -1), range(low, x.size - 1)):
         step = -1 if isinstance(side, range) and side.step == -1 else 1
@@ -86,7 +86,7 @@ def crossings(x: Array, rises: Array, low: int) -> list[float | None]:
 
 
 def information(study: Study) -> dict[str, dict[str, float]]:
-    """Relative 95 % half-width of KIVDC by noise, KPVDC unknown too, if nothing but white noise stood in the way."""
+    """Return the relative 95 % half-width of KIVDC by noise level, KPVDC unknown too, for white noise alone."""
     at = {"KIVDC": 850.0, "KPVDC": 26.2}
     s = trajectory_sensitivities(study.model, study.experiments, ["KIVDC", "KPVDC"], values=at)
     j = {name: np.column_stack([s.of(name, OUTPUT, p) for p in s.parameters]) for name in MOVES}
@@ -99,7 +99,7 @@ def information(study: Study) -> dict[str, dict[str, float]]:
 
 
 def verdicts(study: Study, bounds: tuple[float, float]) -> list[dict[str, Any]]:
-    """What the identifiability report says of KIVDC, KPVDC unknown too, by noise, without and with the load step."""
+    """Return the identifiability verdicts on KIVDC, KPVDC unknown too, by noise level, without and with the load step."""
     free = [FitParameter("KPVDC", 20, 10, 40), FitParameter("KIVDC", min(max(750, bounds[0]), bounds[1]), *bounds)]
     found = []
     for noise in NOISE:
@@ -126,7 +126,7 @@ def verdicts(study: Study, bounds: tuple[float, float]) -> list[dict[str, Any]]:
 
 
 def modes(study: Study, values: list[float]) -> list[dict[str, float | None]]:
-    """The dc-voltage mode and the margins of its loop, opened at the control error, at some values of KIVDC."""
+    """Return the dc voltage mode and the margins of its loop, opened at the control error, at some values of KIVDC."""
     found = []
     for value in values:
         model = study.model.with_values({"KIVDC": value})
@@ -150,14 +150,14 @@ def modes(study: Study, values: list[float]) -> list[dict[str, float | None]]:
 
 
 def swept(study: Study) -> SweepResult:
-    """The study's own sweep."""
+    """Return the sweep that the study file defines."""
     return sweep(
         study.model, study.experiments, sweep_axes(study.settings.sweep, 0), values=study.values, want=("rmse", "poles")
     )
 
 
 def draw(found: SweepResult, curves: dict[str, Any], title: str, paper: dict[float, float]) -> Any:
-    """A figure: RMSE over KIVDC with the paper's numbers, the rise of the likelihood, and the poles."""
+    """Draw RMSE over KIVDC with the paper's numbers, the rise of the negative log-likelihood, and the poles."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -188,7 +188,7 @@ def draw(found: SweepResult, curves: dict[str, Any], title: str, paper: dict[flo
 
 
 def main(folder: Path, title: str, at: tuple[float, ...], paper: dict[float, float]) -> dict[str, Any]:
-    """The numbers of a study's README; result.json and figure.svg are in the folder."""
+    """Write result.json and figure.svg into the folder and return the numbers of the README."""
     write_waveforms(folder)
     study = load_study(folder / "study.toml")
     found = swept(study)
@@ -217,7 +217,7 @@ def main(folder: Path, title: str, at: tuple[float, ...], paper: dict[float, flo
 
 
 def tell(folder: Path, result: dict[str, Any]) -> None:
-    """Print the numbers beside those expected."""
+    """Print the numbers beside the expected ones."""
     expected = json.loads((folder / "expected.json").read_text(encoding="utf-8"))
     for name, line in result["rmse"].items():
         print(f"RMSE of {OUTPUT}, {name}, pu")

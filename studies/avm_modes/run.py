@@ -1,4 +1,4 @@
-"""The average-value link's modes, named by participation, and the delays of its inner loop and measurements.
+"""Modes of the average-value link, named by participation, and the delays of its inner loop and measurements.
 
 python studies/avm_modes/run.py
 """
@@ -23,14 +23,14 @@ OMEGA = 1.0  # rad/s, far below every mode
 
 
 def path_delay(linear: LinearModel, source: str, before: str, after: str, omega: float = 1.0) -> float:
-    """The delay in s from one output to another at omega in rad/s, both driven by one input: -arg(after/before)/omega."""
+    """Return the delay in s between two outputs at omega in rad/s, both driven by one input: -arg(after/before)/omega."""
     response = linear.response(np.array([omega]))[0, :, linear.input_names.index(source)]
     ratio = response[linear.output_names.index(after)] / response[linear.output_names.index(before)]
     return float(-np.angle(ratio) / omega)
 
 
 def main(name: str) -> dict[str, Any]:
-    """Modes (name, rad/s, Hz, damping) from the slowest on, and delays at low frequency in ms, of a shipped link."""
+    """Return modes (name, rad/s, Hz, damping), the slowest first, and low-frequency delays in ms of a shipped link."""
     model = load_model(name)
     inputs = list(dict.fromkeys(source for source, _, _ in PATHS.values()))
     outputs = [signal for _, *pair in PATHS.values() for signal in pair]

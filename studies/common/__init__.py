@@ -1,1 +1,1 @@
-"""What the studies of the paper share: its numbers, its experiments on the average-value link, and how a study ends."""
+"""Shared by the studies of the paper: its numbers, its experiments on the average-value link, and the end of a study."""

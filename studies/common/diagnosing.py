@@ -1,4 +1,4 @@
-"""A diagnosis as a study tells it: plain numbers for expected.json, and words for its tables."""
+"""A diagnosis in the form that studies report: plain numbers for expected.json and text for the tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hvdc_ident.executor import Progress
 
 
 def told(found: Diagnosis) -> dict[str, Any]:
-    """Verdict, effects with their sizes, ambiguity sets, gap in noise units, and parameters: given, refitted, with the effects."""
+    """Return verdict, effects with sizes, ambiguity sets, gap in noise units, and given, refitted and augmented parameters."""
     return {
         "verdict": found.verdict,
         "text": found.text,
@@ -46,7 +46,7 @@ def told(found: Diagnosis) -> dict[str, Any]:
 
 
 def label(line: Mapping[str, Any], digits: int = 3) -> str:
-    """An effect with its place and its sizes: "lag at P2_m (T 0.00146)"."""
+    """Return an effect with its insertion point and sizes: "lag at P2_m (T 0.00146)"."""
     brought = f" from {line['from']}" if line["from"] else ""
     sizes = ", ".join(
         f"{n} {number(s['value'] if isinstance(s, Mapping) else s, digits)}" for n, s in line["parameters"].items()
@@ -55,12 +55,12 @@ def label(line: Mapping[str, Any], digits: int = 3) -> str:
 
 
 def effects_of(diagnosed: Mapping[str, Any]) -> str:
-    """The effects that were put in; a dash for none."""
+    """Return the inserted effects as text; a dash for none."""
     return "; ".join(label(e) for e in diagnosed["effects"]) or "-"
 
 
 def on_stderr(name: str) -> Progress:
-    """Progress of a diagnosis on stderr, a line a step."""
+    """Return a function that reports the progress of a diagnosis on stderr, one line for each step."""
     begun = time.perf_counter()
 
     def tell(done: int, total: int, text: str) -> None:

@@ -1,7 +1,7 @@
-"""How a study ends: its numbers beside those expected, its tables in the README, its figure.
+"""The end of a study: its numbers beside the expected ones, its tables in the README, its figure.
 
-A study's run.py gives `main(...)`, its numbers; `tables(values)`, the README's tables by name; `draw(values)`, the
-figure. Without --pin nothing in the folder changes: the numbers are compared with expected.json.
+A study's run.py provides `main(...)`, its numbers; `tables(values)`, the README's tables by name; `draw(values)`, the
+figure. Without --pin the folder does not change: the numbers are compared with expected.json.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DIGITS = 6
 
 
 def arguments(text: str | None, *, quick: str = "", workers: bool = False) -> argparse.Namespace:
-    """The command line: --pin, and where they are useful --quick and --workers."""
+    """Return the parsed command line: --pin and, where they are useful, --quick and --workers."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pin", action="store_true", help="write expected.json, the README's tables and the figure")
     if quick:
@@ -41,9 +41,9 @@ def ended(
     begun: float | None = None,
     whole: bool = True,
 ) -> int:
-    """The exit code, once the tables are printed and the numbers compared (or, with `pin`, written).
+    """Print the tables, compare the numbers (or, with `pin`, write them) and return the exit code.
 
-    whole: whether every number was computed; where not, lists may be shorter than expected and nothing is pinned.
+    whole: True if every number was computed; otherwise lists may be shorter than expected and nothing is pinned.
     """
     values = rounded(values)
     for name, text in tables(values).items() if whole else ():
@@ -68,7 +68,7 @@ def ended(
 
 
 def rounded(value: Any, digits: int = DIGITS) -> Any:
-    """The value with every number at so many significant digits, as plain lists, dicts and numbers."""
+    """Return the value as plain lists, dicts and numbers, each rounded to that many significant digits."""
     if isinstance(value, Mapping):
         return {str(k): rounded(v, digits) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -83,7 +83,7 @@ def rounded(value: Any, digits: int = DIGITS) -> Any:
 def differences(
     expected: Any, found: Any, tolerance: Mapping[str, float], where: str = "", *, whole: bool = True
 ) -> list[str]:
-    """In words, each number that lies further off than tolerance["relative"] and tolerance["absolute"] together."""
+    """Return, as text, each number that differs by more than tolerance["relative"] and tolerance["absolute"] together."""
     if isinstance(expected, Mapping):
         if not isinstance(found, Mapping):
             return [f"{where}: expected a table, got {found!r}"]
@@ -106,12 +106,12 @@ def differences(
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows])
 
 
 def write_tables(readme: Path, tables: Mapping[str, str]) -> None:
-    """Put each table into the README between its marks. Raises ValueError where the marks are missing."""
+    """Write each table into the README between its marks. Raises ValueError where the marks are missing."""
     text = readme.read_text(encoding="utf-8")
     for name, table in tables.items():
         head, rest = text.split(f"<!-- {name} -->\n", 1)
@@ -121,7 +121,7 @@ def write_tables(readme: Path, tables: Mapping[str, str]) -> None:
 
 
 def save(figure: Any, path: Path) -> None:
-    """Write the figure as an SVG file, the same bytes each time."""
+    """Write the figure as an SVG file, with the same bytes each time."""
     import matplotlib
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -130,7 +130,7 @@ def save(figure: Any, path: Path) -> None:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """The number at so many significant digits, without an exponent from 1e-5 to 1e5; a dash for None."""
+    """Return the number with that many significant digits, without an exponent from 1e-5 to 1e5; a dash for None."""
     if value is None:
         return "-"
     if value == 0:
@@ -142,5 +142,5 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def interval(ends: Sequence[float] | None, digits: int = 4) -> str:
-    """Both ends of an interval; a dash for None."""
+    """Return both ends of an interval as text; a dash for None."""
     return "-" if ends is None else f"{number(ends[0], digits)} to {number(ends[1], digits)}"

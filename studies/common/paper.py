@@ -30,7 +30,7 @@ EVENT, END, SAMPLE = 0.1, 0.9, 5e-4  # s
 
 @dataclass(frozen=True)
 class Controller:
-    """A controller: its set-point with the step that stands for it (before, after), its output, its gains."""
+    """A controller: its set-point with its representative step (before, after), its output and its gains."""
 
     setpoint: str
     before: float
@@ -115,25 +115,25 @@ EQUAL = 1e-3
 
 
 def free(names: Iterable[str]) -> tuple[FitParameter, ...]:
-    """The unknowns as Table II sets them up."""
+    """Return the fit parameters as Table II defines them."""
     return tuple(FitParameter(n, TABLE_2[n][2], TABLE_2[n][0], TABLE_2[n][1]) for n in names)
 
 
 def link() -> ModelSimulator:
-    """The model under calibration."""
+    """Return the model under calibration."""
     return ModelSimulator(load_model(LINK))
 
 
 def recordings(count: int = 30, *, source: str = REFERENCE, at_rest: bool = True) -> tuple[Experiment, ...]:
-    """So many noise-free steps and ramps of each controller, its output and the two others recorded.
+    """Return noise-free steps and ramps of each controller, with its output and the two others recorded.
 
-    The first ones are the same whatever the count. at_rest: from the 40 MW operating point, not from anywhere.
+    The first ones do not depend on the count. at_rest: start at the 40 MW operating point instead of a random one.
     """
     return tuple(recorded(Campaign(source=source, count=count, noise=Noise(0.0), sample=SAMPLE, at_rest=at_rest)))
 
 
 def step(kind: str, source: Model | str = REFERENCE, outputs: Sequence[str] = OUTPUTS) -> Experiment:
-    """The one step that stands for a controller, recorded on a model: 0.9 s from rest, every 0.5 ms, no noise."""
+    """Return the representative step of a controller, recorded on a model: 0.9 s from steady state, every 0.5 ms, no noise."""
     c = CONTROLLERS[kind]
     time = np.round(np.arange(round(END / SAMPLE) + 1) * SAMPLE, 9)
     signal = InputSignal.step(EVENT, c.before, c.after)
@@ -143,13 +143,13 @@ def step(kind: str, source: Model | str = REFERENCE, outputs: Sequence[str] = OU
 
 
 def of(kind: str, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
-    """The experiments in which the controller's set-point moves, its own output alone."""
+    """Return the experiments in which the controller's set-point moves, with its own output only."""
     c = CONTROLLERS[kind]
     return tuple(e.with_(measured=e.measured.select([c.output])) for e in experiments if c.setpoint in e.inputs)
 
 
 def without(output: str, kind: str, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
-    """All the experiments, the output not recorded where this controller's set-point moves."""
+    """Return all experiments; the output is not recorded where this controller's set-point moves."""
     moved = CONTROLLERS[kind].setpoint
     return tuple(
         e.with_(measured=e.measured.select([o for o in e.outputs if o != output])) if moved in e.inputs else e
@@ -160,9 +160,9 @@ def without(output: str, kind: str, experiments: Iterable[Experiment]) -> tuple[
 def individual(
     experiments: Sequence[Experiment], *, held: Mapping[str, float] | None = None, executor: Any = None
 ) -> dict[str, dict[str, Any]]:
-    """By gain what `fit_each` says: each controller by itself, on its own output, one experiment a fit.
+    """Return the results of `fit_each` by gain: each controller separately, on its own output, one experiment for each fit.
 
-    held: values of the other controllers' gains; Table I's where none are given.
+    held: values of the other controllers' gains; if left out, those of Table I.
     """
     found: dict[str, dict[str, Any]] = {}
     for kind, c in CONTROLLERS.items():
@@ -173,9 +173,9 @@ def individual(
 
 
 def simultaneous(experiments: Sequence[Experiment], *, executor: Any = None) -> dict[str, dict[str, Any]]:
-    """By gain what `fit_each` says: all six at once from one experiment of each controller, a plain sum of squares.
+    """Return the results of `fit_each` by gain: all six at once from one experiment of each controller, unweighted.
 
-    Every output recorded is compared in every experiment, as in the paper's one set-up.
+    Every recorded output is compared in every experiment, as in the paper's simultaneous set-up.
     """
     alike = [e.with_(noise=FrozenMap(dict.fromkeys(e.outputs, EQUAL))) for e in experiments]
     groups = [[e.name for e in alike if c.setpoint in e.inputs] for c in CONTROLLERS.values()]
@@ -184,7 +184,7 @@ def simultaneous(experiments: Sequence[Experiment], *, executor: Any = None) -> 
 
 
 def together(experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:
-    """By gain: each controller's fit to all its experiments at once, with an interval from their scatter (t, n - 1)."""
+    """Return by gain each controller's fit to all its experiments at once, with an interval from their scatter (t, n - 1)."""
     from scipy.stats import t
 
     found = {}
@@ -200,7 +200,7 @@ def together(experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:
 
 
 def values_of(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float]]:
-    """The estimates by gain, in the order of the runs. Raises where a fit ended without one."""
+    """Return the estimates by gain, in the order of the runs. Raises if a fit ended without an estimate."""
     table = {}
     for name in GAINS:
         rows = found[name]["experiments"]
@@ -212,7 +212,7 @@ def values_of(found: Mapping[str, Mapping[str, Any]]) -> dict[str, list[float]]:
 
 
 def intervals_of_mean(values: Mapping[str, Mapping[str, list[float]]]) -> dict[str, dict[str, tuple[float, float]]]:
-    """By II or SI and gain the 95 % interval of the mean as the paper computes it: n = 30, and 6 for simultaneous runs."""
+    """Return the 95 % interval of the mean by II or SI and gain, as the paper computes it: n = 30, and 6 for simultaneous runs."""
     ends: dict[str, dict[str, tuple[float, float]]] = {}
     for label, mode in MODES.items():
         for n in GAINS:
@@ -223,7 +223,7 @@ def intervals_of_mean(values: Mapping[str, Mapping[str, list[float]]]) -> dict[s
 
 
 def rmse(recorded: Experiment, gains: Mapping[str, float], model: Model | str = LINK) -> dict[str, float]:
-    """RMSE in pu of each output recorded, the model with these gains."""
+    """Return the RMSE in pu of each recorded output for the model with these gains."""
     assert recorded.measured is not None
     chosen = load_model(model) if isinstance(model, str) else model
     run = simulate(chosen, recorded.with_(measured=None), gains, outputs=recorded.outputs)

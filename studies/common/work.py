@@ -1,4 +1,4 @@
-"""Processes for the fits of a study, kept for the whole of it."""
+"""Worker processes for the fits of a study."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 @contextmanager
 def processes(workers: int) -> Iterator[Any]:
-    """An executor with so many processes, or None for this process alone."""
+    """Return an executor with that many processes, or None for this process alone."""
     if workers <= 1:
         yield None
         return

@@ -1,4 +1,4 @@
-"""What the phasor link lacks on waveforms computed by Dymola: what is named, told nothing, and the gap before and after.
+"""What the phasor link lacks on waveforms computed by Dymola: the diagnosis without hints, and the gap before and after.
 
 python studies/dymola_missing/run.py [--workers N] [--pin]
 
@@ -42,7 +42,7 @@ TRIED = {  # the effect that explains most, at each of the places where it does,
 
 
 def setup() -> tuple[Model, Experiment, tuple[FitParameter, ...]]:
-    """The link with the ratings of the authors' model, the P step on an even grid, and the gains begun where they were."""
+    """Return the link with the ratings of the authors' model, the P step on an even grid, and the gains with their starts."""
     study = load_study(STUDY)
     (given,) = study.experiments
     begin, end = given.window or (given.time[0], given.time[-1])
@@ -58,14 +58,14 @@ def setup() -> tuple[Model, Experiment, tuple[FitParameter, ...]]:
 
 
 def errors(model: Model, e: Experiment, values: Mapping[str, float]) -> dict[str, float]:
-    """RMSE by output, pu."""
+    """Return the RMSE by output, pu."""
     assert e.measured is not None
     run = simulate(model, e.with_(measured=None), values, outputs=e.outputs)
     return {o: float(np.sqrt(np.mean((run[o] - e.measured[o]) ** 2))) for o in e.outputs}
 
 
 def refits() -> dict[str, Any]:
-    """Gains and RMSE of the plain link with the true gains and fitted, and fitted with one effect, by effect and place."""
+    """Return gains and RMSE of the plain link, with the true gains and fitted, and of the link fitted with one effect."""
     model, e, free = setup()
     plain = fit(Problem(ModelSimulator(model), (e,), free), starts=4, seed=0)
     found: dict[str, Any] = {
@@ -91,7 +91,7 @@ def _row(model: Model, e: Experiment, result: Any, own: str = "") -> dict[str, A
 
 
 def named(executor: Any = None) -> dict[str, Any]:
-    """What the diagnosis says, told nothing: the whole catalogue at every place."""
+    """Return the diagnosis without hints: every effect at every insertion point."""
     model, e, free = setup()
     found = diagnose(
         model,
@@ -112,13 +112,13 @@ def named(executor: Any = None) -> dict[str, Any]:
 
 
 def main(workers: int = 1) -> dict[str, Any]:
-    """The refits and the diagnosis."""
+    """Return the refits and the diagnosis."""
     with processes(workers) as executor:
         return {"refits": refits(), "told nothing": named(executor)}
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     told, cases = values["told nothing"], values["refits"]
     outputs = list(next(iter(cases.values()))["rmse"])
     gains = [

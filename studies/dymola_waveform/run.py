@@ -23,7 +23,7 @@ TRUE = {"KIP": 30.0, "KPVDC": 9.6, "KIVDC": 293.88}
 
 
 def errors(study, values):
-    """RMSE by output at the gains."""
+    """Return the RMSE by output at the gains."""
     (experiment,) = study.experiments
     run = simulate(study.model, experiment, values).trajectory
     rows = experiment.compared
@@ -31,7 +31,7 @@ def errors(study, values):
 
 
 def main() -> dict:
-    """Gains and RMSE per output: at the start, at the true gains, fitted, and fitted with one lag on all currents."""
+    """Return gains and RMSE by output: at the start, at the true gains, fitted, and fitted with one lag on all currents."""
     study = load_study(HERE / "study.toml")
     free = tuple(study.candidates.values())
     plain = fit(Problem(ModelSimulator(study.model), study.experiments, free), starts=8, seed=0)

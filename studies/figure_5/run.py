@@ -1,4 +1,4 @@
-"""Fig. 5: what stands around the model in a fit, as study files: one for each controller, one for all three.
+"""Fig. 5: the set-up of a fit as study files, one for each controller and one for all three.
 
 python studies/figure_5/run.py [--quick] [--pin]
 """
@@ -34,7 +34,7 @@ WHY = {
 
 
 def write_waveforms() -> None:
-    """Write the reference's answer to one step of each set-point into the folder, all three outputs."""
+    """Write the reference's response to one step of each set-point into the folder, all three outputs."""
     for kind, c in paper.CONTROLLERS.items():
         e = paper.step(kind)
         recorded = [np.round(e.measured[o], 9) for o in e.outputs]
@@ -43,7 +43,7 @@ def write_waveforms() -> None:
 
 
 def main(setups: Sequence[str] = tuple(SETUPS)) -> dict[str, Any]:
-    """By set-up what `hvdc-ident fit` says: status, estimates, and what the report held back."""
+    """Return the result of `hvdc-ident fit` by set-up: status, estimates and held parameters."""
     found = {}
     for setup in setups:
         study = load_study(HERE / SETUPS[setup])
@@ -60,7 +60,7 @@ def main(setups: Sequence[str] = tuple(SETUPS)) -> dict[str, Any]:
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's table."""
+    """Return the README's table."""
     rows = []
     for setup, v in values.items():
         estimates = [f"{n} {number(e['value'])} ({ends(e['ci95'])})" for n, e in v["estimates"].items()]
@@ -73,12 +73,12 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def ends(ci: Sequence[float | None] | None) -> str:
-    """Both ends of an interval, a dash for one that is not known."""
+    """Return both ends of an interval as text, a dash for an unknown one."""
     return "no interval" if ci is None else " to ".join(number(v) for v in ci)
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """The container of the Vdc controller: recorded inputs in, the model with its unknowns, outputs compared."""
+    """Draw the container of the Vdc controller: recorded inputs, the model with its unknowns, compared outputs."""
     from hvdc_ident.report.drawing import figure
 
     study = load_study(HERE / SETUPS["Vdc"])

@@ -1,4 +1,4 @@
-"""Fig. 6: histograms of the gains that 30 experiments of each controller give, fitted one by one.
+"""Fig. 6: histograms of the gains from 30 experiments of each controller, fitted one by one.
 
 python studies/figure_6/run.py [--quick] [--pin]
 """
@@ -30,7 +30,7 @@ WHY = {
 
 
 def main(count: int = 30) -> dict[str, Any]:
-    """By gain and shape of the experiment the estimates."""
+    """Return the estimates by gain and shape of the experiment."""
     found = paper.individual(paper.recordings(count))
     values = paper.values_of(found)
     names = {n: list(found[n]["experiments"]) for n in ORDER}
@@ -41,7 +41,7 @@ def main(count: int = 30) -> dict[str, Any]:
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's table."""
+    """Return the README's table."""
     rows = []
     for n in ORDER:
         steps, ramps = (np.array(values[n][s]) for s in ("step", "ramp"))
@@ -64,12 +64,12 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def plus(values: Any) -> str:
-    """Mean and std."""
+    """Return mean and std as text."""
     return f"{number(values.mean())} ± {number(values.std(ddof=1), 2)}"
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """Six histograms, steps and ramps stacked; Table I's value and the paper's mean lie off the picture: in the title."""
+    """Draw six histograms, steps and ramps stacked; the titles give Table I's value and the paper's mean, outside the axes."""
     from hvdc_ident.report.drawing import figure
 
     fig = figure(11, 5.5)

@@ -31,15 +31,15 @@ WHY = {
 
 
 def perturbations() -> dict[str, list[Experiment]]:
-    """By output a step and a ramp of its set-point from the 40 MW operating point, none of them among Table III's."""
+    """Return by output a step and a ramp of its set-point from the 40 MW operating point, none of them among Table III's."""
     experiments = tuple(recorded(OTHERS))
     return {c.output: list(paper.of(kind, experiments)) for kind, c in paper.CONTROLLERS.items()}
 
 
 def main(ends: Mapping[str, Mapping[str, tuple[float, float]]] | None = None) -> dict[str, Any]:
-    """The gains drawn, and RMSE in pu by output, perturbation and set of gains.
+    """Return the plotted gains, and the RMSE in pu by output, perturbation and set of gains.
 
-    ends: Table III's intervals of the mean; computed anew where none are given.
+    ends: Table III's intervals of the mean; if left out, they are computed.
     """
     pairs = (ends if ends is not None else fresh_ends())["II"]
     sets = {
@@ -55,13 +55,13 @@ def main(ends: Mapping[str, Mapping[str, tuple[float, float]]] | None = None) ->
 
 
 def fresh_ends() -> Any:
-    """Table III's intervals of the mean, from the individual fits; the simultaneous ones are not drawn."""
+    """Return Table III's intervals of the mean from the individual fits; the simultaneous ones are not plotted."""
     found = paper.values_of(paper.individual(paper.recordings()))
     return paper.intervals_of_mean(dict.fromkeys(paper.MODES.values(), found))
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's table: shares of the test value's RMSE, by perturbation."""
+    """Return the README's table: shares of the test value's RMSE, by perturbation."""
     rows = []
     for o, by_experiment in values["rmse"].items():
         theirs = paper.TABLE_4[o]
@@ -75,7 +75,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """Each output in its step and its ramp: reference blue, ends of the interval red, test values black; then errors."""
+    """Draw each output in its step and its ramp (reference blue, ends of the interval red, test values black) and the errors."""
     from hvdc_ident.report.drawing import figure
 
     fig = figure(11, 9)

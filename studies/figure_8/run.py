@@ -1,4 +1,4 @@
-"""Fig. 8: the error of Irorder1 over KIVDC from 550 to 950, and what the curve alone does not tell.
+"""Fig. 8: the error of Irorder1 over KIVDC from 550 to 950, with likelihood, verdicts and modes.
 
 python studies/figure_8/run.py
 """
@@ -19,7 +19,7 @@ PAPER = {550.0: 0.0053, 780.0: 0.0033, 850.0: 0.0033, 950.0: 0.0036}
 
 
 def main() -> dict[str, Any]:
-    """The numbers of the README."""
+    """Return the numbers of the README."""
     return study(HERE, "Fig. 8", AT, PAPER)
 
 

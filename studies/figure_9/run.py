@@ -1,4 +1,4 @@
-"""Fig. 9: the error of Irorder1 over KIVDC from 250 to 1500, and what the curve alone does not tell.
+"""Fig. 9: the error of Irorder1 over KIVDC from 250 to 1500, with likelihood, verdicts and modes.
 
 python studies/figure_9/run.py
 """
@@ -18,7 +18,7 @@ AT = (250.0, 400.0, 550.0, 850.0, 1200.0, 1500.0)
 
 
 def main() -> dict[str, Any]:
-    """The numbers of the README."""
+    """Return the numbers of the README."""
     return study(HERE, "Fig. 9", AT, {})
 
 

@@ -1,4 +1,4 @@
-"""Models as FMUs and back: trajectories, linear models, identifiable sets and estimates, both ways.
+"""Models exported as FMUs and imported again: trajectories, linear models, identifiable sets and estimates.
 
     python studies/fmu_round_trip/run.py            (every model and effect, and the full studies)
     python studies/fmu_round_trip/run.py --quick    (the link and three effects; one full study)
@@ -42,7 +42,7 @@ NOISE = 1e-4  # pu, standard deviation of the studies' recordings
 
 
 def models(quick: bool) -> Iterator[tuple[str, Model]]:
-    """Every shipped model, and the link with each effect of the catalogue in its P loop."""
+    """Return every shipped model, and the link with each effect of the catalogue in its P loop."""
     for name in shipped_models():
         if not quick or name in QUICK:
             yield name, load_model(name)
@@ -61,7 +61,7 @@ def models(quick: bool) -> Iterator[tuple[str, Model]]:
 
 
 def case(model: Model) -> Experiment:
-    """Steps of the first power and the first voltage set-point; no row falls on the instant of a sample."""
+    """Return steps of the first power and voltage set-points; no row coincides with a sampling instant."""
     rows = np.concatenate([[0.0], np.linspace(0.00057, 0.3, 211)])
     moved = [n for n in model.inputs if n.startswith("Pref")][:1] + [n for n in model.inputs if n.startswith("Vdcref")][
         :1
@@ -74,12 +74,12 @@ def case(model: Model) -> Experiment:
 
 
 def worst(found: Any, expected: Any, names: Mapping[str, Any]) -> float:
-    """The largest difference of two runs, in shares of each output's largest size (and 1e-3)."""
+    """Return the largest difference of two runs, relative to each output's largest magnitude (at least 1e-3)."""
     return max(float(np.abs(found[n] - expected[n]).max() / (np.abs(expected[n]).max() + 1e-3)) for n in names)
 
 
 def agreement(model: Model, folder: Path) -> dict[str, float]:
-    """Differences between the model and its FMUs: trajectories by version and kind, and A, B, C, D."""
+    """Return differences between the model and its FMUs: trajectories by version and kind, and A, B, C, D."""
     e, row = case(model), {}
     reference = simulate(model, e, rtol=1e-3 * RTOL)
     for version in ("2.0", "3.0"):
@@ -96,7 +96,7 @@ def agreement(model: Model, folder: Path) -> dict[str, float]:
 
 
 class Case(NamedTuple):
-    """A full study: a model, what it is recorded with, and what is estimated."""
+    """A full study: a model, its experiment and its fit parameters."""
 
     model: Callable[[], Model]
     candidates: Mapping[str, tuple[float, float, float]]  # start, min, max
@@ -122,7 +122,7 @@ CASES = {
 
 
 def full_study(chosen: Case, folder: Path, kinds: Mapping[str, str]) -> dict[str, Any]:
-    """The identifiable set by the model and by its FMUs, and by how much the estimates differ, in standard deviations."""
+    """Return the identifiable sets of the model and its FMUs, and the differences of the estimates in standard deviations."""
     model = chosen.model()
     folder.mkdir(parents=True, exist_ok=True)
     save_card(model, folder / "model.toml")
@@ -165,7 +165,7 @@ def _study_text(chosen: Case, source: str, kind: str) -> str:
 
 
 def beyond(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
-    """What lies beyond its limit, in words."""
+    """Return the numbers beyond their limits, as text."""
     found = []
     for model, row in values["agreement"].items():
         for what, value in row.items():
@@ -182,7 +182,7 @@ def beyond(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
 
 
 def table(values: Mapping[str, Any]) -> str:
-    """The README's two tables."""
+    """Return the README's two tables."""
     columns = ["ME 2", "CS 2", "ME 3", "CS 3", "A, B, C, D"]
     lines = [f"| model | {' | '.join(columns)} |", "|---" * 6 + "|"]
     for model, row in values["agreement"].items():
@@ -195,7 +195,7 @@ def table(values: Mapping[str, Any]) -> str:
 
 
 def main(quick: bool = False, parts: Collection[str] = PARTS, say: Callable[[str], None] = print) -> dict[str, Any]:
-    """All numbers: differences by model, and the studies' sets and estimates."""
+    """Return all numbers: differences by model, and the studies' sets and estimates."""
     values: dict[str, Any] = {"agreement": {}, "studies": {}}
     with tempfile.TemporaryDirectory(prefix="round-trip-") as place:
         for k, (name, model) in enumerate(models(quick)) if "agreement" in parts else ():

@@ -1,4 +1,4 @@
-"""Effects hidden by another simulator, and what `diagnose` makes of them. See README.md."""
+"""Effects hidden by another simulator, and their diagnoses. See README.md."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SEED = 42
 
 
 def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
-    """The line of one case: made, diagnosed, compared."""
+    """Return the line of one case: generated, diagnosed, compared."""
     from hidden.diagnosing import diagnosed
 
     begin = time.perf_counter()
@@ -49,7 +49,7 @@ def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
 
 
 def lines(path: Path, crashes: bool = False) -> dict[str, dict[str, Any]]:
-    """What a file of results holds, by case; a last line that a kill cut short is left out, and unless asked for, so are crashes."""
+    """Return the lines of a result file by case, without a truncated last line and, unless requested, without crashes."""
     found: dict[str, dict[str, Any]] = {}
     if path.exists():
         for text in path.read_text(encoding="utf-8").splitlines():
@@ -65,7 +65,7 @@ def lines(path: Path, crashes: bool = False) -> dict[str, dict[str, Any]]:
 def pending(
     parts: list[str], seed: int, limit: int | None, done: set[str], full: bool = False, least: float = 0.0
 ) -> Iterator[Design]:
-    """The cases still to be done, the parts in turn so that an early stop has something of each.
+    """Return the cases still to be done, the parts in turn, so that an early stop has cases of each.
 
     limit: of each part; least: size of a hidden effect.
     """
@@ -78,7 +78,7 @@ def pending(
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """The summary; results are kept line by line and a second call goes on where the first one stopped."""
+    """Return the summary; results are kept line by line, and a second call resumes the first."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--limit", type=int, help="cases of each part at most")
@@ -106,7 +106,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 
 
 def _work(todo: list[Design], asked: argparse.Namespace, path: Path, before: int) -> None:
-    """Append each case's line to the file as soon as it is there."""
+    """Append each case's line to the file as soon as it is finished."""
     if path.exists() and path.read_bytes()[-1:] not in (b"\n", b""):
         with path.open("a", encoding="utf-8") as stream:
             stream.write("\n")

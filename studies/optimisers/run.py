@@ -1,4 +1,4 @@
-"""RaPId's catalogue of optimisers on the link: evaluations, time and cost reached, each from Table II's start.
+"""RaPId's optimisers on the link: evaluations, time and final cost of each from Table II's start.
 
 python studies/optimisers/run.py [--budget 5000] [--only NAME ...] [--write]
 """
@@ -40,7 +40,7 @@ HERE = Path(__file__).parent
 
 @cache
 def problem() -> Problem:
-    """Three steps of set-points of the link with its true gains and white noise, six gains to be found."""
+    """Return the problem: three set-point steps of the link with its true gains and white noise, six gains to estimate."""
     model = load_model("vsc-hvdc-link")
     random = np.random.default_rng(SEED)
     data = []
@@ -53,7 +53,7 @@ def problem() -> Problem:
 
 
 def one(name: str, budget: int) -> dict[str, Any]:
-    """A run of the named method alone, nothing refined after it: status, evaluations, cost, CPU seconds."""
+    """Return status, evaluations, cost and CPU seconds of the named method alone, without refinement."""
     method = replace(optimiser(name, SEED), max_evaluations=budget)
     begun = time.process_time()
     run = method.run(problem(), problem().start)
@@ -68,7 +68,7 @@ def one(name: str, budget: int) -> dict[str, Any]:
 
 
 def main(names: list[str] | None = None, budget: int = 5000) -> dict[str, Any]:
-    """By method what it took and reached; `best` is the cost of the package's multistart, `above` the cost over it."""
+    """Return effort and result by method; `best` is the cost of the package's multistart, `above` the cost beyond it."""
     problem().residual(problem().start)
     problem().cost(problem().start)  # both kinds of machine code are made before the clock runs
     best = fit(problem(), starts=8, assess=False)
@@ -80,7 +80,7 @@ def main(names: list[str] | None = None, budget: int = 5000) -> dict[str, Any]:
 
 
 def shown(found: dict[str, Any]) -> str:
-    """The table of the README."""
+    """Return the table of the README."""
     lines = [
         "| method | searches | status | evaluations | CPU time, s | cost above the best |",
         "|---|---|---|---|---|---|",

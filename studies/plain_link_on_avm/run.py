@@ -1,4 +1,4 @@
-"""The phasor link, which has no delay, fitted to single steps of the average-value link: this folder's table.
+"""The phasor link, which has no delay, fitted to single steps of the average-value link.
 
 python studies/plain_link_on_avm/run.py
 """
@@ -27,7 +27,7 @@ CASES = {"with filters": "vsc-hvdc-avm", "without filters": "vsc-hvdc-avm-unfilt
 
 
 def recording(source: str, step: str) -> Experiment:
-    """One step recorded on an average-value link: 0.9 s from rest, every 0.5 ms, no noise."""
+    """Return one step recorded on an average-value link: 0.9 s from steady state, every 0.5 ms, no noise."""
     moved, before, after, output, _ = STEPS[step]
     time = np.round(np.arange(round(END / SAMPLE) + 1) * SAMPLE, 9)
     plain = experiment(step, time, {moved: InputSignal.step(EVENT, before, after)}, event=EVENT)
@@ -35,7 +35,7 @@ def recording(source: str, step: str) -> Experiment:
 
 
 def fitted(source: str) -> dict[str, float]:
-    """The gains of the phasor link fitted to each step by itself, and RMSE of the output in pu."""
+    """Return the gains of the phasor link fitted to each step separately, and the RMSE of the output in pu."""
     simulator = ModelSimulator(load_model("vsc-hvdc-link"))
     found: dict[str, float] = {}
     for step, (_, _, _, output, gains) in STEPS.items():
@@ -47,7 +47,7 @@ def fitted(source: str) -> dict[str, float]:
 
 
 def main() -> dict[str, dict[str, float]]:
-    """The fitted gains by case."""
+    """Return the fitted gains by case."""
     return {case: fitted(source) for case, source in CASES.items()}
 
 

@@ -1,4 +1,4 @@
-"""How often the profile's 95 % interval holds the truth: 2000 noisy records of the link, two gains fitted to each.
+"""Coverage of the 95 % profile likelihood interval: 2000 noisy records of the link, two gains fitted to each.
 
 python studies/profile_coverage/run.py [--runs 2000] [--workers 2]
 """
@@ -33,14 +33,14 @@ TIME = np.round(np.arange(0, 0.4001, 1e-3), 9)
 
 @cache
 def plant():
-    """The link, and the record without noise of a step of the dc-voltage set-point."""
+    """Return the link, and the noise-free record of a step of the dc voltage set-point."""
     model = load_model("vsc-hvdc-link")
     asked = experiment("step", TIME, {"Vdcref1": InputSignal.step(0.05, 1.0, 1.019)}, event=0.05)
     return ModelSimulator(model), asked, simulate(model, asked).trajectory["Irorder1"]
 
 
 def one(seed: int) -> dict[str, tuple[float, float, float]]:
-    """By parameter: the estimate and its interval, from the record with this seed's noise."""
+    """Return the estimate and its interval by parameter, from the record with this seed's noise."""
     simulator, asked, clean = plant()
     noisy = clean + NOISE * np.random.default_rng(seed).standard_normal(clean.size)
     data = asked.with_(measured=trajectory(TIME, {"Irorder1": noisy}), noise={"Irorder1": NOISE})
@@ -54,7 +54,7 @@ def one(seed: int) -> dict[str, tuple[float, float, float]]:
 
 
 def main(runs: int, workers: int) -> dict:
-    """Coverage by parameter with its binomial 95 % range, and the mean half-width."""
+    """Return the coverage by parameter with its binomial 95 % range, and the mean half-width."""
     begun = time.monotonic()
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         rows = list(pool.map(one, range(runs), chunksize=20))

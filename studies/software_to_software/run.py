@@ -1,4 +1,4 @@
-"""The average-value link against Dymola, and the phasor link against the average-value link: this folder's tables.
+"""The average-value link against Dymola, and the phasor link against the average-value link.
 
     python studies/software_to_software/run.py [folder for the plots, default study-results/ beside this file]
 
@@ -48,7 +48,7 @@ SHOWN = ("P1", "Q1", "Vdc1", "P2", "Q2", "Vdc2", "Irorder1", "Iiorder1", "Irorde
 
 
 def against_dymola() -> tuple[Trajectory, Trajectory]:
-    """What Dymola computed and what the average-value link gives, pu, under this project's names, from 0.6 s on."""
+    """Return Dymola's waveforms and those of the average-value link, pu, under this project's names, from 0.6 s on."""
     recorded = read_waveforms(DATA, [name for name, _, _ in SIGNALS.values()])
     recorded = recorded.rows(recorded.time >= FROM)
     theirs = {here: recorded[name] * factor for here, (name, factor, _) in SIGNALS.items()}
@@ -58,16 +58,16 @@ def against_dymola() -> tuple[Trajectory, Trajectory]:
 
 
 def ripple(recorded: Trajectory) -> dict[str, float]:
-    """RMS of each signal about its mean from 0.7 to 0.8 s, where nothing happens, in % of its range.
+    """Return the RMS of each signal about its mean from 0.7 to 0.8 s, before the event, in % of its range.
 
-    Dymola's waveforms turn with the grid, so that its solver's errors remain as a ripple: what no model can follow.
+    Dymola integrates rotating three-phase quantities, so that its solver's errors appear as a ripple.
     """
     quiet = (recorded.time >= 0.7) & (recorded.time < STEP)
     return {n: float(100 * recorded[n][quiet].std() / np.ptp(recorded[n])) for n in recorded.names}
 
 
 def phasor_against_avm() -> dict[str, tuple[Trajectory, Trajectory]]:
-    """By step: the average-value link's outputs (with its filters) and the phasor link's, pu, 0.9 s from rest."""
+    """Return by step the outputs of the average-value link (with its filters) and of the phasor link, pu, 0.9 s from steady state."""
     time = np.round(np.arange(1801) * 5e-4, 9)
     found = {}
     for label, (moved, before, after) in STEPS.items():
@@ -78,7 +78,7 @@ def phasor_against_avm() -> dict[str, tuple[Trajectory, Trajectory]]:
 
 
 def errors(reference: Trajectory, other: Trajectory) -> dict[str, dict[str, float]]:
-    """RMSE and largest error in % of the range, RMSE and range in pu, by signal; signals at rest left out."""
+    """Return RMSE and largest error in % of the range, and RMSE and range in pu, by signal; constant signals are left out."""
     found = {}
     for name in reference.names:
         gap, span = other[name] - reference[name], float(np.ptp(reference[name]))
@@ -92,7 +92,7 @@ def errors(reference: Trajectory, other: Trajectory) -> dict[str, dict[str, floa
 def plot(
     pairs: dict[str, tuple[Trajectory, Trajectory]], signals: tuple[str, ...], words: tuple[str, str], to: Path
 ) -> None:
-    """Draw overlaid waveforms into the file, one row a signal and one column a case."""
+    """Write a figure of overlaid waveforms, one row for each signal and one column for each case."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -116,7 +116,7 @@ def plot(
 
 
 def main(results: Path = HERE / "study-results", plots: bool = True) -> dict[str, Any]:
-    """Errors by comparison and signal; the plots are in `results`."""
+    """Write the plots into `results` and return the errors by comparison and signal."""
     pairs = phasor_against_avm()
     found: dict[str, Any] = {"phasor against average-value": {k: errors(*v) for k, v in pairs.items()}}
     if plots:

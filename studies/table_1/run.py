@@ -1,4 +1,4 @@
-"""Table I: the six gains from two physical numbers, and what loops they make.
+"""Table I: the six gains from two physical numbers, and the resulting loops.
 
 python studies/table_1/run.py [--pin]
 """
@@ -37,7 +37,7 @@ EXPLAINED = {
 
 
 def main() -> dict[str, Any]:
-    """The rule's gains, the numbers it is fed with, the loops' poles and settling times."""
+    """Return the rule's gains, its inputs, and the poles and settling times of the loops."""
     model = load_model(paper.LINK)
     rule = model.parameterisations["physical"]
     design = {n: p.value for n, p in rule.parameters.items()}
@@ -54,27 +54,27 @@ def main() -> dict[str, Any]:
 
 
 def gains(rule: Mapping[str, Any], design: Mapping[str, float], others: Mapping[str, float]) -> dict[str, float]:
-    """The six gains that a design gives; those the rule does not set stay at the model's values."""
+    """Return the six gains of a design; those that the rule does not set keep the model's values."""
     at = {parse(n): v for n, v in design.items()}
     return {n: float(rule[n].subs(at)) if n in rule else others[n] for n in paper.GAINS}
 
 
 def inverse() -> dict[str, float]:
-    """J, Ts and damping from the gains as printed: Kp = 2 z wn J with z wn = 3/Ts gives J, Ki = wn^2 J gives wn."""
+    """Return J, Ts and damping from the printed gains: Kp = 2 z wn J with z wn = 3/Ts gives J, Ki = wn^2 J gives wn."""
     ts = 3.0 / paper.TABLE_1["KIP"]
     j = paper.TABLE_1["KPVDC"] * ts / 6.0
     return {"Ts": ts, "J": j, "damping": 3.0 / (ts * float(np.sqrt(paper.TABLE_1["KIVDC"] / j)))}
 
 
 def mode(model: Any) -> dict[str, float]:
-    """The link's one oscillating mode with the gains of the rule: frequency in rad/s, and damping."""
+    """Return frequency in rad/s and damping of the link's one oscillatory mode with the gains of the rule."""
     linear = linearize(model, inputs=["Vdcref1"], outputs=["Vdc1"])
     (found,) = [m for m in linear.modes() if m.eigenvalue.imag > 0]
     return {"wn": abs(found.eigenvalue), "damping": float(found.damping)}
 
 
 def settling(kind: str) -> float:
-    """Seconds after the step from which on the controlled quantity stays within 5 % of it."""
+    """Return the time in s after the step from which the controlled quantity stays within 5 % of it."""
     c = paper.CONTROLLERS[kind]
     e = paper.step(kind, paper.LINK, [FOLLOWS[kind]])
     away = np.abs(e.measured[FOLLOWS[kind]] - c.after) > BAND * abs(c.after - c.before)
@@ -82,7 +82,7 @@ def settling(kind: str) -> float:
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     rows = [
         [n, number(paper.TABLE_1[n]), f"{values['gains'][n]:.{DIGITS.get(n, 0)}f}", EXPLAINED[n]] for n in paper.GAINS
     ]
@@ -110,7 +110,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """The three controlled quantities after their steps, with the 5 % band and Ts."""
+    """Draw the three controlled quantities after their steps, with the 5 % band and Ts."""
     from hvdc_ident.report.drawing import figure
 
     fig = figure(11, 3.2)

@@ -1,4 +1,4 @@
-"""Table II: the bounds, starts and test values of the fits, and where the fits end from every one of them.
+"""Table II: bounds, starts and test values of the fits, and the end points of the fits from each of them.
 
 python studies/table_2/run.py [--quick] [--pin]
 """
@@ -29,12 +29,12 @@ DATA = {"the link itself": paper.LINK, "the average-value link": paper.REFERENCE
 
 
 def main(setups: Sequence[str] = tuple(SETUPS)) -> dict[str, Any]:
-    """By data and set-up: how many starts there are, and how far from each other and from the truth they end."""
+    """Return by data and set-up the number of starts, and the distances of their ends from each other and from Table I."""
     return {data: {setup: ends(setup, source) for setup in setups} for data, source in DATA.items()}
 
 
 def problem_of(setup: str, source: str) -> Problem:
-    """The set-up's gains fitted to one step of each of its controllers, all its outputs weighed alike."""
+    """Return the problem of the set-up: its gains, one step of each of its controllers, equal weights."""
     kinds = SETUPS[setup]
     outputs = [paper.CONTROLLERS[k].output for k in kinds]
     experiments: list[Experiment] = [paper.step(k, source, outputs) for k in kinds]
@@ -44,7 +44,7 @@ def problem_of(setup: str, source: str) -> Problem:
 
 
 def starts_of(problem: Problem) -> list[Array]:
-    """Table II's start, every corner of its bounds, and its test values where the bounds hold them."""
+    """Return Table II's start, every corner of its bounds, and its test values where these lie within the bounds."""
     low, high = ([getattr(f, side) for f in problem.free] for side in ("min", "max"))
     corners = [np.array(c) for c in itertools.product(*zip(low, high, strict=True))]
     test = np.array([paper.TABLE_2[f.name][3] for f in problem.free])
@@ -53,9 +53,9 @@ def starts_of(problem: Problem) -> list[Array]:
 
 
 def ends(setup: str, source: str) -> dict[str, Any]:
-    """The optimum, and over all starts that end there the worst distance from it and from Table I.
+    """Return the optimum and, over all starts that end there, the largest distance from it and from Table I.
 
-    Distances are shares: of the value, or of Table II's range where Table I's value is 0.
+    Distances are relative to the value, or to Table II's range where Table I's value is 0.
     """
     problem = problem_of(setup, source)
     starts = starts_of(problem)
@@ -81,7 +81,7 @@ def ends(setup: str, source: str) -> dict[str, Any]:
 
 
 def worst(distances: Iterable[Array]) -> float:
-    """The largest magnitude; below 1e-6 it is rounding, and 0."""
+    """Return the largest magnitude, or 0 below 1e-6, which is rounding."""
     found = max(float(np.abs(d).max()) for d in distances)
     return 0.0 if found < 1e-6 else found
 
@@ -97,7 +97,7 @@ NOTES = {
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     bounds = [[n, *(number(v) for v in row), number(paper.TABLE_1[n]), NOTES[n]] for n, row in paper.TABLE_2.items()]
     rows = []
     for data, setup in itertools.product(DATA, SETUPS):
@@ -106,7 +106,14 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
         optimum = ", ".join(f"{n} {number(x if x > 1e-6 else 0.0)}" for n, x in v["optimum"].items())
         cells = [f"{v['to the optimum']} of {v['starts']}", lost(v), share(v["apart"]), share(v["off Table I"])]
         rows.append([data, setup, *cells, optimum, f"{low} to {high}"])
-    head = ["starts that end at the optimum", "other starts", "largest distance from it", "distance from Table I", "optimum", "simulations"]
+    head = [
+        "starts that end at the optimum",
+        "other starts",
+        "largest distance from it",
+        "distance from Table I",
+        "optimum",
+        "simulations",
+    ]
     return {
         "bounds": markdown(["gain", "min", "max", "start", "test", "true", "here"], bounds),
         "ends": markdown(["waveforms of", "fitted", *head], rows),
@@ -114,7 +121,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def lost(v: Mapping[str, Any]) -> str:
-    """What became of the other starts, and what they have in common."""
+    """Return, as text, the outcome of the other starts and the values that they have in common."""
     stopped = v["starts"] - v["to the optimum"] - v["elsewhere"]
     parts = [f"{stopped} not simulated"] if stopped else []
     parts += [f"{v['elsewhere']} elsewhere"] if v["elsewhere"] else []
@@ -123,12 +130,12 @@ def lost(v: Mapping[str, Any]) -> str:
 
 
 def share(value: float) -> str:
-    """The share in %."""
+    """Return the share in % as text."""
     return "under 1e-6" if value == 0 else f"{number(100 * value, 2)} %"
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """RMSE of each controller's output over the box of Table II, with starts, test value, Table I and the optimum."""
+    """Draw the RMSE of each controller's output over the bounds of Table II, with starts, test value, Table I and optimum."""
     from matplotlib.patches import Rectangle
 
     from hvdc_ident.report.drawing import figure
@@ -159,7 +166,7 @@ def draw(values: Mapping[str, Any]) -> Any:
 
 
 def misfit(recorded: Experiment, gains: Mapping[str, float]) -> float:
-    """RMSE of the one output; not a number (blank in the picture) where the link cannot be simulated."""
+    """Return the RMSE of the output; NaN (blank in the figure) where the link cannot be simulated."""
     try:
         return paper.rmse(recorded, gains)[recorded.outputs[0]]
     except SimulationError:

@@ -1,4 +1,4 @@
-"""Table III: 30 experiments for each controller individually, and simultaneously, with what the intervals mean.
+"""Table III: 30 experiments for each controller, individually and simultaneously, and the meaning of the intervals.
 
 python studies/table_3/run.py [--quick] [--workers N] [--pin]
 """
@@ -29,7 +29,7 @@ STARTS = {n: start for n, (_, _, start, _) in paper.TABLE_2.items()}
 
 
 def main(count: int = FULL, workers: int = 1) -> dict[str, Any]:
-    """The estimates of every run by mode and gain; with all 30 also what else the README tells."""
+    """Return the estimates of every run by mode and gain; with all 30 also the other numbers of the README."""
     with processes(workers) as executor:
         paper.step("P", paper.LINK)  # the integrators are compiled once for an installation: not timed
         begun = time.perf_counter()
@@ -68,19 +68,22 @@ def main(count: int = FULL, workers: int = 1) -> dict[str, Any]:
 
 
 def median_std(row: Mapping[str, Any]) -> float | None:
-    """The median of the standard deviations that the single fits give themselves."""
+    """Return the median of the standard deviations of the single fits."""
     known = [r["std"] for r in row["experiments"].values() if r["std"] is not None]
     return float(np.median(known)) if known else None
 
 
 def statistics(values: Mapping[str, list[float]]) -> dict[str, dict[str, float]]:
-    """Mean and std by gain."""
+    """Return mean and std by gain."""
     found = {n: spread(np.array(v)) for n, v in values.items()}
     return {n: {"mean": s["mean"], "std": s["std"]} for n, s in found.items()}
 
 
 WHY = {
-    ("KIVDC", "II"): "both far above 734.7: the fit compensates for a delay. The amount depends on the steps and ramps, "
+    (
+        "KIVDC",
+        "II",
+    ): "both far above 734.7: the fit compensates for a delay. The amount depends on the steps and ramps, "
     "which the paper does not list; {elsewhere} from other operating points (last table)",
     (
         "KIVDC",
@@ -104,7 +107,7 @@ WHY = {
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     return {
         "table-iii": table_iii(values),
         "intervals": intervals(values),
@@ -114,7 +117,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def table_iii(values: Mapping[str, Any]) -> str:
-    """Mean, std, variance and interval of the mean, paper and here."""
+    """Return the table of mean, std, variance and interval of the mean, paper and here."""
     rows = []
     ends = paper.intervals_of_mean(values)
     for n in paper.GAINS:
@@ -133,7 +136,7 @@ def table_iii(values: Mapping[str, Any]) -> str:
 
 
 def intervals(values: Mapping[str, Any]) -> str:
-    """Intervals that are all called 95 %, and the true value."""
+    """Return the table of the different 95 % intervals and the true value."""
     rows = []
     for n in paper.GAINS:
         s = spread(np.array(values["individual"][n]))
@@ -163,7 +166,7 @@ def intervals(values: Mapping[str, Any]) -> str:
 
 
 def variation(values: Mapping[str, Any]) -> str:
-    """Coefficients of variation in %, and std over Table II's range, which has a meaning where the mean is near 0."""
+    """Return the table of coefficients of variation in %, and of std over Table II's range for means near 0."""
     rows = []
     for n in paper.GAINS:
         width = paper.TABLE_2[n][1] - paper.TABLE_2[n][0]
@@ -179,12 +182,12 @@ def variation(values: Mapping[str, Any]) -> str:
 
 
 def percent(share: float | None) -> str:
-    """The share in %; a dash for None."""
+    """Return the share in % as text; a dash for None."""
     return "-" if share is None else number(100 * share, 2)
 
 
 def choices(values: Mapping[str, Any]) -> str:
-    """Mean and std of the gains by what the paper leaves open."""
+    """Return the table of mean and std of the gains by the choices that the paper does not specify."""
     lines: dict[str, dict[str, Any]] = {
         "as above": {m: statistics(values[m]) for m in paper.MODES.values()},
         "Irorder1 not compared in the P experiments": {
@@ -205,12 +208,12 @@ def choices(values: Mapping[str, Any]) -> str:
 
 
 def plus(s: Mapping[str, float]) -> str:
-    """Mean and std."""
+    """Return mean and std as text."""
     return f"{number(s['mean'])} ± {number(s['std'], 2)}"
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """Every run's estimate by gain, both modes, with means, the paper's mean and std, and the true gain."""
+    """Draw every run's estimate by gain, both modes, with means, the paper's mean and std, and the true gain."""
     from hvdc_ident.report.drawing import figure
 
     fig = figure(11, 5.5)

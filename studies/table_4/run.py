@@ -27,7 +27,7 @@ Ends = Mapping[str, Mapping[str, tuple[float, float]]]
 
 
 def gain_sets(ends: Ends) -> dict[str, dict[str, float]]:
-    """The sets of gains Table IV compares, by the paper's name for them; ends: Table III's intervals of the mean."""
+    """Return the sets of gains in Table IV by their names in the paper. ends: Table III's intervals of the mean."""
     sets = {
         f"{side} {mode}": {n: max(float(pair[place]), 0.0) for n, pair in ends[mode].items()}
         for side, place in (("upper", 1), ("lower", 0))
@@ -40,9 +40,9 @@ def gain_sets(ends: Ends) -> dict[str, dict[str, float]]:
 
 
 def main(ends: Ends | None = None) -> dict[str, Any]:
-    """RMSE in pu by output and set of gains, each output in the step of its own set-point.
+    """Return the RMSE in pu by output and set of gains, each output in the step of its own set-point.
 
-    ends: Table III's intervals of the mean; computed anew where none are given.
+    ends: Table III's intervals of the mean; if left out, they are computed.
     """
     sets = gain_sets(ends if ends is not None else fresh_ends())
     recorded = {c.output: paper.step(kind, outputs=[c.output]) for kind, c in paper.CONTROLLERS.items()}
@@ -50,14 +50,14 @@ def main(ends: Ends | None = None) -> dict[str, Any]:
 
 
 def fresh_ends() -> Ends:
-    """Table III's intervals of the mean, from the fits."""
+    """Return Table III's intervals of the mean, from the fits."""
     experiments = paper.recordings()
     found = {"individual": paper.individual(experiments), "simultaneous": paper.simultaneous(experiments)}
     return paper.intervals_of_mean({mode: paper.values_of(f) for mode, f in found.items()})
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     rows, shares = [], []
     for o in ROWS:
         theirs, ours = paper.TABLE_4[o], values[o]
@@ -69,12 +69,14 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
     last = "here, with the paper's own mean II"
     return {
         "rmse": markdown(["output", *(f"{c}: paper / here" for c in COLUMNS), "why they differ"], rows),
-        "shares": markdown(["divided by the test value's", *(f"{c}: paper / here" for c in COLUMNS[:-1]), last], shares),
+        "shares": markdown(
+            ["divided by the test value's", *(f"{c}: paper / here" for c in COLUMNS[:-1]), last], shares
+        ),
     }
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """RMSE over that of the test values, paper and here, on a logarithmic axis."""
+    """Draw the RMSE divided by that of the test values, paper and here, on a logarithmic axis."""
     from hvdc_ident.report.drawing import figure
 
     fig = figure(10, 3.4)

@@ -1,4 +1,4 @@
-"""A link that two other tools computed: its card calibrated on one of them, and what is named where the card lacks a part.
+"""A link computed by two other tools: its card calibrated against one of them, and diagnosed without one of its parts.
 
 python studies/two_tools_one_link/run.py [--quick] [--workers N] [--pin]
 
@@ -81,18 +81,18 @@ DIAGNOSED = (MEASUREMENT, "droop of the ac voltage controls", "slew of the power
 
 
 def card() -> Model:
-    """The link's card, complete."""
+    """Return the complete card of the link."""
     return read_card(HERE / "link.toml")
 
 
 def record(tool: str, time: Array) -> dict[str, Array]:
-    """A tool's waveforms by the card's output, at these instants, pu of 1000 MVA."""
+    """Return a tool's waveforms by the card's outputs, at these instants, pu of 1000 MVA."""
     files = {name: read_waveforms(DATA / name) for name in {f for f, _, _ in TOOLS[tool].values()}}
     return {o: np.interp(time, files[f].time, files[f][c] / unit) for o, (f, c, unit) in TOOLS[tool].items()}
 
 
 def inputs(model: Model) -> dict[str, InputSignal]:
-    """What is done to the link: power, dc voltage and both ac voltages, as the README of the data tells."""
+    """Return the input signals (power, dc voltage and both ac voltages) that the README of the data describes."""
     at = {n: i.value for n, i in model.inputs.items()}
     up, down = at["Uref1"] + 0.0203, at["Uref2"] - 0.1016
     return {
@@ -104,7 +104,7 @@ def inputs(model: Model) -> dict[str, InputSignal]:
 
 
 def _held(*steps: tuple[float, float], first: float) -> InputSignal:
-    """A value that jumps at the times given."""
+    """Return a signal that jumps at the given times."""
     corners, value = [(0.0, first)], first
     for time, new in steps:
         corners += [(time, value), (time, new)]
@@ -115,7 +115,7 @@ def _held(*steps: tuple[float, float], first: float) -> InputSignal:
 def experiments(
     tool: str = "Eurostag", outputs: Sequence[str] = tuple(BANDS), sample: float = SAMPLE
 ) -> tuple[Experiment, ...]:
-    """The three parts of the record, the voltage steps held out. Each is simulated from rest, and compared in its window."""
+    """Return the three parts of the record, the voltage steps held out; each starts at a steady state and has its window."""
     moved = inputs(card())
     found = []
     for name, (begin, end) in WINDOWS.items():
@@ -135,7 +135,7 @@ def experiments(
 
 
 def errors(model: Model, tool: str, values: Mapping[str, float] | None = None) -> dict[str, dict[str, float]]:
-    """RMSE in pu of every recorded signal by window, the card against a tool."""
+    """Return the RMSE in pu of every recorded signal by window, the card against a tool."""
     (run,) = (simulate(model, e.with_(measured=None), dict(values or {})) for e in experiments(tool)[-1:])
     seen = record(tool, run.trajectory.time)
     time = run.trajectory.time
@@ -145,7 +145,7 @@ def errors(model: Model, tool: str, values: Mapping[str, float] | None = None) -
 
 
 def apart() -> dict[str, dict[str, float]]:
-    """RMS difference in pu of the two tools by window and signal."""
+    """Return the RMS difference in pu of the two tools by window and signal."""
     time = np.round(np.arange(BEGIN, FAULT[1][1], SAMPLE), 6)
     one, other = record("Eurostag", time), record("Dynawo", time)
     windows = {**WINDOWS, FAULT[0]: FAULT[1]}
@@ -159,7 +159,7 @@ def _rms(x: Array) -> float:
 
 
 def calibrated() -> dict[str, Any]:
-    """The card's parameters from Eurostag's P ramp and dc voltage step, begun a quarter off, and how well it then predicts."""
+    """Return the card's parameters from Eurostag's P ramp and dc voltage step, starts a quarter off, and the RMSE with them."""
     model = card()
     free = tuple(FitParameter(n, 1.25 * model.values[n], model.values[n] / 3, 3 * model.values[n]) for n in CALIBRATED)
     result = fit(Problem(ModelSimulator(model), experiments(), free), starts=2, seed=0)
@@ -171,7 +171,7 @@ def calibrated() -> dict[str, Any]:
 
 
 def named(part: str, executor: Any = None) -> dict[str, Any]:
-    """What the diagnosis says where the card lacks a part, told nothing; the gains begin at the card's."""
+    """Return the diagnosis of the card without a part, without hints; the gains start at the card's."""
     model = card().with_values(LEFT_OUT[part])
     free = tuple(FitParameter(n, model.values[n], model.values[n] / 3, 3 * model.values[n]) for n in GAINS)
     fitted, held_out = ROLES.get(part, ROLES[""])
@@ -185,7 +185,7 @@ def named(part: str, executor: Any = None) -> dict[str, Any]:
 
 
 def main(parts: Sequence[str] = DIAGNOSED, workers: int = 1) -> dict[str, Any]:
-    """The card against both tools, its calibration, the tools against each other, and what is named part by part."""
+    """Return the card against both tools, its calibration, the tools against each other, and the diagnoses part by part."""
     values: dict[str, Any] = {
         "as described": {tool: errors(card(), tool) for tool in TOOLS},
         "calibrated": calibrated(),
@@ -199,7 +199,7 @@ def main(parts: Sequence[str] = DIAGNOSED, workers: int = 1) -> dict[str, Any]:
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     fitted, described = values["calibrated"]["values"], card().values
     gains = [[n, number(described[n]), number(fitted[n])] for n in CALIBRATED]
     return {
@@ -220,7 +220,14 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
             }
         ),
         "named": markdown(
-            ["removed part", "verdict", "inserted effects", "equivalents", "held-out gap: refitted, with them", "improvement, %"],
+            [
+                "removed part",
+                "verdict",
+                "inserted effects",
+                "equivalents",
+                "held-out gap: refitted, with them",
+                "improvement, %",
+            ],
             [_told(part, v) for part, v in values["named"].items()],
         ),
     }
@@ -243,7 +250,7 @@ def _told(part: str, v: Mapping[str, Any]) -> list[str]:
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """Both tools and the card: the current of the dc voltage station and the dc voltage around the dc voltage step."""
+    """Draw both tools and the card: the current of the dc voltage station and the dc voltage around the dc voltage step."""
     from hvdc_ident.report.drawing import figure
 
     whole = experiments()[-1].with_(measured=None)

@@ -1,4 +1,4 @@
-"""Why Table III's gains are off Table I: what a missing delay does, what the program names, told nothing, and what else.
+"""Why the gains of Table III differ from Table I: a missing delay, the diagnoses without hints, and other causes.
 
 python studies/why_table_3_is_biased/run.py [--quick] [--workers N] [--pin]
 """
@@ -58,9 +58,9 @@ PARTS: dict[str, dict[str, float]] = {  # part of the average-value link: by wha
 
 
 def main(parts: Sequence[str] = tuple(PARTS), workers: int = 1) -> dict[str, Any]:
-    """The mechanism, the diagnoses with what they change, the bias by part of the reference, and the other causes' scores.
+    """Return the mechanism, the diagnoses and their effect, the bias by part of the reference, and the causes' scores.
 
-    With fewer parts nothing is diagnosed, which takes most of the time.
+    With fewer parts there are no diagnoses, which take most of the time.
     """
     filters = {name: vsc_hvdc_avm.model(chosen) for name, chosen in filter_choices().items()}
     values: dict[str, Any] = {
@@ -77,7 +77,7 @@ def main(parts: Sequence[str] = tuple(PARTS), workers: int = 1) -> dict[str, Any
 
 
 def causes(names: Sequence[str] = (), count: int = hypotheses.RUNS, executor: Any = None) -> dict[str, Any]:
-    """What each cause makes of Table III and Fig. 8, all of them or those named."""
+    """Return Table III and Fig. 8 for each cause, or for the causes named."""
     chosen = {n: c for n, c in hypotheses.causes().items() if not names or n in names}
     found = {}
     for name, cause in chosen.items():
@@ -87,7 +87,7 @@ def causes(names: Sequence[str] = (), count: int = hypotheses.RUNS, executor: An
 
 
 def told_nothing(executor: Any = None) -> dict[str, Any]:
-    """The diagnoses by what was asked, told nothing with more noise too, and Fig. 8 with what was named."""
+    """Return the diagnoses of ASKED, also with more noise, and Fig. 8 with the inserted effects."""
     found, finer = (
         {name: diagnosed.diagnosis(name, executor=executor) for name in asked}
         for asked in (diagnosed.TOLD_NOTHING, diagnosed.FINER)
@@ -100,13 +100,13 @@ def told_nothing(executor: Any = None) -> dict[str, Any]:
 
 
 def after(found: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said to be missing, or the best of the first round, does to the gains and to Fig. 8, by what was asked."""
+    """Return the gains and Fig. 8 with the named effects, or with the best of the first round, for each of ASKED."""
     put_in = {name: diagnosed.put_in(told, name) for name, told in found.items()}
     return {"put in": put_in, "figure 8": {name: diagnosed.figure_8(told) for name, told in put_in.items()}}
 
 
 def planted() -> dict[str, Any]:
-    """Gains of the plain link, and of the link with a lag, fitted to the link with a lag of 1.6 ms on all currents."""
+    """Return the gains of the plain link, and of the link with a lag, fitted to the link with a lag of 1.6 ms on all currents."""
     lagged = load_model(paper.LINK).with_effects([LAGGED])
     experiments = [recorded(lagged, name) for name in PLANTED]
     plain = fit(Problem(paper.link(), tuple(experiments), paper.free(MOVED)), starts=4)
@@ -119,7 +119,7 @@ def planted() -> dict[str, Any]:
 
 
 def recorded(model: Model, name: str) -> Experiment:
-    """One of the planted experiments, 0.9 s every 0.5 ms, all three outputs weighed alike."""
+    """Return one of the planted experiments, 0.9 s every 0.5 ms, with equal weights on all three outputs."""
     setpoint, course = PLANTED[name]
     time = np.round(np.arange(round(paper.END / paper.SAMPLE) + 1) * paper.SAMPLE, 9)
     plain = experiment(name, time, {setpoint: course}, event=paper.EVENT)
@@ -128,13 +128,13 @@ def recorded(model: Model, name: str) -> Experiment:
 
 
 def filter_choices() -> dict[str, tuple[Any, ...]]:
-    """Sets of filtered measurements: all, each left out, none."""
+    """Return the sets of filtered measurements: all, each left out, none."""
     left_out = {f"without {m}'s": tuple(k for k in FILTERED if k != m) for m in FILTERED}
     return {", ".join(FILTERED): FILTERED, **left_out, "none": ()}
 
 
 def switched_off(model: Model, parts: Sequence[str]) -> dict[str, dict[str, float]]:
-    """The fitted gains with each part of the average-value link switched off by itself, and with all of them."""
+    """Return the fitted gains with each part of the average-value link switched off separately, and with all of them off."""
     found = {}
     for part in parts:
         found[part] = fitted(without(model, PARTS[part]))
@@ -144,12 +144,12 @@ def switched_off(model: Model, parts: Sequence[str]) -> dict[str, dict[str, floa
 
 
 def without(model: Model, factors: Mapping[str, float]) -> Model:
-    """The model with some parameters multiplied."""
+    """Return the model with some parameters multiplied."""
     return model.with_values({n: model.values[n] * by for n, by in factors.items()})
 
 
 def fitted(model: Model) -> dict[str, float]:
-    """The phasor link's gains, each controller by itself on its own output in one step of its set-point."""
+    """Return the phasor link's gains, each controller separately, on its own output in one step of its set-point."""
     found: dict[str, float] = {}
     for kind, c in paper.CONTROLLERS.items():
         problem = Problem(paper.link(), (paper.step(kind, model, [c.output]),), wide(c.gains))
@@ -161,12 +161,12 @@ def fitted(model: Model) -> dict[str, float]:
 
 
 def wide(names: Sequence[str]) -> tuple[FitParameter, ...]:
-    """Table II's starts with bounds that no result here touches."""
+    """Return Table II's starts with bounds that no result here reaches."""
     return tuple(FitParameter(n, paper.TABLE_2[n][2], 0.0, 4.0 * paper.TABLE_2[n][1]) for n in names)
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables."""
+    """Return the README's tables."""
     p = values["planted"]
     plant = [
         [
@@ -196,7 +196,7 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def cases(values: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
-    """The fitted gains by what the average-value link was, in words."""
+    """Return the fitted gains by variant of the average-value link."""
     found = {f"filters: {n}": v for n, v in values["filters"].items()}
     for base in ("with filters", "without filters"):
         for part, v in values[f"parts off, {base}"].items():
@@ -205,13 +205,13 @@ def cases(values: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
 
 
 def row(v: Mapping[str, float]) -> list[str]:
-    """The gains and their bias."""
+    """Return the gains and their bias as text."""
     bias = [f"{100 * (v[n] / paper.TABLE_1[n] - 1):+.1f}" for n in MOVED[:3]]
     return [*(number(v[n]) for n in MOVED), *bias]
 
 
 def draw(values: Mapping[str, Any]) -> Any:
-    """The bias of each gain by what is switched off, and Fig. 8 before and after."""
+    """Draw the bias of each gain by part switched off, and Fig. 8 before and after."""
     return page.draw(values, cases(values), MOVED[:3])
 
 

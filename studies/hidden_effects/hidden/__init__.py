@@ -1,1 +1,1 @@
-"""Hidden effects: what the study is made of. Its simulator knows nothing of the package it judges."""
+"""Hidden effects: the parts of the study. Its simulator is independent of the package that it tests."""

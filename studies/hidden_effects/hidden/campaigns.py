@@ -1,4 +1,4 @@
-"""What is done to a plant: two experiments to fit, one of another kind to judge by."""
+"""The excitation of a plant: two experiments to fit and one of another kind to validate."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ VARIANTS = 4
 
 
 def campaign(plant: Plant, excitation: str, variant: int) -> tuple[Run, Run, Run]:
-    """The inputs of the two fitted experiments and of the held-out one.
+    """Return the inputs of the two fitted experiments and of the held-out one.
 
-    small: one small step each; held out is a pulse the other way with a ramp. rich: a step three times as large and back,
-    and a multisine; held out is a staircase with a step of another input.
+    small: one small step each; the held-out one is a pulse in the other direction with a ramp. rich: a step three times as
+    large and back, and a multisine; the held-out one is a staircase with a step of another input.
     """
     rng = np.random.default_rng([excitation == "rich", variant])
     names = list(plant.kicks)
@@ -60,7 +60,7 @@ def _ramp(rest: float, begin: float, end: float, change: float) -> Signal:
 
 
 def _multisine(rest: float, size: float, rng: np.random.Generator) -> Signal:
-    """Ten sines from 0.8 to 40 Hz from the event on, as straight lines between rows, which is how it is recorded too."""
+    """Return ten sines from 0.8 to 40 Hz from the event on, as straight lines between rows, as in the record."""
     t = np.arange(round(EVENT / INTERVAL), ROWS) * INTERVAL
     frequencies = np.geomspace(0.8, 40.0, 10)
     phases = rng.uniform(0, 2 * np.pi, 10)
@@ -73,5 +73,5 @@ def _multisine(rest: float, size: float, rng: np.random.Generator) -> Signal:
 
 
 def summary(run: Run) -> Mapping[str, list[list[float]]]:
-    """The run's inputs as plain numbers."""
+    """Return the run's inputs as plain numbers."""
     return {n: [list(p) for p in s.points] for n, s in run.inputs.items()}

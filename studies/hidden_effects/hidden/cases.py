@@ -1,4 +1,4 @@
-"""The cases: a seeded fractional design, and each case as records with what is hidden in them."""
+"""The cases: a seeded fractional design, and each case as records with their hidden effects."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60}
 
 @dataclass(frozen=True)
 class Design:
-    """One case before it is made. effects: their names; size: of each, in units. told: whether the noise is told."""
+    """One case before it is generated. effects: their names; size: of each, in units. told: True if the noise is stated."""
 
     part: str
     number: int
@@ -47,7 +47,7 @@ class Design:
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """Return the name in tables."""
         return f"{self.part}-{self.number:03d}"
 
 
@@ -55,9 +55,9 @@ class Design:
 class Case:
     """A case: records of two fitted experiments and a held-out one, and the truth.
 
-    records, clean: (rows, 3, outputs), all outputs; channels: those that are recorded. sigma: (outputs,) of the noise.
-    told: what the records say it is; None: nothing. given: the parameters a user would start from. units: the size of
-    what is hidden altogether. tries: how many places were drawn until one could hold an effect of this size.
+    records, clean: (rows, 3, outputs), all outputs; channels: the recorded ones. sigma: (outputs,) of the noise.
+    told: the stated standard deviation, or None. given: the parameters that a user would start from. units: the total size
+    of the hidden effects. tries: number of insertion points drawn until an effect of this size was possible.
     """
 
     design: Design
@@ -76,12 +76,12 @@ class Case:
 
     @property
     def truth(self) -> list[dict[str, Any]]:
-        """What is hidden, as plain numbers."""
+        """Return the hidden effects as plain numbers."""
         return [asdict(h) for h in self.hidden]
 
 
 def designs(part: str, seed: int) -> tuple[Design, ...]:
-    """The designs of one part: every effect as often, the other factors balanced within each."""
+    """Return the designs of one part: all effects equally often, the other factors balanced within each."""
     names = {"outside": list(OUTSIDE), "clean": [""]}.get(part, list(CATALOGUE))
     count = PARTS[part]
     rng = np.random.default_rng([seed, list(PARTS).index(part)])
@@ -102,7 +102,7 @@ def designs(part: str, seed: int) -> tuple[Design, ...]:
 
 
 def factorial(seed: int) -> tuple[Design, ...]:
-    """Every combination of the factors for a single effect; the place is drawn, as in the fractional design."""
+    """Return every combination of the factors for a single effect; the insertion point is drawn, as in the fractional design."""
     rng = np.random.default_rng([seed, 99])
     rows = product(CATALOGUE, PLANTS, SIZES, KINDS, EXCITATIONS, (False, True), (True, False), range(VARIANTS))
     found: list[Design] = []
@@ -116,7 +116,7 @@ def factorial(seed: int) -> tuple[Design, ...]:
 
 
 def _balanced(rng: np.random.Generator, count: int, part: str) -> list[dict[str, Any]]:
-    """Rows of factors, each level of each as often as another (one more at most)."""
+    """Return rows of factors with all levels equally often (at most one more)."""
     noise: Sequence[str] = KINDS
     sizes: Sequence[float] = SIZES
     if part == "clean":
@@ -143,7 +143,7 @@ def _balanced(rng: np.random.Generator, count: int, part: str) -> list[dict[str,
 
 
 def made(design: Design, seed: int) -> Case | None:
-    """The case; None where in TRIES places the effect cannot be as large as the design wants it."""
+    """Return the case; None if the effect cannot reach the size of the design at any of TRIES insertion points."""
     key = [seed, list(PARTS).index(design.part), design.number]
     rng = np.random.default_rng([*key, 7])
     base = nominal(design.plant, design.excitation, design.variant)
@@ -176,7 +176,7 @@ def _drawn(
     key: list[int],
     rng: np.random.Generator,
 ) -> tuple[list[Hidden], Array, float, int] | None:
-    """(what is hidden, the plant's answer with it, its size in units, places drawn); None after too many places."""
+    """Return the hidden effects, the plant's response, the size in units and the insertion points drawn; None after too many."""
     for tries in range(1, TRIES + 1):
         hidden: list[Hidden] = []
         for k, effect in enumerate(design.effects):
@@ -205,10 +205,10 @@ def _drawn(
 def _firm(
     base: Nominal, hidden: list[Hidden], clean: Array, sigma: Array, kind: str, channels: tuple[int, ...]
 ) -> bool:
-    """Whether the answer is the plant's and not the integrator's: at half its step the same to FIRM units.
+    """Return True if the response does not depend on the integrator: at half its step it is the same to FIRM units.
 
-    A quantised loop that comes to rest between two levels chatters from step to step, and which of them a row catches is
-    no truth that could be found. A curve or a filter has no such thing, and is followed to far less than a unit.
+    A quantised loop that settles between two levels switches between them from step to step, and the level in a row is
+    arbitrary. Static effects and filters are accurate to far less than a unit.
     """
     if not any((CATALOGUE | OUTSIDE)[h.effect].stepped for h in hidden):
         return True
@@ -217,7 +217,7 @@ def _firm(
 
 
 def _told(design: Design, sigma: Array) -> Array | None:
-    """What the records say of their noise; nothing in half of the cases, and where they are rounded."""
+    """Return the stated noise; None in half of the cases, and for quantised records."""
     if design.noise == "told-half":
         return 0.5 * sigma
     if design.noise == "told-white":
@@ -226,7 +226,7 @@ def _told(design: Design, sigma: Array) -> Array | None:
 
 
 def _place(rng: np.random.Generator, base: Nominal, effect: str, taken: list[str]) -> tuple[str, str]:
-    """A slot for the effect, and the other signal where it brings one in."""
+    """Return an insertion point for the effect, and the other signal if it reads one."""
     plant = base.plant
     places = [*plant.slots, *(f"outputs.{o}" for o in plant.outputs)]
     if effect == "inductance":
@@ -249,5 +249,5 @@ def _place(rng: np.random.Generator, base: Nominal, effect: str, taken: list[str
 
 
 def _alike(a: Array, b: Array) -> bool:
-    """Whether one signal is the other times a number."""
+    """Return True if one signal is a multiple of the other."""
     return abs(float(np.vdot(a, b))) > (1.0 - 1e-9) * float(np.linalg.norm(a) * np.linalg.norm(b))

@@ -1,4 +1,4 @@
-"""A case given to the package, and what came of it as one line of numbers. The only part that imports the package."""
+"""The diagnosis of a case as one line of numbers. This is the only part that imports the package."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ NAMES = ("fit-1", "fit-2", "holdout")
 
 
 def model_of(plant: str) -> Model:
-    """The plant's card."""
+    """Return the plant's card."""
     return read_card(CARDS / f"{plant}.toml")
 
 
 def experiments_of(case: Case) -> tuple[Experiment, ...]:
-    """The case's records as experiments; the last one is held out."""
+    """Return the case's records as experiments; the last one is held out."""
     outputs = PLANTS[case.design.plant].outputs
     names = tuple(outputs[k] for k in case.channels)
     noise = {} if case.told is None else {outputs[k]: float(case.told[k]) for k in case.channels}
@@ -59,15 +59,15 @@ def experiments_of(case: Case) -> tuple[Experiment, ...]:
 
 
 def free_of(case: Case) -> tuple[FitParameter, ...]:
-    """The parameters that may be fitted, from where a user would start."""
+    """Return the fit parameters with the values that a user would start from."""
     true = PLANTS[case.design.plant].parameters
     return tuple(FitParameter(n, v, true[n] / WIDTH, true[n] * WIDTH) for n, v in case.given.items())
 
 
 def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
-    """One line: the design, the truth, the diagnosis, and how the held-out record is then predicted.
+    """Return one line: the design, the truth, the diagnosis, and the misfit of the held-out record.
 
-    sindy: whether the baseline of that name is run too.
+    sindy: run the baseline of that name too.
     """
     design = case.design
     line: dict[str, Any] = {
@@ -109,7 +109,7 @@ def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
 
 
 def _told(found: Any) -> dict[str, Any]:
-    """What the diagnosis says, as plain numbers; of its candidates the best by score and the best by BIC."""
+    """Return the diagnosis as plain numbers, with the best candidate by score and the best by BIC."""
     told = found.to_dict()
     lines = told["candidates"]
     scored = [c for c in lines if c["score"] is not None and np.isfinite(c["score"])]
@@ -129,7 +129,7 @@ def _told(found: Any) -> dict[str, Any]:
 
 
 def _misfit(model: Any, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
-    """Root mean square of the held-out record's residuals in units of its true noise; None where the model cannot run."""
+    """Return the rms of the held-out record's residuals in units of its true noise; None if the model cannot run."""
     held = experiments[2]
     assert held.measured is not None
     try:
@@ -141,9 +141,9 @@ def _misfit(model: Any, experiments: Sequence[Experiment], case: Case, values: M
 
 
 def _apart(model: Any, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]) -> float | None:
-    """How far the model's answer to the three records lies from the hidden one without noise, in units; None where it cannot run.
+    """Return the distance of the model's response from the noise-free truth, in units; None if the model cannot run.
 
-    Rows on a jump of an input do not count: no record tells them.
+    Rows on a jump of an input do not count: they are not defined in a record.
     """
     off = np.zeros_like(case.clean)
     for k, e in enumerate(experiments):
@@ -158,7 +158,7 @@ def _apart(model: Any, experiments: Sequence[Experiment], case: Case, values: Ma
 def _sindy(
     model: Model, experiments: Sequence[Experiment], case: Case, values: Mapping[str, float]
 ) -> dict[str, float | None]:
-    """The held-out misfit with a sparse law for the residual, and how many terms the law has."""
+    """Return the held-out misfit with a sparse law for the residual, and the number of its terms."""
     from hidden.sindy import predicted
 
     plant = PLANTS[case.design.plant]
@@ -180,7 +180,7 @@ def _sindy(
 
 
 def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: Sequence[FitParameter]) -> float | None:
-    """The same for the model with what is truly there, fitted from the truth; None outside the catalogue and without effects."""
+    """Return the misfit of the model with the true effects, fitted from the truth; None outside the catalogue or without effects."""
     known = effects()
     if not case.hidden or any(h.effect not in known for h in case.hidden):
         return None
@@ -216,7 +216,7 @@ def _numbers(parameters: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _bounds(effect: str, values: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Bounds for a fit from the truth: a factor of ten, or ten times the distance from neutral; what a refit holds is left."""
+    """Return bounds for a fit from the truth: a factor of ten, or ten times the distance from neutral; held ones are omitted."""
     found = {}
     for name, q in effects()[effect].parameters.items():
         value = values.get(name, q.value)

@@ -1,4 +1,4 @@
-"""What the lines of all cases come to: who was named, who should have been, how large, how well it then predicts."""
+"""Statistics of all cases: named and true effects, sizes, insertion points and held-out misfit."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "fai
 
 
 def same_effect(a: str, b: str) -> bool:
-    """Whether two names stand for one equation."""
+    """Return True if two names stand for one equation."""
     return a == b or any({a, b} <= group for group in SAME_NAME)
 
 
 def same_place(plant: str, effect: str, a: str, b: str) -> bool:
-    """Whether an effect at one slot is the same as at the other."""
+    """Return True if an effect is the same at both insertion points."""
     return a == b or (effect in ADDED and any({a, b} <= group for group in SUMS[plant]))
 
 
 def _is(line: Line, truth: Line, told: Line, place: bool = True) -> bool:
-    """Whether what is told (effect, at, from) is what is hidden."""
+    """Return True if the reported effect (effect, at, from) is the hidden one."""
     if not same_effect(truth["effect"], told["effect"]):
         return False
     if not place:
@@ -53,7 +53,7 @@ def _is(line: Line, truth: Line, told: Line, place: bool = True) -> bool:
 
 
 def outcome(line: Line) -> str:
-    """What came of one case with an effect in it.
+    """Return the outcome of one case with an effect.
 
     right: named, effect and place. covered: the truth is in the ambiguity set. place: the effect is right, its place is
     not (and not in the set). wrong: another effect is named, or one beside the right ones. ambiguous: a set without the
@@ -81,7 +81,7 @@ def outcome(line: Line) -> str:
 
 
 def limit_above(count: int, of: int, level: float = 0.95) -> float:
-    """The upper Clopper-Pearson limit of a share."""
+    """Return the upper Clopper-Pearson limit of a proportion."""
     return 1.0 if count >= of else float(stats.beta.ppf(level, count + 1, of - count))
 
 
@@ -89,7 +89,7 @@ def limit_above(count: int, of: int, level: float = 0.95) -> float:
 
 
 def summary(lines: Sequence[Line]) -> dict[str, Any]:
-    """Everything the study reports, as plain numbers."""
+    """Return everything that the study reports, as plain numbers."""
     made = [x for x in lines if not x.get("unreachable")]
     by_part = {p: [x for x in made if x["part"] == p] for p in ("single", "pair", "clean", "outside", "left-out")}
     single = by_part["single"]
@@ -145,7 +145,7 @@ def _by(lines: Sequence[Line], key: str) -> dict[str, Any]:
 
 
 def _confusion(lines: Sequence[Line]) -> dict[str, dict[str, int]]:
-    """By hidden effect: what was named (the first), or the verdict where nothing was."""
+    """Return by hidden effect the first named effect, or the verdict if nothing was named."""
     table: dict[str, Counter[str]] = {}
     for x in lines:
         if "failed" in x:
@@ -161,7 +161,7 @@ def _confusion(lines: Sequence[Line]) -> dict[str, dict[str, int]]:
 
 
 def _ambiguity(lines: Sequence[Line]) -> dict[str, Any]:
-    """Of the cases with an ambiguity set: how often the truth is in it, and how many members it has."""
+    """Return, for the cases with an ambiguity set, how often it contains the truth, and its number of members."""
     sets = [(x, x["ambiguity"][0]) for x in lines if "failed" not in x and x["ambiguity"]]
     inside = [any(_is(x, x["truth"][0], r) for r in members) for x, members in sets]
     return {
@@ -172,7 +172,7 @@ def _ambiguity(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _clean(lines: Sequence[Line]) -> dict[str, Any]:
-    """False names, all and by noise; an ambiguous verdict claims an effect too and is counted beside."""
+    """Return the number of false names, in total and by noise; ambiguous verdicts are counted separately."""
     ran = [x for x in lines if "failed" not in x]
 
     def row(part: Sequence[Line]) -> dict[str, Any]:
@@ -195,10 +195,10 @@ def _clean(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _strangers(lines: Sequence[Line]) -> dict[str, Any]:
-    """Cases whose effect the search did not have: a name is wrong unless it is the same equation.
+    """Return statistics of cases whose effect the search did not have: a name is wrong unless it is the same equation.
 
-    alike: of the wrong names those whose model, as fitted, answers all three records within a unit of what is hidden, so
-    that no record there is could tell them apart.
+    alike: the wrong names whose fitted model reproduces all three records within a unit of the truth, so that these
+    records cannot distinguish them.
     """
     ran = [x for x in lines if "failed" not in x]
     named = [x for x in ran if x["verdict"] == "named" and not any(_is(x, x["truth"][0], f) for f in x["found"])]
@@ -219,7 +219,7 @@ def _strangers(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _location(lines: Sequence[Line]) -> dict[str, Any]:
-    """Of the cases in which the right effect is named: is the place? And with the places of the set?"""
+    """Return how often the insertion point is right where the effect is, by itself and within the set."""
     named = [x for x in lines if "failed" not in x and x["verdict"] in ("named", "ambiguous") and x["found"]]
     named = [x for x in named if same_effect(x["truth"][0]["effect"], x["found"][0]["effect"])]
     exact = sum(_is(x, x["truth"][0], x["found"][0]) for x in named)
@@ -229,7 +229,7 @@ def _location(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _sizes(lines: Sequence[Line]) -> dict[str, Any]:
-    """Of what was named rightly: the relative error of the size, and how often its interval holds the truth."""
+    """Return, for correctly named effects, the relative error of the size and the coverage of its interval."""
     table: dict[str, list[tuple[float, bool]]] = {}
     for x in lines:
         if "failed" in x or outcome(x) != "right" or len(x["found"]) != 1:
@@ -260,12 +260,12 @@ def _sizes(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def same_sign_place(line: Line) -> bool:
-    """Whether the effect was found at its own slot: at the other side of a sum its size has another sign."""
+    """Return True if the effect was found at its own insertion point: at the other side of a sum the sign of its size differs."""
     return bool(line["found"][0]["at"] == [line["truth"][0]["at"]])
 
 
 def _held_out(lines: Sequence[Line]) -> dict[str, Any]:
-    """Shrink of the held-out misfit against the refitted nominal, for what was named, beside the oracle's."""
+    """Return the held-out improvement over the refitted nominal model for named effects, and that of the oracle."""
     rows = []
     for x in lines:
         held = x.get("held_out") or {}
@@ -289,10 +289,10 @@ def _held_out(lines: Sequence[Line]) -> dict[str, Any]:
 
 
 def _baselines(large: Sequence[Line], clean: Sequence[Line], outside: Sequence[Line]) -> dict[str, Any]:
-    """What simpler rules would have said, from the same candidates.
+    """Return the results of simpler rules with the same candidates.
 
-    refit only: never names. best score: the candidate with the best score before any refit, whenever p < 0.01. best BIC:
-    the refit with the best BIC whenever it gains more than 10, without held-out records and without a look at what is left.
+    refit only: never names. best score: the candidate with the best score before any refit, if p < 0.01. best BIC:
+    the refit with the best BIC if it improves by more than 10, without held-out records or residual tests.
     """
 
     def rule(name: str, x: Line) -> Line | None:
@@ -316,7 +316,7 @@ def _baselines(large: Sequence[Line], clean: Sequence[Line], outside: Sequence[L
 
 
 def _sindy(large: Sequence[Line], clean: Sequence[Line]) -> dict[str, Any]:
-    """The sparse law for the residual: its held-out shrink where an effect is, and where none is (it should be none)."""
+    """Return the held-out improvement of the sparse law for the residual, with and without a hidden effect (should be 0)."""
 
     def row(lines: Sequence[Line]) -> dict[str, Any]:
         ran = [x for x in lines if "sindy" in x]

@@ -1,4 +1,4 @@
-"""Noise of the records, and how it weighs a difference."""
+"""Noise of the records, and differences in units of it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ WRONG = ("told-half", "told-white", "heavy", "louder-later")
 
 
 def added(rng: np.random.Generator, clean: Array, sigma: Array, kind: str, event: int) -> Array:
-    """The record: clean (rows, outputs) with noise of standard deviation sigma (outputs,). event: its row.
+    """Return the record: clean (rows, outputs) with noise of standard deviation sigma (outputs,). event: its row.
 
-    told-half: white, told-white: AR(1); what they tell is another matter. heavy: Student's t with 3 degrees of freedom.
-    louder-later: one and a half times as loud from the event on. quantised: rounded to steps whose error has this
-    standard deviation, with white noise of a quarter of a step below.
+    told-half: white, told-white: AR(1); only the stated noise differs. heavy: Student's t with 3 degrees of freedom.
+    louder-later: one and a half times as large from the event on. quantised: rounded to steps whose error has this
+    standard deviation, after white noise of a quarter of a step.
     """
     e = rng.standard_normal(clean.shape)
     if kind == "quantised":
@@ -35,9 +35,9 @@ def added(rng: np.random.Generator, clean: Array, sigma: Array, kind: str, event
 
 
 def whitened(difference: Array, sigma: Array, kind: str, gone: NDArray[np.bool_] | None = None) -> Array:
-    """A difference (rows, runs, ..., outputs) in units of independent noise. gone: (rows, runs), rows left out, which are 0.
+    """Return a difference (rows, runs, ..., outputs) in units of independent noise. gone: (rows, runs), omitted rows, which are 0.
 
-    What is correlated counts from the last row that is there.
+    The correlation counts from the last row that is not omitted.
     """
     d = difference / sigma
     if kind == "ar":

@@ -1,4 +1,4 @@
-"""What may be hidden at a slot, as operators of a time-stepping program: numpy on a batch of runs, nothing else.
+"""Hidden effects as operators of a time-stepping program, in numpy on a batch of runs.
 
 An operator sees the slot's signal at four instants of each step (the stages of the classical Runge-Kutta method). Those
 with dynamics of their own have states that are stepped along; those with memory keep it from step to step.
@@ -16,7 +16,7 @@ Values = Mapping[str, Array]
 
 
 class Operator:
-    """y = u; the others change what they need. p: (batch,) arrays by name. h: step, s; steps: how many there will be."""
+    """y = u; subclasses override what they need. p: (batch,) arrays by name. h: step, s; steps: their number."""
 
     states = 0
     waits_for_rest = False  # whether a steady start cannot be computed: it has to be waited for
@@ -27,24 +27,24 @@ class Operator:
         self.p, self.h, self.steps = p, h, steps
 
     def begin(self, u: Array, other: Array | None) -> list[Array]:
-        """The operator's states at rest; memory is set."""
+        """Set the memory and return the operator's states in steady state."""
         return []
 
     def rest(self, u: Array, other: Array | None) -> Array:
-        """y at rest."""
+        """Return y in steady state."""
         return u
 
     def value(self, u: Array, z: list[Array], t: float, share: float, other: Array | None) -> Array:
-        """y at time t, `share` of a step after the last whole one (0: the step begins here, memory moves on)."""
+        """Return y at time t, `share` of a step after the last whole one (0: a step begins and the memory advances)."""
         return u
 
     def rates(self, u: Array, z: list[Array]) -> list[Array]:
-        """The rates of the operator's states."""
+        """Return the derivatives of the operator's states."""
         return []
 
 
 class Static(Operator):
-    """A curve: y depends on u (and the other signal) alone."""
+    """A static effect: y depends on u (and the other signal) only."""
 
     def rest(self, u: Array, other: Array | None) -> Array:
         return self.value(u, [], 0.0, 0.0, other)
@@ -89,7 +89,7 @@ class Conductance(Static):
 
 
 class Change(Operator):
-    """Something of how far another signal is from its start."""
+    """A function of the change of another signal from its start."""
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.first = other.copy()
@@ -176,7 +176,7 @@ class LeadLag(Operator):
 
 
 class History:
-    """The values at whole steps, read between them along straight lines."""
+    """The values at whole steps, interpolated linearly between them."""
 
     def __init__(self, first: Array, h: float, steps: int) -> None:
         self.values = np.empty((steps + 2, first.size))
@@ -184,12 +184,12 @@ class History:
         self.count, self.h, self.columns = 0, h, np.arange(first.size)
 
     def add(self, value: Array) -> None:
-        """One more step."""
+        """Add one step."""
         self.values[self.count] = value
         self.count += 1
 
     def at(self, back: Array) -> tuple[Array, Array]:
-        """(values, how long before the first one), `back` steps before the last one."""
+        """Return the values `back` steps before the last one, and the time before the first one."""
         place = np.minimum(self.count - 1 - back, self.count - 1.0)
         low = np.clip(np.floor(place).astype(int), 0, max(self.count - 2, 0))
         share = np.clip(place - low, 0.0, 1.0)
@@ -199,7 +199,7 @@ class History:
 
 
 class Delay(Operator):
-    """From the values at both ends of every step: a jump between two steps stays one."""
+    """A delay of the values at both ends of every step: a jump between two steps is preserved."""
 
     stepped = True
 
@@ -225,7 +225,7 @@ class Delay(Operator):
 
 
 class WindowMean(Operator):
-    """From the integral of u: its growth over the window."""
+    """The increment of the integral of u over the window."""
 
     states = 1
     stepped = True
@@ -246,7 +246,7 @@ class WindowMean(Operator):
 
 
 class RateLimit(Operator):
-    """The ideal one: towards u by at most rate times the time since the last whole step."""
+    """The ideal rate limit: towards u by at most rate times the time since the last whole step."""
 
     stepped = True
 
@@ -263,7 +263,7 @@ class RateLimit(Operator):
 
 
 class Backlash(Operator):
-    """The play operator of Krasnosel'skii: the least movement that keeps u within the play."""
+    """The play operator of Krasnosel'skii: the smallest movement that keeps u within the play."""
 
     stepped = True
 
@@ -317,7 +317,7 @@ class Relay(Static):
 
 
 class Notch(Operator):
-    """Outside the catalogue: a band of frequencies is missing."""
+    """Outside the catalogue: a notch filter."""
 
     states = 2
     width = 0.5  # of the band, in parts of its middle
@@ -342,7 +342,7 @@ class Drift(Operator):
 
 
 class Product(Operator):
-    """Outside the catalogue: another signal's change scales the slot's own."""
+    """Outside the catalogue: the change of another signal scales that of the insertion point."""
 
     def begin(self, u, other):  # type: ignore[no-untyped-def]
         self.first = other.copy()

@@ -1,4 +1,4 @@
-"""The two small plants of the study, as plain functions; their cards for the package stand in `cards/`."""
+"""The two small plants of the study as plain functions; their cards for the package are in `cards/`."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Flow = Callable[[list[Array], Mapping[str, Array], Mapping[str, Array], See], li
 
 @dataclass(frozen=True)
 class Plant:
-    """A plant: values of parameters and inputs, where its states may be looked for, and its equations.
+    """A plant: values of parameters and inputs, initial guesses of its states, and its equations.
 
-    flow(x, inputs, parameters, see): rates of the states; every signal passes `see(slot, value)`, which returns what
-    its readers get, and keeps it. fitted: the parameters a fit may move. kicks: by input, the size of a small step.
-    slots: where an effect may hide, but for the outputs; a signal stands after those it may bring in.
+    flow(x, inputs, parameters, see): derivatives of the states; every signal passes through `see(slot, value)`, which
+    returns and keeps the value for its readers. fitted: the fit parameters. kicks: by input, the size of a small step.
+    slots: insertion points other than the outputs; a signal comes after those that it may read.
     """
 
     name: str

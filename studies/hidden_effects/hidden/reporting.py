@@ -9,7 +9,7 @@ from hidden.judging import OUTCOMES
 
 
 def report(found: Mapping[str, Any]) -> str:
-    """The summary as Markdown."""
+    """Return the summary as Markdown."""
     sizes = {"all": found["sizes"]["all"], **found["sizes"]["by_effect"]}
     parts = [
         f"Cases: {', '.join(f'{n} {p}' for p, n in found['cases'].items())}; "

@@ -22,12 +22,12 @@ WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 @dataclass(frozen=True)
 class Signal:
-    """An input: straight lines through points (time, value), a time that stands twice is a jump; constant outside."""
+    """An input: straight lines through points (time, value); a repeated time is a jump; constant outside."""
 
     points: tuple[tuple[float, float], ...]
 
     def at(self, t: Array, before: bool = False) -> Array:
-        """Values at times; at a jump the one after it, or before it."""
+        """Return the values at times; at a jump the one after it, or before it."""
         times, values = np.array(self.points).T
         right = np.searchsorted(times, t, side="left" if before else "right")
         low, high = np.clip(right - 1, 0, None), np.clip(right, None, times.size - 1)
@@ -37,14 +37,14 @@ class Signal:
 
     @property
     def jumps(self) -> tuple[float, ...]:
-        """The times that stand twice."""
+        """Return the times of jumps."""
         times = [t for t, _ in self.points]
         return tuple(a for a, b in pairwise(times) if a == b)
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """An effect at a slot. parameters: numbers, or one a run. source: the signal it brings in."""
+    """An effect at an insertion point. parameters: numbers, or one for each run. source: the other signal that it reads."""
 
     effect: str
     at: str
@@ -54,7 +54,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a batch: the inputs that move and the parameters that differ from the plant's."""
+    """One run of a batch: the varying inputs and the parameters that differ from the plant's."""
 
     inputs: Mapping[str, Signal] = field(default_factory=dict)
     values: Mapping[str, float] = field(default_factory=dict)
@@ -71,9 +71,9 @@ def simulate(
     step: float = STEP,
     lead: float = LEAD,
 ) -> Array:
-    """(rows, runs, outputs) at k * interval s; or of the slots in `watch` (as their readers see them).
+    """Return (rows, runs, outputs) at k * interval s, or the signals in `watch` as their readers see them.
 
-    lead: how long a run without a steady start waits for rest, or for what it repeats, before its first row, s.
+    lead: time in s before the first row, for a run without a steady start to settle or to become periodic.
     """
     return _Batch(plant, runs, hidden, rows, interval, watch, step, lead).result()
 
@@ -113,7 +113,7 @@ class _Batch:
         self.seen: dict[str, Array] = {}
 
     def _inputs(self, runs: Sequence[Run]) -> dict[str, Array]:
-        """(steps, 3, runs): at the beginning, the middle and just before the end of every step."""
+        """Return (steps, 3, runs): the inputs at the beginning, in the middle and just before the end of every step."""
         # To a picosecond: by rounding the end of a step may lie behind a jump that stands there, and see it one step early.
         t, middle, end = (
             np.round((np.arange(self.steps) - self.lead + share) * self.h, 12) for share in (0.0, 0.5, 1.0)
@@ -135,7 +135,7 @@ class _Batch:
     def _flow(
         self, mode: str, x: list[Array], inputs: Mapping[str, Array], t: float, share: float
     ) -> list[Array | None]:
-        """Rates of all states. mode: "rest" (operators as they are at rest), "begin" (they set themselves up) or "run"."""
+        """Return the derivatives of all states. mode: "rest" (operators in steady state), "begin" (they are initialised) or "run"."""
         own = len(self.plant.states)
         rates: list[Array | None] = [None] * (self.count - own)
         chains, seen = self.chains, self.seen
@@ -164,7 +164,7 @@ class _Batch:
         return [*self.plant.flow(x, inputs, self.p, see), *rates]
 
     def _brought_in(self, source: str, x: list[Array], inputs: Mapping[str, Array]) -> Array | None:
-        """Of an input or a state the value itself, of a signal what its readers get; None without a source."""
+        """Return the value of the input or state, or a signal as its readers see it; None without a source."""
         if not source:
             return None
         if source in inputs:
@@ -172,7 +172,7 @@ class _Batch:
         return x[self.states[source]] if source in self.states else self.seen[source]
 
     def _rest(self) -> list[Array]:
-        """The states at which nothing moves, by Newton's method with differences; operators are set up there."""
+        """Return the steady state by Newton's method with differences, and initialise the operators there."""
         inputs = {n: v[0, 0] for n, v in self.inputs.items()}
         m = len(self.plant.states)
         x = [np.full(self.n, g) for g in self.plant.states.values()]
@@ -196,7 +196,7 @@ class _Batch:
     # --- the run ---
 
     def result(self) -> Array:
-        """(rows, runs, watched); a run that leaves all bounds is nan from there on."""
+        """Return (rows, runs, watched); a diverged run is NaN from there on."""
         with np.errstate(all="ignore"):
             return self._result()
 

@@ -1,8 +1,8 @@
-"""A baseline that names nothing: a sparse equation for what the refitted model leaves (needs pysindy, the extra `bench`).
+"""A baseline that names nothing: a sparse equation for the residual of the refitted model (needs pysindy, the extra `bench`).
 
-The residual of the refitted nominal model is taken for a state of its own, driven by the model's outputs and the inputs;
-pysindy finds a sparse polynomial law for it on the fitted records, and the law is run along the held-out one. How sparse
-and how smooth it is, down to no law at all, is settled by the BIC of runs along the fitted records.
+The residual of the refitted nominal model is treated as a state that is driven by the model's outputs and the inputs.
+pysindy fits a sparse polynomial law to the fitted records, and the law is simulated along the held-out one. The BIC of
+simulations along the fitted records determines sparsity and smoothing, or rejects the law.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ FARTHEST = 30.0
 
 
 def predicted(residuals: Sequence[Array], drivers: Sequence[Array], times: Array) -> tuple[Array | None, int]:
-    """(the residual of the last experiment as the law of the others predicts it, terms in the law).
+    """Return the residual of the last experiment as predicted by the law of the others, and the number of its terms.
 
-    residuals, drivers: (rows, n) in each experiment, the held-out one last; nothing of its residual is used.
-    None where the law runs away along the held-out drivers.
+    residuals, drivers: (rows, n) in each experiment, the held-out one last; its residual is not used.
+    None if the law diverges along the held-out drivers.
     """
     size = np.maximum(np.std(np.concatenate(residuals[:-1]), axis=0), 1e-12)
     middle = np.mean(np.concatenate(drivers[:-1]), axis=0)
@@ -70,7 +70,7 @@ def _law(x: Sequence[Array], u: Sequence[Array], step: float, degree: int, windo
 
 
 def _run(law: Any, drivers: Array, t: Array, n: int) -> Array | None:
-    """(rows, n) the law's own run from 0, by classical Runge-Kutta steps from row to row; None where it runs away."""
+    """Return (rows, n), the law's simulation from 0 by classical Runge-Kutta steps from row to row; None if it diverges."""
     powers, coefficients = np.asarray(law.feature_library.powers_), np.asarray(law.coefficients())
 
     def rate(state: Array, now: Array) -> Array:

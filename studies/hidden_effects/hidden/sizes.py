@@ -1,4 +1,4 @@
-"""How large an effect has to be: in units of what can just be detected once the gains have been refitted."""
+"""Sizes of hidden effects in units of the smallest detectable size after a refit of the gains."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ would meet exactly, and which of the two comes first would be a matter of roundi
 
 @dataclass(frozen=True)
 class About:
-    """What a size is relative to: the slot's signal (and the other one) over the fitted experiments without the effect."""
+    """Reference of a size: the insertion point's signal (and the other one) in the fitted experiments without the effect."""
 
     low: float
     high: float
@@ -46,12 +46,12 @@ class About:
 
     @property
     def peak(self) -> float:
-        """Its largest magnitude."""
+        """Return its largest magnitude."""
         return max(abs(self.low), abs(self.high), 1e-9)
 
     @property
     def range(self) -> float:
-        """How far it moves, or a hundredth of its peak."""
+        """Return its range, or at least a hundredth of its peak."""
         return max(self.high - self.low, 0.01 * self.peak)
 
 
@@ -79,7 +79,7 @@ TIMES = ("lag", "delay", "window-mean", "sample-hold", "second-order", "inner-lo
 
 
 def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, resistance: float) -> dict[str, Array]:
-    """The effect's parameters for sizes x (any shape, growing with the effect). rng: what else there is to choose."""
+    """Return the effect's parameters for sizes x (any shape, growing with the effect). rng: for the other choices."""
     sign, one = rng.choice([-1.0, 1.0]), np.ones_like(x)
     ratio = about.range / max(about.other_range, 1e-9)
     match effect:
@@ -144,7 +144,7 @@ def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, re
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """The plant without effects under a campaign: outputs (rows, 3, outputs) and their slopes by the fitted parameters."""
+    """The plant without effects under a campaign: outputs (rows, 3, outputs) and their derivatives by the fit parameters."""
 
     plant: Plant
     runs: tuple[Run, Run, Run]
@@ -156,7 +156,7 @@ class Nominal:
 
 @lru_cache(maxsize=32)
 def nominal(plant_name: str, excitation: str, variant: int) -> Nominal:
-    """The plant's own answer to a campaign, and how the fitted parameters move it."""
+    """Return the plant's response to a campaign and its derivatives by the fit parameters."""
     plant = PLANTS[plant_name]
     runs = campaign(plant, excitation, variant)
     batch = list(runs)
@@ -177,7 +177,7 @@ def nominal(plant_name: str, excitation: str, variant: int) -> Nominal:
 
 
 def about(base: Nominal, at: str, source: str) -> About:
-    """What sizes at a slot are relative to."""
+    """Return the reference of sizes at an insertion point."""
     u, o = base.slots[at], base.slots[source] if source else np.zeros((1, 2))
     return About(
         float(u.min()), float(u.max()), float(np.abs(u[0]).max()),
@@ -186,22 +186,23 @@ def about(base: Nominal, at: str, source: str) -> About:
 
 
 def on_jumps(runs: Sequence[Run]) -> NDArray[np.bool_]:
-    """(rows, runs) whether a row lies on a jump of an input: no recording says which of its sides such a row shows."""
+    """Return (rows, runs), True for rows on a jump of an input: a recording does not state which side such a row shows."""
     rows = [[round(t / INTERVAL) for signal in run.inputs.values() for t in signal.jumps] for run in runs]
     return np.stack([np.isin(np.arange(ROWS), own) for own in rows], axis=1)
 
 
 def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Sequence[int]) -> Array:
-    """(n,) the post-refit size of each answer, in units. answer: (rows, 2, n, outputs) of the fitted experiments.
+    """Return (n,), the post-refit size of each response, in units. answer: (rows, 2, n, outputs) of the fitted experiments.
 
-    What the plant without effects, refitted, leaves of the answer. Where a linear step moves no parameter far it is
-    taken for the refit; else the refit is run, within the bounds a fit has. Rows on a jump of an input do not count.
+    It is the part of the response that the refitted plant without effects does not explain. If a linear step changes no
+    parameter much, it replaces the refit; else the refit is run within the bounds of a fit. Rows on a jump of an input do
+    not count.
     """
     pick = list(channels)
     gone = on_jumps(base.runs[:2])
 
     def residual(y: Array) -> Array:
-        """(N, n) of outputs (rows, 2, n, outputs)."""
+        """Return the residuals (N, n) of outputs (rows, 2, n, outputs)."""
         d = whitened(y, sigma, kind, gone)[..., pick]
         return np.asarray(d.transpose(0, 1, 3, 2).reshape(-1, y.shape[2]))
 
@@ -217,7 +218,7 @@ def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Seque
 
 
 def _step(slopes: Array, r: Array, damping: float) -> Array:
-    """The Levenberg-Marquardt step of log-parameters towards r."""
+    """Return the Levenberg-Marquardt step of log-parameters towards r."""
     norms = np.maximum(np.linalg.norm(slopes, axis=0), 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300))
     unit = slopes / norms
     left, values, right = np.linalg.svd(unit, full_matrices=False)
@@ -227,7 +228,7 @@ def _step(slopes: Array, r: Array, damping: float) -> Array:
 
 
 def _refitted(base: Nominal, residual: Callable[[Array], Array], answer: Array, r: Array, slopes: Array) -> Array:
-    """(n,) the norm of what is left of each answer at the best parameters found, all answers at once."""
+    """Return (n,), the residual norm of each response at its best parameters, all responses at once."""
     n = answer.shape[2]
     here, cost, jacobians = np.zeros((n, len(base.plant.fitted))), np.sum(r**2, axis=0), [slopes] * n
     r, damping, open_ = r.copy(), np.full(n, 1e-3), np.ones(n, dtype=bool)
@@ -251,7 +252,7 @@ def _refitted(base: Nominal, residual: Callable[[Array], Array], answer: Array, 
 
 
 def _bounded(at: Array, slopes: Array, r: Array, damping: float) -> Array:
-    """Where a step leads, within the bounds; parameters that a step would take across one stand there."""
+    """Return the end of a step, with parameters clipped to the bounds."""
     edge, free = np.log(WIDTH), np.ones(at.size, dtype=bool)
     there = at.copy()
     for _ in range(at.size):
@@ -266,7 +267,7 @@ def _bounded(at: Array, slopes: Array, r: Array, damping: float) -> Array:
 
 
 def _plant(base: Nominal, logs: Array) -> tuple[Array, Array]:
-    """Outputs, (rows, 2, n, outputs), of the plant without effects at log-parameters (n, p), and slopes by those.
+    """Return the outputs (rows, 2, n, outputs) of the plant without effects at log-parameters (n, p), and their derivatives.
 
     slopes: (rows, 2, n, parameters, outputs).
     """
@@ -295,9 +296,9 @@ def sized(
     channels: Sequence[int],
     seed: Sequence[int],
 ) -> Hidden | None:
-    """The effect as large as wanted, in units; None where no size reaches it, or a run leaves all bounds before.
+    """Return the effect at the required size, in units; None if no size reaches it or a run diverges before.
 
-    A size beyond which the answer is out of all proportion (four times the outputs' own range) counts as out of bounds.
+    A size with a response of over four times the outputs' range counts as diverged.
     """
     plant = base.plant
     low, high = SPANS.get(effect, (1e-3, 1.0))
@@ -332,5 +333,5 @@ def sized(
 
 
 def needs_source(effect: str) -> bool:
-    """Whether the effect brings another signal in."""
+    """Return True if the effect reads another signal."""
     return effect in WITH_SOURCE

@@ -1,4 +1,4 @@
-"""The program told nothing: what it says is missing, and what the gains and Fig. 8 become with it."""
+"""The diagnoses without hints, and the gains and Fig. 8 with the inserted effects."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ OPTIONS = DiagnosisOptions(fallback=False)
 
 @dataclass(frozen=True)
 class Asked:
-    """What is recorded, and what is let count."""
+    """The recorded outputs and the options of a diagnosis."""
 
     outputs: tuple[str, ...]
     options: DiagnosisOptions = OPTIONS
@@ -50,26 +50,26 @@ AT = tuple(float(k) for k in range(550, 951, 25))
 
 
 def link() -> Model:
-    """The plain link, its currents among its outputs."""
+    """Return the plain link with its currents as further outputs."""
     plain = load_model(paper.LINK)
     currents = {n: Output(parse(n), "pu") for n in ("Ir1", "Ir2")}
     return replace(plain, outputs=FrozenMap({**plain.outputs, **currents}))
 
 
 def experiments(outputs: Sequence[str], noise: float = NOISE) -> tuple[Experiment, ...]:
-    """Five of the paper's kind to fit and three held out, from the average-value link, with white noise."""
+    """Return five experiments to fit and three held out, from the average-value link, with white noise."""
     campaign = Campaign(source=paper.REFERENCE, count=3, holdout=1, sample=SAMPLE, at_rest=True, outputs=tuple(outputs),
                         noise=Noise(noise))  # fmt: skip
     return tuple(e for e in recorded(campaign) if e.name in (*FITTED, *HELD_OUT))
 
 
 def unknowns() -> tuple[FitParameter, ...]:
-    """The gains, begun at Table I's: what the vendor gave."""
+    """Return the gains, which start at Table I's, the vendor's values."""
     return tuple(FitParameter(n, paper.TABLE_1[n], paper.TABLE_1[n] / 4, 3 * paper.TABLE_1[n]) for n in FREE)
 
 
 def diagnosis(name: str, *, noise: float = NOISE, executor: Any = None) -> dict[str, Any]:
-    """What is said to be missing, one of ASKED; at every place."""
+    """Return the diagnosis of one of ASKED, at every insertion point."""
     asked = ASKED[name]
     found = diagnose(
         link(),
@@ -90,7 +90,7 @@ def diagnosis(name: str, *, noise: float = NOISE, executor: Any = None) -> dict[
 
 
 def put_in(told: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """What is said to be missing, or else the best of the first round: its sizes, and the gains refitted with it."""
+    """Return the named effects, or else the best of the first round, with sizes and the gains refitted with them."""
     if told["effects"]:
         return {"effects": sized(told)} | {k: dict(told[k]) for k in ("refitted", "augmented")}
     best, plain = told["first round"][0], link()
@@ -112,17 +112,17 @@ def put_in(told: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def sized(told: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The effects that are said to be missing, of their parameters the values alone."""
+    """Return the effects of a diagnosis with only the values of their parameters."""
     return [{**e, "parameters": {n: s["value"] for n, s in e["parameters"].items()}} for e in told["effects"]]
 
 
 def delay(effects: Sequence[Mapping[str, Any]]) -> float:
-    """The delay that effects of one loop add together at low frequencies, s: what their transfer functions begin with."""
+    """Return the total low-frequency delay of the effects in one loop, s, from their transfer functions."""
     return sum(late(e["parameters"]) for e in effects if (late := catalogue()[e["effect"]].late))
 
 
 def augmented(told: Mapping[str, Any]) -> Model:
-    """The plain link with what was put in, as big as it was found."""
+    """Return the plain link with the inserted effects at their estimated sizes."""
     uses = [
         {"effect": e["effect"], "at": e["at"], "parameters": dict(e["parameters"])}
         | ({"from": e["from"]} if e["from"] else {})
@@ -132,7 +132,7 @@ def augmented(told: Mapping[str, Any]) -> Model:
 
 
 def figure_8(told: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """RMSE of Irorder1 over KIVDC in the paper's step: the plain link with its fitted KPVDC, the augmented one with its own."""
+    """Return the RMSE of Irorder1 over KIVDC in the paper's step, plain and augmented link, each with its fitted KPVDC."""
     step = paper.step("Vdc", paper.REFERENCE, ["Irorder1"])
     lines = {
         "plain link": (load_model(paper.LINK), told["refitted"]),
@@ -145,7 +145,7 @@ def figure_8(told: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 
 
 def share_gone(told: Mapping[str, Any]) -> dict[str, float]:
-    """By gain the share of the plain link's bias that is gone with what was named, 1 for all of it."""
+    """Return by gain the share of the plain link's bias that the inserted effects remove, 1 for all of it."""
     return {
         n: 1.0 - abs(told["augmented"][n] - paper.TABLE_1[n]) / abs(told["refitted"][n] - paper.TABLE_1[n])
         for n in FREE

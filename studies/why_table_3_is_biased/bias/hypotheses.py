@@ -1,4 +1,4 @@
-"""What else might have moved Table III's gains: each cause put into the waveforms, fitted as the paper fits, and scored."""
+"""Other possible causes of Table III's bias: each put into the waveforms, fitted as in the paper, and scored."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ PAPER_8 = {550.0: 0.0053, 780.0: 0.0033, 850.0: 0.0033, 950.0: 0.0036}
 
 @dataclass(frozen=True)
 class Cause:
-    """What made the waveforms, and how they are fitted: late, s, and a number of evaluations after which a fit is stopped."""
+    """A cause: the model of the waveforms, their misalignment `late` in s, and the evaluations after which a fit is stopped."""
 
     model: Any = field(default_factory=lambda: load_model(paper.LINK))
     late: float = 0.0
@@ -59,7 +59,7 @@ class Cause:
 
 
 def causes() -> dict[str, Cause]:
-    """Every cause that is scored."""
+    """Return every cause that is scored."""
     link = load_model(paper.LINK)
     found = {"nothing missing": Cause(link), "the average-value link": Cause(vsc_hvdc_avm.model())}
     found |= {name: Cause(link.with_effects(uses)) for name, uses in EFFECTS.items()}
@@ -72,7 +72,7 @@ def causes() -> dict[str, Cause]:
 
 
 def recordings(cause: Cause, count: int = RUNS) -> tuple[Experiment, ...]:
-    """Steps and ramps of each controller as the cause records them, set-points at the instants the fit believes in."""
+    """Return steps and ramps of each controller with the cause, set-points at the instants that the fit assumes."""
     campaign = Campaign(source=paper.LINK, count=count, sample=paper.SAMPLE, at_rest=True)
     shifted = experiments(replace(campaign, event=round(campaign.event + cause.late, 9)))
     return tuple(
@@ -82,7 +82,7 @@ def recordings(cause: Cause, count: int = RUNS) -> tuple[Experiment, ...]:
 
 
 def estimates(cause: Cause, count: int = RUNS, executor: Any = None) -> dict[str, dict[str, list[float]]]:
-    """By mode and gain the estimates of all runs, on bounds too, as Table III has them."""
+    """Return the estimates of all runs by mode and gain, including those on bounds, as in Table III."""
     recorded = recordings(cause, count)
     if cause.evaluations:
         return _stopped(recorded, cause.evaluations)
@@ -93,7 +93,7 @@ def estimates(cause: Cause, count: int = RUNS, executor: Any = None) -> dict[str
 
 
 def _stopped(recorded: Sequence[Experiment], evaluations: int) -> dict[str, dict[str, list[float]]]:
-    """The estimates where a simplex is stopped after so many evaluations, begun at Table II's starts."""
+    """Return the estimates of a simplex from Table II's starts, stopped after that many evaluations."""
     found: dict[str, dict[str, list[float]]] = {m: {n: [] for n in paper.GAINS} for m in paper.MODES.values()}
     method = NelderMead(max_evaluations=evaluations)
     for kind, c in paper.CONTROLLERS.items():
@@ -111,7 +111,7 @@ def _stopped(recorded: Sequence[Experiment], evaluations: int) -> dict[str, dict
 
 
 def judged(cause: Cause, count: int = RUNS, executor: Any = None) -> dict[str, Any]:
-    """The twelve means and spreads, the RMSE of fitted over test gains by output, and Fig. 8's line of Irorder1."""
+    """Return the twelve means and spreads, the RMSE ratios of fitted to test gains by output, and Fig. 8's curve."""
     values = estimates(cause, count, executor)
     mean = {m: {n: float(np.mean(v)) for n, v in by.items()} for m, by in values.items()}
     std = {m: {n: float(np.std(v, ddof=1)) for n, v in by.items()} for m, by in values.items()}
@@ -127,7 +127,7 @@ def judged(cause: Cause, count: int = RUNS, executor: Any = None) -> dict[str, A
 
 
 def step_of(cause: Cause, kind: str) -> Experiment:
-    """A controller's one step as the cause records it."""
+    """Return a controller's representative step with the cause."""
     c = paper.CONTROLLERS[kind]
     believed = paper.step(kind, paper.LINK, [c.output])
     moved = type(believed.inputs[c.setpoint]).step(paper.EVENT + cause.late, c.before, c.after)
@@ -136,7 +136,7 @@ def step_of(cause: Cause, kind: str) -> Experiment:
 
 
 def scores(found: Mapping[str, Any]) -> dict[str, float]:
-    """How far a cause is from the paper, 0 for the same.
+    """Return the distances of a cause from the paper, 0 for equality.
 
     means: rms over the twelve means, in % of the gains' ranges in Table II. spreads: rms over eleven (one of the paper's
     is 0) of the decades between the standard deviations, none taken below a hundred-thousandth of the range. ratios: the
@@ -158,7 +158,7 @@ def scores(found: Mapping[str, Any]) -> dict[str, float]:
 
 
 def paper_ratios() -> dict[str, float]:
-    """Table IV's RMSE at the upper ends of the individual fits over that of the test values, by controller."""
+    """Return Table IV's RMSE at the upper ends of the individual fits divided by that of the test values, by controller."""
     rows = {kind: paper.TABLE_4[c.output] for kind, c in paper.CONTROLLERS.items()}
     return {kind: row["upper II"] / row["test"] for kind, row in rows.items()}
 
@@ -168,7 +168,7 @@ def _rms(x: Sequence[float]) -> float:
 
 
 def coarse_solver(step: float = COARSE) -> dict[str, float]:
-    """The gains of the linear chain solved by implicit Euler at a coarse step, fitted to the exact response to a step.
+    """Return the gains of the linear chain, solved by implicit Euler with a coarse step and fitted to the exact step response.
 
     P and Q: x' = K (ref - x), whose pole the method puts at ln(1 + K h)/h; the fit gives back the true 30 where that is
     30. Vdc: C s^2 + KPVDC s + KIVDC, the same of both poles, so that z = 1/(1 - h s) for the two.
@@ -186,5 +186,5 @@ def coarse_solver(step: float = COARSE) -> dict[str, float]:
 
 
 def on_stderr(text: str) -> None:
-    """Tell whoever watches."""
+    """Print a line on stderr."""
     print(text, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""The tables of what was named and of the other causes, and the figure."""
+"""The tables of the diagnoses and of the other causes, and the figure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLOURS = ("#1f5fa8", "#3a9d5d", "#a03a8c")
 
 
 def tables(values: Mapping[str, Any]) -> dict[str, str]:
-    """The README's tables by name."""
+    """Return the README's tables by name."""
     told = values["told nothing"] | values["finer"]
     return {
         "verdicts": _verdicts(told, values["louder"]),
@@ -59,7 +59,7 @@ def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
 
 
 def _places(t: Mapping[str, Any]) -> str:
-    """The best of the first round, where nothing is in the model yet."""
+    """Return the table of the best effects of the first round, before any is in the model."""
     best = t["first round"][0]["delta_bic"]
     rows = [
         [diagnosing.label(c), number(c["delta_bic"] - best, 3), number(c["holdout"], 4)] for c in t["first round"][:8]
@@ -100,7 +100,7 @@ def _figure_8(lines: Mapping[str, Any]) -> str:
 
 
 def _causes(found: Mapping[str, Any]) -> str:
-    """The scores by cause, the nearest to the paper's means first."""
+    """Return the table of scores by cause, the nearest to the paper's means first."""
     scored = {name: hypotheses.scores(v) for name, v in found.items()}
     names = sorted(scored, key=lambda n: scored[n]["means"])
     keys = ("means", "spreads", "ratios", "figure 8")
@@ -126,7 +126,7 @@ def _means(found: Mapping[str, Any]) -> str:
 
 
 def draw(values: Mapping[str, Any], by_case: Mapping[str, Mapping[str, float]], gains: Sequence[str]) -> Any:
-    """Left the bias of each gain by what is switched off; right the gains and Fig. 8 before and after what was named."""
+    """Draw the bias of each gain by part switched off (left), and the gains and Fig. 8 before and after the diagnosis (right)."""
     from hvdc_ident.report.drawing import figure
 
     fig = figure(13, 9)
