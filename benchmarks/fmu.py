@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu.export.fmu import export_fmu
-from hvdc_ident.fmu.host import Limits
-from hvdc_ident.fmu.model import FmuModel, read_fmu
+from hvdc_ident.fmu import FmuModel, Limits, read_fmu
+from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.models import load_model
 
@@ -32,7 +31,7 @@ def own_memory() -> int:
 
 def processor(model: FmuModel) -> float:
     """Seconds of processor time of this process and the FMU's."""
-    fields = Path(f"/proc/{model.host._processes.workers[0].pid}/stat").read_text().rpartition(") ")[2].split()
+    fields = Path(f"/proc/{model.pool._processes.workers[0].pid}/stat").read_text().rpartition(") ")[2].split()
     return time.process_time() + (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
@@ -46,19 +45,19 @@ def successive_runs(path: Path, version: str) -> None:
         start = time.perf_counter()
         model.simulate(run, {"KPVDC": 20.0 + 0.01 * k})
         times.append(time.perf_counter() - start)
-        memory.append(model.host.memory)
+        memory.append(model.pool.memory)
         ours.append(own_memory())
     each = 1e3 * (processor(model) - begin) / RUNS
     ms = 1e3 * np.array(times)
     print(
         f"FMI {version}, co-simulation, 500 points, {RUNS} runs: median {np.median(ms):.1f} ms, least {ms.min():.1f}, "
-        f"95 % under {np.percentile(ms, 95):.1f}, processor {each:.1f} ms a run; workers {model.host.started}"
+        f"95 % under {np.percentile(ms, 95):.1f}, processor {each:.1f} ms a run; workers {model.pool.started}"
     )
     print(
         f"  memory from run 50 to {RUNS}: worker {(memory[-1] - memory[49]) / 1024:+.0f} KiB, "
         f"this process {(ours[-1] - ours[49]) / 1024:+.0f} KiB"
     )
-    model.host.close()
+    model.pool.close()
 
 
 def linear_models(path: Path, version: str) -> None:
@@ -76,7 +75,7 @@ def linear_models(path: Path, version: str) -> None:
         print(
             f"FMI {version}, {len(model.states)} states, {name}: median {np.median(ms):.1f} ms, least {ms.min():.1f} ms"
         )
-    model.host.close()
+    model.pool.close()
 
 
 def main() -> None:

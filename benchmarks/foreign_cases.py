@@ -22,7 +22,7 @@ from fmpy.fmi3 import FMU3Model
 from fmpy.simulation import instantiate_fmu, simulate_fmu
 
 from hvdc_ident.data import Experiment, InputSignal
-from hvdc_ident.fmu.model import FmuModel, read_fmu
+from hvdc_ident.fmu import FmuModel, read_fmu
 from hvdc_ident.simulate import Tolerance
 
 REAL = ("Real", "Float64", "Float32")
@@ -307,7 +307,7 @@ def simulation(path: Path, interface: str, told: Told) -> None:
     apart = np.abs(found[rows] - truth[rows])[:, k] if off.size else np.zeros(1)
     row = int(np.nanargmax(apart)) if np.isfinite(apart).any() else 0
     told({**beyond(peer.names, off, own), "at": float(plan.rows[rows][row]), "stage": "done"})
-    model.host.close()
+    model.pool.close()
     peer.close()
 
 
@@ -332,7 +332,7 @@ def uneven(path: Path, interface: str, told: Told) -> None:
     reached = np.isfinite(truth[rows]).all(axis=1)
     off = np.where(fresh, both_gaps(found[rows], truth[rows], scale), 0.0)
     told({"reached": float(reached.mean()), **beyond(peer.names, off, own), "stage": "done"})
-    model.host.close()
+    model.pool.close()
     peer.close()
 
 
@@ -370,7 +370,7 @@ def values(path: Path, interface: str, told: Told) -> None:
         gap = beyond(peer.names, off, gaps(other[rows], y[rows], scale))
         found.append({**gap, "output": f"{gap['output']} with {name}", "beyond": f"{gap['beyond']} with {name}"})
     told({**max(found, key=lambda f: float(f["beyond_gap"])), "stage": "done"})
-    model.host.close()
+    model.pool.close()
     peer.close()
 
 
@@ -400,7 +400,7 @@ def second(path: Path, interface: str, told: Told) -> None:
         told({"between": f"{moved.name if moved else ''}: {type(e).__name__}: {e}"})
     third = np.where(steady, gaps(run_ours(model, plan, peer.names), first, scale), 0.0)
     told({**worst(peer.names, np.maximum(again, third)), "again": float(again.max(initial=0.0)), "stage": "done"})
-    model.host.close()
+    model.pool.close()
     peer.close()
 
 
@@ -432,5 +432,5 @@ def speed(path: Path, interface: str, told: Told) -> None:
             times[name].append(time.perf_counter() - begin)
     least = {n: 1e3 * min(t) for n, t in times.items()}
     told({**{f"{n}_ms": t for n, t in least.items()}, "ratio": least["here"] / least["fmpy"], "stage": "done"})
-    model.host.close()
+    model.pool.close()
     peer.close()

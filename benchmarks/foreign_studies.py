@@ -280,10 +280,10 @@ def runs(path: Path, interface: str, told: Told) -> None:
         path_of = write_study(Path(folder), peer, [record], scale, free, "[fit]")
         alone = load_study(path_of)
         problem_of(alone).residual(problem_of(alone).start)
-        first = alone.model.host.runs
-        alone.model.host.close()
+        first = alone.model.pool.runs
+        alone.model.pool.close()
         study = load_study(path_of)
-        problem, host = problem_of(study), study.model.host
+        problem, host = problem_of(study), study.model.pool
         end = TrustRegion().run(problem, problem.start)
         iterations = end.evaluations
         each = host.runs / iterations if iterations >= LONG else (host.runs - first) / iterations

@@ -123,7 +123,7 @@ def _check_fmu(
     path: Path, find: str, limits: Mapping[str, float], console: Console, *, every: bool, build: bool
 ) -> None:
     """Print what an FMU holds and offers; where it cannot run here, that is the error, after the list."""
-    from hvdc_ident.fmu.capabilities import read_capabilities, tried
+    from hvdc_ident.fmu import read_capabilities, tested_capabilities
     from hvdc_ident.models import load_model
 
     if not path.is_file():
@@ -137,12 +137,12 @@ def _check_fmu(
             else "the path as `ls` shows it, or another folder",
         )
     if build:
-        from hvdc_ident.fmu.compile import compile_fmu
+        from hvdc_ident.fmu import compile_fmu
 
         path = compile_fmu(path)
         console.say(f"compiled: {path} is written; name it in the study's [model] source")
     found = read_capabilities(path)
-    found = found if found.problem else tried(load_model(path, limits=limits), found)  # type: ignore[arg-type]
+    found = found if found.problem else tested_capabilities(load_model(path, limits=limits), found)  # type: ignore[arg-type]
     shown = found.matching(find) if find else found
     console.print_json(shown.to_dict())
     console.say(shown.text(None) if every else shown.text())

@@ -72,7 +72,7 @@ def by_fmpy(
     """A loop over fmpy.simulate_fmu within scipy's least squares, as ModestPy and its like work; the FMU is our own."""
     import fmpy
 
-    from hvdc_ident.fmu.export.fmu import export_fmu
+    from hvdc_ident.fmu.export import export_fmu
 
     folder = Path(tempfile.mkdtemp())
     try:

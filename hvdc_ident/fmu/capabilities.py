@@ -56,7 +56,7 @@ LEARNED = {
     "communication steps": "steps",
     "reading outputs after a jump": "reading",
 }
-"""By the words for it, the key of what the host has learned in its runs."""
+"""By the words for it, the key of what the pool has learned in its runs."""
 
 
 @dataclass(frozen=True)
@@ -242,12 +242,12 @@ def _groups(d: Description) -> FrozenMap[FrozenMap[Variable]]:
     return FrozenMap({g: FrozenMap(t) for g, t in zip(GROUPS, tables, strict=True)})
 
 
-def tried(model: FmuModel, known: Capabilities | None = None) -> Capabilities:
+def tested_capabilities(model: FmuModel, known: Capabilities | None = None) -> Capabilities:
     """Return the capabilities of an FMU with what short runs of it show; what fails is told in the error's words."""
     found = known or read_capabilities(model.fmu.path)
     subjects = {"two short runs": _two_runs, "derivatives at the start": _derivatives}
     words = {subject: _words(look, model, found) for subject, look in subjects.items()}
-    words |= {subject: str(model.host.learned.get(key, "")) for subject, key in LEARNED.items()}
+    words |= {subject: str(model.pool.learned.get(key, "")) for subject, key in LEARNED.items()}
     return replace(found, found=FrozenMap({k: v for k, v in words.items() if v}))
 
 
@@ -278,7 +278,7 @@ def _two_runs(model: FmuModel, found: Capabilities) -> str:
 
 def _derivatives(model: FmuModel, _: Capabilities) -> str:
     """Return which derivatives the FMU computes itself, and whether these agree with differences."""
-    from hvdc_ident.fmu.point import at_point, smooth_inputs
+    from hvdc_ident.fmu.evaluate import at_point, smooth_inputs
 
     if not model.has_equations or not model.states:
         return ""

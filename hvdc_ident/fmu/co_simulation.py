@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu.binding import DISCARD, ERROR, Ended, Failure, Vector
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
-from hvdc_ident.fmu.restart import SAME, apart, moving
-from hvdc_ident.fmu.signals import Signals
+from hvdc_ident.fmu.fmi import DISCARD, ERROR, FmiError, TerminationRequested, Vector
+from hvdc_ident.fmu.instance import SAME, Instance, RunEnded, RunFailed, apart, moving
+from hvdc_ident.fmu.piecewise_linear import PackedInputs
 
 EARLY = 10_000  # early returns in one communication step
 TRIAL = 300  # rows of a trial from the first change of an input on: solvers' own steps may be tens of rows long
@@ -41,7 +40,7 @@ Slopes = Literal["followed", "ignored", "needless"]
 
 
 @dataclass(frozen=True)
-class Calls:
+class CallPattern:
     """The way in which an FMU is called.
 
     reading: see `READINGS`. sloping: moving inputs are set with their slopes; else they are held at their mean over a
@@ -54,19 +53,19 @@ class Calls:
     plain: bool = False
 
     @classmethod
-    def learned(cls, learned: Mapping[str, Any]) -> Calls:
+    def learned(cls, learned: Mapping[str, Any]) -> CallPattern:
         """Return the calls that trials have shown to be right, where there were any."""
         return cls(learned.get("reading", "restored"), learned.get("sloping") == "followed")
 
 
 def run(
-    plant: Plant,
+    instance: Instance,
     values: Mapping[str, float],
-    signals: Signals,
+    signals: PackedInputs,
     time: Array,
     names: tuple[str, ...],
     tolerance: float,
-    calls: Calls | None = None,
+    calls: CallPattern | None = None,
 ) -> Array:
     """Return the outputs at the instants, shape (n, outputs). Two equal instants are before and after a jump.
 
@@ -78,36 +77,36 @@ def run(
 
     calls: default, those that are learned of the FMU. Raises RunFailed, or what a failing call of FMI raises.
     """
-    chosen = calls or Calls.learned(plant.learned)
-    even = not plant.description.variable_step or plant.learned.get("steps") == "even"
-    stops = _stops(plant.description, signals, time, even)
+    chosen = calls or CallPattern.learned(instance.learned)
+    even = not instance.description.variable_step or instance.learned.get("steps") == "even"
+    stops = _stops(instance.description, signals, time, even)
     uneven = not _is_even(stops)
     try:
-        rows = _go(plant, values, signals, time, stops, names, tolerance, chosen)
-    except Failure as e:
-        retry = uneven and not even and "steps" not in plant.learned
+        rows = _go(instance, values, signals, time, stops, names, tolerance, chosen)
+    except FmiError as e:
+        retry = uneven and not even and "steps" not in instance.learned
         if not retry or not e.function.endswith("DoStep") or e.status not in (DISCARD, ERROR):
             raise
-        plant.abandon()
+        instance.abandon()
         try:
-            stops = _stops(plant.description, signals, time, even=True)
-            rows = _go(plant, values, signals, time, stops, names, tolerance, chosen)
-        except (Failure, RunFailed):
+            stops = _stops(instance.description, signals, time, even=True)
+            rows = _go(instance, values, signals, time, stops, names, tolerance, chosen)
+        except (FmiError, RunFailed):
             raise e from None
-        plant.learned["steps"] = "even"
+        instance.learned["steps"] = "even"
         return rows
     if uneven and not even:
-        plant.learned["steps"] = "any"
+        instance.learned["steps"] = "any"
     return rows
 
 
 def find_calls(
     learned: dict[str, Any],
     description: Description,
-    signals: Signals,
+    signals: PackedInputs,
     time: Array,
     tolerance: float,
-    run: Callable[[Calls, Array], Array],
+    run: Callable[[CallPattern, Array], Array],
 ) -> None:
     """Learn how the FMU has to be called for this experiment, where that is not known yet, from short runs of it.
 
@@ -131,7 +130,7 @@ def find_calls(
         if found is not None:
             learned["reading"] = found
     if sloping:
-        held = Calls(learned.get("reading", "restored"))
+        held = CallPattern(learned.get("reading", "restored"))
         learned["sloping"] = _tried_slopes(span, allowed, held, run)
 
 
@@ -166,9 +165,9 @@ def _offers_slopes(d: Description) -> bool:
     return d.interpolates and d.variable_step and bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
 
 
-def _harmless_reading(time: Array, allowed: float, run: Callable[[Calls, Array], Array]) -> Reading | None:
+def _harmless_reading(time: Array, allowed: float, run: Callable[[CallPattern, Array], Array]) -> Reading | None:
     """Return the first way to read outputs after a change that leaves the run as it is; None where nothing moves."""
-    undisturbed = run(Calls("never", plain=True), time)
+    undisturbed = run(CallPattern("never", plain=True), time)
     size = np.nan_to_num(np.ptp(undisturbed, axis=0))
     if not moving(undisturbed).any():
         return None
@@ -176,13 +175,13 @@ def _harmless_reading(time: Array, allowed: float, run: Callable[[Calls, Array],
     for attempt in range(2):
         for reading in READINGS[:-1]:
             try:
-                read = run(Calls(reading, plain=True), time)
-            except (Failure, RunFailed):
+                read = run(CallPattern(reading, plain=True), time)
+            except (FmiError, RunFailed):
                 continue
             if (apart(read, undisturbed) <= allowed * size)[steady].all():
                 return reading
         if attempt == 0:  # an output such as the time that the computation took is never repeated, and does not judge
-            steady = apart(run(Calls("never", plain=True), time), undisturbed) <= allowed * size
+            steady = apart(run(CallPattern("never", plain=True), time), undisturbed) <= allowed * size
             if not steady.any():
                 return None
             if steady.all():
@@ -190,7 +189,7 @@ def _harmless_reading(time: Array, allowed: float, run: Callable[[Calls, Array],
     return "never"
 
 
-def _tried_slopes(time: Array, allowed: float, held: Calls, run: Callable[[Calls, Array], Array]) -> Slopes:
+def _tried_slopes(time: Array, allowed: float, held: CallPattern, run: Callable[[CallPattern, Array], Array]) -> Slopes:
     """Return whether slopes of inputs give outputs as near to those of held inputs on finer steps as held inputs do.
 
     Held at their mean over a step, inputs are off by the square of its length: with PARTS as many steps the error left
@@ -201,7 +200,7 @@ def _tried_slopes(time: Array, allowed: float, held: Calls, run: Callable[[Calls
     off, allowance = apart(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
     try:
         sloped = apart(run(replace(held, sloping=True), time), finer)
-    except (Failure, RunFailed):
+    except (FmiError, RunFailed):
         return "ignored"
     if (sloped > 2.0 * off + allowance).any():
         return "ignored"
@@ -212,21 +211,21 @@ def _tried_slopes(time: Array, allowed: float, held: Calls, run: Callable[[Calls
 
 
 def _go(
-    plant: Plant,
+    instance: Instance,
     values: Mapping[str, float],
-    signals: Signals,
+    signals: PackedInputs,
     time: Array,
     stops: Array,
     names: tuple[str, ...],
     tolerance: float,
-    calls: Calls,
+    calls: CallPattern,
 ) -> Array:
     rows = signals.at(stops, "left"), signals.at(stops, "right")
-    plant.begin(values, rows[0][0], float(time[0]), float(stops[-1]), tolerance)
+    instance.begin(values, rows[0][0], float(time[0]), float(stops[-1]), tolerance)
     before, after = (list(map(tuple, side.tolist())) for side in rows)  # compared in every step: tuples are quickest
-    seen = plant.block(names)
+    seen = instance.block(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
-    stepper = _Stepper(plant, calls, before[0], seen.get)
+    stepper = _Stepper(instance, calls, before[0], seen.get)
     shows = calls.reading != "never"
     instants = stops.tolist()
     for k, t in enumerate(instants):
@@ -236,7 +235,7 @@ def _go(
             except RunEnded as e:
                 count = k
                 if float(e.t or 0.0) >= t - _rounding(time):
-                    with contextlib.suppress(Failure):  # an FMU may show nothing any more: its row is not there then
+                    with contextlib.suppress(FmiError):  # an FMU may show nothing any more: its row is not there then
                         left[k] = right[k] = seen.get()
                         count += 1
                 e.rows = _rows(
@@ -252,8 +251,8 @@ def _go(
             shown = stepper.show(after[k])
             if not calls.plain:
                 right[k] = shown
-    if stepper.behind > plant.learned.get("behind", 0.0):
-        plant.learned["behind"] = stepper.behind
+    if stepper.behind > instance.learned.get("behind", 0.0):
+        instance.learned["behind"] = stepper.behind
     return _rows(time, stops, left, right)
 
 
@@ -262,7 +261,7 @@ def _is_even(stops: Array) -> bool:
     return gaps.size < 2 or bool(np.allclose(gaps, gaps[0], rtol=1e-9, atol=0.0))
 
 
-def _stops(description: Description, signals: Signals, time: Array, even: bool) -> Array:
+def _stops(description: Description, signals: PackedInputs, time: Array, even: bool) -> Array:
     """Return the instants at which communication steps end. even: whether they have to be of one length."""
     begin, end = float(time[0]), float(time[-1])
     breaks = signals.breaks[(signals.breaks > begin) & (signals.breaks < end)]
@@ -308,16 +307,16 @@ def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
 class _Stepper:
     """The steps of one run. behind: by how much the outputs of a step were older than its end at most, s."""
 
-    def __init__(self, plant: Plant, calls: Calls, inputs: Inputs, compute: Callable[[], Array]) -> None:
-        self.plant, self.calls, self.compute = plant, calls, compute
+    def __init__(self, instance: Instance, calls: CallPattern, inputs: Inputs, compute: Callable[[], Array]) -> None:
+        self.instance, self.calls, self.compute = instance, calls, compute
         self.behind = 0.0
         self._stepped = inputs  # at the end of the last step
         self._now: Inputs | None = inputs
         self._shown = False  # whether others were set since
         self._sloping = False
         if calls.sloping:
-            inputs_ = plant.description.inputs.values()
-            self._references = plant.binding.references([v.reference for v in inputs_])
+            inputs_ = instance.description.inputs.values()
+            self._references = instance.library.references([v.reference for v in inputs_])
             self._orders = (c_int * len(inputs_))(*([1] * len(inputs_)))
             self._slopes = Vector(len(inputs_))
 
@@ -332,7 +331,7 @@ class _Stepper:
         return self.compute()
 
     def _set(self, u: Inputs) -> None:
-        self.plant.inputs.set(u)
+        self.instance.inputs.set(u)
         self._now = u
 
     def step(self, a: float, b: float, first: Inputs, last: Inputs) -> None:
@@ -352,7 +351,7 @@ class _Stepper:
         self._apply(first)
         if moves or self._sloping:
             self._slopes.values[:] = (np.array(last) - np.array(first)) / (b - a)
-            self.plant.binding.set_slopes_of_inputs(self._references, self._orders, self._slopes)
+            self.instance.library.set_slopes_of_inputs(self._references, self._orders, self._slopes)
             self._sloping = moves
         self._advance(a, b)
         self._stepped = last
@@ -368,8 +367,8 @@ class _Stepper:
         t, rounding = a, 1e-12 * max(abs(b), 1.0)
         for _ in range(EARLY):
             try:
-                reached, computed = self.plant.binding.step(t, b - t)
-            except Ended as e:
+                reached, computed = self.instance.library.step(t, b - t)
+            except TerminationRequested as e:
                 raise RunEnded(max(e.reached, t)) from None
             if reached >= b - rounding:
                 if computed < b - rounding and b - computed > 1e-9 * max(abs(b), b - a):

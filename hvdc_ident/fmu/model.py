@@ -19,7 +19,7 @@ from hvdc_ident.effects.placing import EffectUse
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.files import digest
 from hvdc_ident.fmu.description import Description, Interface, Variable, read_description
-from hvdc_ident.fmu.host import Host, Limits
+from hvdc_ident.fmu.worker_pool import Limits, WorkerPool
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Output
 from hvdc_ident.parameters import Input, Parameter
@@ -44,11 +44,11 @@ class FmuModel:
 
     The start of a run is what the FMU's own initialisation gives for the inputs' first values.
     outputs: what the FMU declares as such (its states where it declares none), and what `recording` added.
-    host: its worker, shared by all models made from this one. effects: in the order they were put on.
+    pool: its worker, shared by all models made from this one. effects: in the order they were put on.
     """
 
     name: str
-    host: Host
+    pool: WorkerPool
     parameters: FrozenMap[Parameter]
     inputs: FrozenMap[Input]
     outputs: FrozenMap[Output]
@@ -62,14 +62,14 @@ class FmuModel:
     @property
     def fmu(self) -> Description:
         """The FMU's own description."""
-        return self.host.description
+        return self.pool.description
 
     @property
     def capabilities(self) -> Capabilities:
         """Return what the FMU says of itself and what short runs of it show; `print` gives a screen of it."""
-        from hvdc_ident.fmu.capabilities import tried
+        from hvdc_ident.fmu.capabilities import tested_capabilities
 
-        return tried(self)
+        return tested_capabilities(self)
 
     @property
     def has_equations(self) -> bool:
@@ -103,7 +103,7 @@ class FmuModel:
     @property
     def sensitivity_error(self) -> float:
         """The largest relative error of a derivative so far, where they were differences; 0 where none was."""
-        return self.host.sensitivity_error
+        return self.pool.sensitivity_error
 
     def with_values(self, values: Mapping[str, float]) -> FmuModel:
         """The model with other parameter or input values. Raises UnknownNameError, or ModelError outside the bounds."""
@@ -168,7 +168,7 @@ class FmuModel:
 
     def with_effects(self, effects: Iterable[Any]) -> FmuModel:
         """The model with effects at its inputs and outputs, one after the other; neutral ones change nothing."""
-        from hvdc_ident.fmu.ends import with_effects
+        from hvdc_ident.fmu.terminal_effects import with_effects
 
         return with_effects(self, effects)
 
@@ -204,7 +204,7 @@ class FmuModel:
 
         Raises UnknownNameError for names it has not, SimulationError where the run fails.
         """
-        from hvdc_ident.fmu.run import simulate
+        from hvdc_ident.fmu.evaluate import simulate
 
         chosen = outputs if outputs is not None else (experiment.outputs or None)
         return simulate(self, experiment, values or {}, tuple(sensitivities), chosen, tolerance or Tolerance(), partial)
@@ -230,19 +230,19 @@ def read_fmu(
     if not path.is_file():
         raise ModelError("the model file is not there", where=str(path))
     found = read_description(path.resolve(), interface)
-    host = Host(found, Limits.of(limits))
+    pool = WorkerPool(found, Limits.of(limits))
     starts = {n: v.start for n, v in found.parameters.items()}
     if None in starts.values():
-        read = host.ask({"do": "starts"}, {})[1]["parameters"].tolist()
+        read = pool.ask({"do": "starts"}, {})[1]["parameters"].tolist()
         starts = {n: s if s is not None else r for (n, s), r in zip(starts.items(), read, strict=True)}
-        host.close()  # the next worker knows the starts
-        host.description = replace(
+        pool.close()  # the next worker knows the starts
+        pool.description = replace(
             found,
             parameters=FrozenMap({n: replace(v, start=starts[n]) for n, v in found.parameters.items()}),
         )
     return FmuModel(
         name=found.name,
-        host=host,
+        pool=pool,
         parameters=FrozenMap({n: _parameter(v, float(starts[n] or 0.0)) for n, v in found.parameters.items()}),
         inputs=FrozenMap({n: Input(v.start or 0.0, v.unit, v.description) for n, v in found.inputs.items()}),
         outputs=FrozenMap({n: _output(found.variable(n)) for n in found.shown}),

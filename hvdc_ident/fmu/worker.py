@@ -1,6 +1,6 @@
-"""The process with an FMU's machine code in it: it answers the host's requests. See `hvdc_ident.processes`.
+"""The process with an FMU's machine code in it: it answers the pool's requests. See `hvdc_ident.processes`.
 
-Whatever the FMU prints goes to a file, whose end the host quotes where it dies.
+Whatever the FMU prints goes to a file, whose end the pool quotes where it dies.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
+from hvdc_ident.fmu.archive import Folder
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.folder import Folder
 from hvdc_ident.processes.messages import BEGAN, NOW, PROCESS, START, STOP, packed, unpacked
 from hvdc_ident.processes.server import resident, space
 
@@ -28,7 +28,7 @@ class Setup(NamedTuple):
 
 def prepare(setup: Setup) -> None:
     """Load what workers need: what one of them loads later would count as the FMU's memory."""
-    import hvdc_ident.fmu.jobs  # noqa: F401
+    import hvdc_ident.fmu.experiment_run  # noqa: F401
 
     if setup.description.interface == "model-exchange":
         import scipy.integrate  # noqa: F401
@@ -39,25 +39,25 @@ def finish(setup: Setup) -> None:
     setup.folder.release()
 
 
-def serve(host: Connection, progress: memoryview[float], setup: Setup, begun: Mapping[str, Any]) -> None:
-    """Answer requests until the connection closes or the FMU ends the process. begun: what the host has learned."""
-    from hvdc_ident.fmu.binding import why_not_loaded
-    from hvdc_ident.fmu.jobs import Jobs
-    from hvdc_ident.fmu.plant import Plant, RunFailed
+def serve(connection: Connection, progress: memoryview[float], setup: Setup, begun: Mapping[str, Any]) -> None:
+    """Answer requests until the connection closes or the FMU ends the process. begun: what the pool has learned."""
+    from hvdc_ident.fmu.experiment_run import RequestHandler
+    from hvdc_ident.fmu.fmi import why_not_loaded
+    from hvdc_ident.fmu.instance import Instance, RunFailed
 
     folder = str(setup.folder.binaries)
 
-    def make(learned: dict[str, Any]) -> Plant:
+    def make(learned: dict[str, Any]) -> Instance:
         try:
-            plant = Plant(setup.description, folder, learned)
+            instance = Instance(setup.description, folder, learned)
         except MemoryError:
             raise
         except Exception as e:  # FMPy raises bare ones, beside those of ctypes
             what, hint = why_not_loaded(e, folder, setup.description)
             raise RunFailed(what, hint=hint) from None
-        plant.binding.progress = progress
+        instance.library.progress = progress
         progress[PROCESS] = os.getpid()
-        return plant
+        return instance
 
     def tell() -> None:
         progress[BEGAN] = time.monotonic()  # the deadline is that of one run
@@ -66,7 +66,7 @@ def serve(host: Connection, progress: memoryview[float], setup: Setup, begun: Ma
     def guarded(work: Callable[[], Any]) -> bool:
         """Answer with what the work returns or with its failure; return whether it did not fail.
 
-        A fatal failure ends the process. One with "again" may have come from what the process did before: the host asks
+        A fatal failure ends the process. One with "again" may have come from what the process did before: the pool asks
         once more in a new one.
         """
         try:
@@ -77,15 +77,15 @@ def serve(host: Connection, progress: memoryview[float], setup: Setup, begun: Ma
             told, out, fatal = failed.told(), {}, failed.fatal
         progress[PROCESS] = os.getpid()  # of those that the work was done in
         taken = max(resident(), told.get("resident", 0)), max(space(), told.get("space", 0))
-        host.send_bytes(packed({**told, "memory": taken[0], "space": taken[1]}, out))
+        connection.send_bytes(packed({**told, "memory": taken[0], "space": taken[1]}, out))
         if fatal:
             os._exit(0)
         return "done" in told
 
-    jobs = Jobs(setup.description, make, tell, dict(begun))
+    jobs = RequestHandler(setup.description, make, tell, dict(begun))
     if not guarded(jobs.load):
         return
     while True:
-        heading, arrays = unpacked(host.recv_bytes())
+        heading, arrays = unpacked(connection.recv_bytes())
         tell()
         guarded(partial(jobs.do, heading, arrays))

@@ -17,8 +17,7 @@ from hvdc_ident.errors import (
     require_known,
     unknown_name,
 )
-from hvdc_ident.fmu.model import FmuModel
-from hvdc_ident.fmu.point import FmuPoint, at_point, smooth_inputs
+from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, newton
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel

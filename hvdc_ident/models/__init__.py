@@ -19,7 +19,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 
 if TYPE_CHECKING:
-    from hvdc_ident.fmu.host import Limits
+    from hvdc_ident.fmu import Limits
 
 __all__ = ["is_shipped", "load_model", "shipped_models", "summaries"]
 
@@ -103,7 +103,7 @@ def load_model(
 
         return read_card(path)
     if suffix == ".fmu":
-        from hvdc_ident.fmu.model import read_fmu
+        from hvdc_ident.fmu import read_fmu
 
         return read_fmu(path, interface=interface, limits=limits)
     if suffix == ".py":

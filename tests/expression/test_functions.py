@@ -11,7 +11,7 @@ import sympy as sp
 
 import hvdc_ident as hi
 from hvdc_ident.expression import FUNCTIONS, GrammarFunction, functions, parse, symbol, to_text
-from hvdc_ident.fmu.export.modelica_text import Printer
+from hvdc_ident.fmu.export.modelica import ModelicaPrinter
 from hvdc_ident.linearize.system import evaluate
 from hvdc_ident.simulate import Graph
 
@@ -54,7 +54,7 @@ def test_a_new_function_is_one_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     )
     monkeypatch.setitem(functions.FUNCTIONS, "sinh", sinh)  # type: ignore[arg-type]
     assert to_text(parse("2*sinh(x)")) == "2*sinh(x)"
-    assert Printer(lambda: "h")(parse("sinh(x)")) == "sinh(x)"
+    assert ModelicaPrinter(lambda: "h")(parse("sinh(x)")) == "sinh(x)"
     model = hi.load_model(_card(tmp_path))
     result = hi.simulate(model, hi.Experiment(np.linspace(0.0, 1.0, 11)))
     # dx/dt = -sinh x has the solution tanh(x/2) = tanh(x0/2) exp(-t)

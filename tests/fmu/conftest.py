@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from c_fmu import COMPILER, build
 
-from hvdc_ident.fmu.host import Limits
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import Limits, read_fmu
 
 
 @pytest.fixture(scope="module")
@@ -24,4 +23,4 @@ def fmu(tmp_path_factory):
 
     yield load
     for model in kept.values():
-        model.host.close()
+        model.pool.close()

@@ -1,6 +1,6 @@
 """What the tests' FMUs may use."""
 
-from hvdc_ident.fmu.host import Limits
+from hvdc_ident.fmu import Limits
 
 QUICK = Limits(deadline=1.0, load=30.0, memory=128 * 2**20)
 """A hang costs a second, a leak 128 MiB."""

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hvdc_ident import load_model
 from hvdc_ident.errors import InputError, ModelError
 from hvdc_ident.fmu import archive as checks
-from hvdc_ident.fmu.description import read_description
+from hvdc_ident.fmu import read_description
 
 PLAIN = CModel(
     "lag",

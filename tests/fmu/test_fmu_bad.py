@@ -17,7 +17,7 @@ from fmu_limits import PATIENT, QUICK
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import read_fmu
 from hvdc_ident.sensitivity import sweep
 
 pytestmark = needs_compiler
@@ -79,7 +79,7 @@ def test_the_call_is_told_of_an_fmu_that_takes_its_time_to_end(tmp_path):
     )
     with pytest.raises(SimulationError, match=r"in fmi2DoStep: it ended itself with exit code 0 and no result"):
         simulate(model, STEP, {"fault": 3})
-    model.host.close()
+    model.pool.close()
 
 
 def test_a_crash_in_a_trial_tells_nothing_about_the_run_after_it(tmp_path):
@@ -87,8 +87,8 @@ def test_a_crash_in_a_trial_tells_nothing_about_the_run_after_it(tmp_path):
     assert np.abs(simulate(model, STEP)["out"] - answer(TIME)).max() < 1e-6
     with pytest.raises(SimulationError, match=r"crashed in the run, in fmi2DoStep: its process was ended by SIGSEGV"):
         simulate(model, STEP, {"fault": 1})
-    assert model.host.learned["restart"] == "instance" and model.host.started == 1
-    model.host.close()
+    assert model.pool.learned["restart"] == "instance" and model.pool.started == 1
+    model.pool.close()
 
 
 def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
@@ -141,7 +141,7 @@ def test_every_bad_file_is_one_error_and_those_after_it_run(tmp_path):
         assert path.name in str(told.value)
         with pytest.raises(ComputationError) as again:  # known by now: no second process is spent on it
             simulate(model, STEP)
-        assert str(again.value) == str(told.value) and model.host.started == 1
+        assert str(again.value) == str(told.value) and model.pool.started == 1
 
 
 def test_wrong_names_and_values_are_wrong_input(fmu):
@@ -167,7 +167,7 @@ def test_nothing_of_a_worker_stays(tmp_path):
     """Its process, its folder and its pipes go with the model."""
     model = load_model(build(FAULTY, tmp_path))
     simulate(model, STEP)
-    host = model.host
+    host = model.pool
     process, folder = host._processes.supervisor.process, host._processes.folder.path
     assert folder.is_dir() and process.poll() is None
     before = len(os.listdir("/proc/self/fd"))
@@ -186,8 +186,8 @@ def test_an_fmu_that_gives_one_instance_a_process_gets_a_new_process_for_each_ru
         model = read_fmu(build(once, tmp_path), interface="co-simulation", limits=PATIENT)
         for lag in (0.1, 0.05, 0.1):
             assert np.abs(simulate(model, STEP, {"T": lag})["out"] - answer(TIME, lag)).max() < 1e-6
-        assert model.host.learned["restart"] == "process" and model.host.started == 1
-        model.host.close()
+        assert model.pool.learned["restart"] == "process" and model.pool.started == 1
+        model.pool.close()
 
 
 def test_shared_libraries_that_are_missing_are_named(tmp_path):

@@ -13,7 +13,7 @@ from c_models import latch
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import read_fmu
 
 pytestmark = needs_compiler
 
@@ -50,7 +50,7 @@ def load(tmp_path):
 
     yield load
     for model in loaded:
-        model.host.close()
+        model.pool.close()
 
 
 def run(model, corners, time=TIME):

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu.capabilities import read_capabilities
+from hvdc_ident.fmu import read_capabilities
 
 pytestmark = needs_compiler
 

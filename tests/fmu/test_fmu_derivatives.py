@@ -10,7 +10,7 @@ from c_models import BALL, COUNTER, FAULTY, response, spring
 from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
-from hvdc_ident.fmu.differences import ENOUGH, derivative, first, noise_of
+from hvdc_ident.fmu.derivatives import ENOUGH, derivative, first, noise_of
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
 
 TIME = np.linspace(0.0, 5.0, 251)

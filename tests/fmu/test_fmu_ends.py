@@ -11,7 +11,7 @@ from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.discrepancy.signatures.candidates import candidates
 from hvdc_ident.errors import ModelError, UnknownNameError
-from hvdc_ident.fmu.host import Limits
+from hvdc_ident.fmu import Limits
 from hvdc_ident.immutable import FrozenMap
 
 pytestmark = needs_compiler
@@ -98,9 +98,9 @@ def test_effects_cost_one_run_a_parameter_once_the_steps_are_known_and_none_wher
     model = fmu(spring(own=False), limits=Limits(workers=1)).with_effects(uses)  # two would both run the FMU itself
 
     def runs(**values: float) -> int:
-        before = model.host.runs
+        before = model.pool.runs
         simulate(model, RUN, values, ["k", "lag_u_T", "gain_y_k"])
-        return model.host.runs - before
+        return model.pool.runs - before
 
     runs()
     assert runs(lag_u_T=0.12) == 3  # itself, k, and T

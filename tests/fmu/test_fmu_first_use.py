@@ -13,7 +13,7 @@ from fmu_limits import PATIENT
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import read_fmu
 
 pytestmark = needs_compiler
 
@@ -45,13 +45,13 @@ def test_the_cheapest_restart_that_repeats_a_run_is_taken(tmp_path, way, model, 
     for lag in (0.1, 0.05, 0.1, 0.1):
         run = simulate(found, FREE, {"T": lag}, outputs=["out"])
         assert np.abs(run["out"] - np.exp(-TIME / lag)).max() < 1e-6
-        assert found.host.learned["restart"] == way and (note or "") in run.notes.get("restart", "")
+        assert found.pool.learned["restart"] == way and (note or "") in run.notes.get("restart", "")
     moved = simulate(found, FREE, {"T": 0.1}, ["T"], outputs=["out"])
     assert np.abs(moved.gradient("out")[:, 0] - TIME / 0.01 * np.exp(-TIME / 0.1)).max() < 2e-3
-    assert found.host.started == 1
+    assert found.pool.started == 1
     there = pickle.loads(pickle.dumps(found))
-    assert there.host.learned["restart"] == way  # nobody tries it a second time
-    found.host.close()
+    assert there.pool.learned["restart"] == way  # nobody tries it a second time
+    found.pool.close()
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -62,7 +62,7 @@ def test_an_fmu_that_takes_its_input_from_the_initialization_on_is_given_it_ther
     found = read_fmu(build(model, tmp_path, version), interface=interface, limits=PATIENT)
     held = FREE.with_(inputs={"u": InputSignal.constant(0.5)})
     assert np.abs(simulate(found, held, outputs=["out"])["out"] - 0.5 * (1.0 + np.exp(-TIME / 0.1))).max() < 1e-6
-    found.host.close()
+    found.pool.close()
 
 
 def test_a_run_at_rest_does_not_judge_a_reset(tmp_path):
@@ -70,18 +70,18 @@ def test_a_run_at_rest_does_not_judge_a_reset(tmp_path):
     model = begun("rest", "INITIALIZE(r) (r[0] = 0)", *FROZEN)
     found = read_fmu(build(model, tmp_path), interface="co-simulation", limits=PATIENT)
     assert np.abs(simulate(found, FREE)["out"]).max() == 0.0
-    assert found.host.learned["restart"] == "instance"
+    assert found.pool.learned["restart"] == "instance"
     step = experiment("step", TIME, {"u": InputSignal.step(0.1, 0.0, 1.0)})
     wanted = np.where(TIME < 0.1, 0.0, 1.0 - np.exp(-(TIME - 0.1) / 0.1))
     assert np.abs(simulate(found, step)["out"] - wanted).max() < 1e-6
-    found.host.close()
+    found.pool.close()
 
 
 def test_values_are_set_after_the_experiment_is_told(tmp_path):
     """Some FMUs put their own values back as the experiment is set up."""
     found = read_fmu(build(begun("setup", "AT_SETUP(r, t, e, end) start(r)"), tmp_path), interface="co-simulation")
     assert np.abs(simulate(found, FREE, {"T": 0.2})["out"] - np.exp(-TIME / 0.2)).max() < 1e-6
-    found.host.close()
+    found.pool.close()
 
 
 def test_a_value_that_the_fmu_does_not_take_is_an_error(tmp_path):
@@ -89,7 +89,7 @@ def test_a_value_that_the_fmu_does_not_take_is_an_error(tmp_path):
     assert np.abs(simulate(found, FREE)["out"] - np.exp(-TIME / 0.1)).max() < 1e-6
     with pytest.raises(SimulationError, match=r"parameter 'T' was set to 0.2 and reads 0.1"):
         simulate(found, FREE, {"T": 0.2})
-    found.host.close()
+    found.pool.close()
 
 
 def test_an_experiment_of_one_instant_has_no_end(tmp_path):
@@ -97,7 +97,7 @@ def test_an_experiment_of_one_instant_has_no_end(tmp_path):
         build(begun("ends", "AT_SETUP(r, t, e, end) if (e && end <= t) return 3"), tmp_path), interface="co-simulation"
     )
     assert simulate(found, experiment("now", np.array([0.0])))["out"].tolist() == [1.0]
-    found.host.close()
+    found.pool.close()
 
 
 @pytest.mark.parametrize("fault", ["SHIFTS=1e-3", "SHIFTS=10", "LATER=1.2"])
@@ -119,9 +119,9 @@ def test_an_iteration_of_a_fit_takes_one_run_and_one_a_parameter(fmu):
     model = fmu(spring("counted", own=False), 2, "co-simulation")
     names = ["m", "d", "k", "b"]
     simulate(model, STEP, {}, names)
-    before = model.host.runs
+    before = model.pool.runs
     for step in range(1, 5):
         values = {"m": 2.0 + 0.01 * step, "k": 8.0 - 0.01 * step}
         simulate(model, STEP, values)
         simulate(model, STEP, values, names)
-    assert model.host.runs - before == 4 * (len(names) + 1)
+    assert model.pool.runs - before == 4 * (len(names) + 1)

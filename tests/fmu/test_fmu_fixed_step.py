@@ -12,7 +12,7 @@ from c_models import response, spring
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import read_fmu
 
 pytestmark = needs_compiler
 
@@ -51,7 +51,7 @@ def fixed(tmp_path_factory):
 
     yield load
     for m in models.values():
-        m.host.close()
+        m.pool.close()
 
 
 ROWS = [
@@ -97,7 +97,7 @@ def test_the_same_fmu_that_claims_any_step_is_found_out(tmp_path):
         found = simulate(model, run)
         assert np.abs(found["y"] - response(rows)).max() < 2.0 * 0.5 * step  # |y'| below 2, the jump off by half a step
         assert "refuses steps of different lengths" in found.notes["steps"]
-    model.host.close()
+    model.pool.close()
 
 
 def test_a_step_that_even_ones_cannot_mend_is_an_error(tmp_path):
@@ -106,4 +106,4 @@ def test_a_step_that_even_ones_cannot_mend_is_an_error(tmp_path):
     model = read_fmu(build(refusing, tmp_path), interface="co-simulation")
     with pytest.raises(SimulationError, match=r"experiment 'step'.*fmi2DoStep returned error"):
         simulate(model, run)
-    model.host.close()
+    model.pool.close()

@@ -10,9 +10,7 @@ import pytest
 
 from hvdc_ident.data import experiment
 from hvdc_ident.errors import InputError, SimulationError
-from hvdc_ident.fmu.description import INTERFACES
-from hvdc_ident.fmu.host import Limits
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import INTERFACES, Limits, read_fmu
 from hvdc_ident.linearize import find_operating_point, linearize
 
 FOLDER = os.environ.get("HVDC_IDENT_FMUS", "")
@@ -36,12 +34,12 @@ def test_a_foreign_fmu_runs_or_says_why_not(path):
             assert path.name in str(e)
             continue
         finally:
-            model.host.close()
+            model.pool.close()
         assert np.isfinite(found.trajectory.values).all() and found.trajectory.names == tuple(model.outputs)
         ran += 1
         if interface == "model-exchange" and model.states:
             linear = linearize(model, find_operating_point(model, at="start"))
             assert np.isfinite(linear.A).all() and linear.A.shape == (len(model.states),) * 2
-        model.host.close()
+        model.pool.close()
     if not ran:
         pytest.skip(f"{path.name} has no interface that runs here, and says so")

@@ -21,10 +21,9 @@ from fmu_limits import PATIENT
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError, ModelError, SimulationError
-from hvdc_ident.fmu.endings import crash, overdue
-from hvdc_ident.fmu.folder import LOCK, joined, sweep, unpacked
-from hvdc_ident.fmu.host import Limits, idle_cores
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import read_fmu
+from hvdc_ident.fmu.archive import LOCK, remove_abandoned_folders, shared_folder, unpacked_folder
+from hvdc_ident.fmu.worker_pool import Limits, crash, idle_cores, overdue
 from hvdc_ident.processes import MIB, Budget, Ending
 
 pytestmark = needs_compiler
@@ -58,7 +57,7 @@ def test_an_fmu_that_runs_out_of_memory_is_told_so_however_it_ends(tmp_path, the
     used = int(str(told.value).split("it had used ")[1].split()[0])
     assert 60 <= used <= 64, "chunks of 1 MiB, and a thread's own heap may be reserved"
     assert "fmi2DoStep" in str(told.value)
-    model.host.close()
+    model.pool.close()
 
 
 def test_a_hang_says_where_it_stands(fmu):
@@ -81,7 +80,7 @@ def test_a_slow_run_says_how_far_it_came_and_which_deadline_would_do(tmp_path):
     words = str(told.value).split()
     reached, times = float(words[words.index("=") + 1]), float(words[words.index("pace") + 1])
     assert times == pytest.approx(0.5 / reached, rel=0.05) and reached <= 0.22
-    model.host.close()
+    model.pool.close()
 
 
 @pytest.mark.parametrize(
@@ -104,7 +103,7 @@ def test_a_run_that_stands_is_not_called_slow():
 
 def test_limits_are_stated_by_the_keys_of_a_study(tmp_path):
     path = build(FAULTY, tmp_path)
-    assert load_model(path, limits={"deadline": 300.0, "memory": 4096}).host.limits == Limits(300.0, memory=4096 * MIB)
+    assert load_model(path, limits={"deadline": 300.0, "memory": 4096}).pool.limits == Limits(300.0, memory=4096 * MIB)
     with pytest.raises(InputError, match=r"no limit 'dedline'.*did you mean 'deadline'"):
         load_model(path, limits={"dedline": 300.0})
     with pytest.raises(InputError, match="deadline: a limit is not above 0"):
@@ -123,7 +122,7 @@ from hvdc_ident.data import InputSignal, experiment
 model = load_model(sys.argv[1], interface="co-simulation")
 step = experiment("step", np.linspace(0.0, 0.5, 26), {"u": InputSignal.step(0.1, 0.0, 1.0)})
 simulate(model, step)
-own = model.host._processes
+own = model.pool._processes
 print(own.supervisor.process.pid, own.workers[0].pid, own.folder.path, flush=True)
 if "hang" in sys.argv:
     simulate(model, step, {"fault": 2.0})
@@ -186,20 +185,20 @@ def test_nothing_runs_on_when_the_supervisor_is_killed_and_the_next_host_cleans_
     ) as lock:  # the process that the hang is in holds it until the system has ended that, too
         fcntl.flock(lock, fcntl.LOCK_EX)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    sweep()
+    remove_abandoned_folders()
     assert not folder.exists()
 
 
 def test_a_worker_that_is_killed_costs_a_message(fmu):
     model = fmu(FAULTY, 2, "co-simulation", PATIENT)
     rows = simulate(model, STEP)["out"]
-    worker = model.host._processes.workers[0].pid
+    worker = model.pool._processes.workers[0].pid
     os.kill(worker, signal.SIGKILL)
     wait_until_gone(worker)
     with pytest.raises(SimulationError, match="ended by SIGKILL, from outside"):
         simulate(model, STEP)
     assert np.array_equal(simulate(model, STEP)["out"], rows)
-    supervisor, worker = model.host._processes.supervisor.process.pid, model.host._processes.workers[0].pid
+    supervisor, worker = model.pool._processes.supervisor.process.pid, model.pool._processes.workers[0].pid
     os.kill(supervisor, signal.SIGKILL)
     wait_until_gone(supervisor, worker)
     with pytest.raises(SimulationError, match=r"process that watches the FMU's workers ended .*exit code -9"):
@@ -208,15 +207,15 @@ def test_a_worker_that_is_killed_costs_a_message(fmu):
 
 
 def test_a_folder_is_shared_and_goes_with_its_last_user(tmp_path):
-    mine = unpacked(build(FAULTY, tmp_path))
-    other, late = joined(mine.path), joined(mine.path)
+    mine = unpacked_folder(build(FAULTY, tmp_path))
+    other, late = shared_folder(mine.path), shared_folder(mine.path)
     assert other is not None and late is not None
     mine.release()
-    sweep()
+    remove_abandoned_folders()
     assert (other.binaries / "modelDescription.xml").is_file()
     other.release()
     late.release()
-    assert not mine.path.exists() and joined(mine.path) is None
+    assert not mine.path.exists() and shared_folder(mine.path) is None
 
 
 def test_a_model_that_travels_uses_the_folder_it_finds(fmu):
@@ -224,8 +223,8 @@ def test_a_model_that_travels_uses_the_folder_it_finds(fmu):
     rows = simulate(model, STEP)["out"]
     there = pickle.loads(pickle.dumps(model))
     assert np.array_equal(simulate(there, STEP)["out"], rows)
-    assert there.host._processes.folder.path == model.host._processes.folder.path
-    there.host.close()
+    assert there.pool._processes.folder.path == model.pool._processes.folder.path
+    there.pool.close()
     assert np.array_equal(simulate(model, STEP)["out"], rows)
 
 
@@ -238,20 +237,20 @@ def test_columns_are_the_same_from_one_worker_and_from_two(tmp_path):
     one, two = (load_model(path, limits={"workers": n}) for n in (1, 2))
     for i, lag in enumerate((0.1, 0.11, 0.25)):
         if i == 2:
-            os.kill(two.host._processes.workers[1].pid, signal.SIGKILL)
-            wait_until_gone(two.host._processes.workers[1].pid)
+            os.kill(two.pool._processes.workers[1].pid, signal.SIGKILL)
+            wait_until_gone(two.pool._processes.workers[1].pid)
             with pytest.raises(SimulationError, match="SIGKILL"):
                 two.simulate(STEP, {"T": 0.11}, names)
         runs = [m.simulate(STEP, {"T": lag}, names) for m in (one, two)]
         assert np.array_equal(runs[0].sensitivities, runs[1].sensitivities)
         assert np.array_equal(runs[0].trajectory.values, runs[1].trajectory.values)
         assert dict(runs[0].notes) == dict(runs[1].notes)
-    assert len(one.host._processes.workers) == 1 and len(two.host._processes.workers) == 2
+    assert len(one.pool._processes.workers) == 1 and len(two.pool._processes.workers) == 2
     s = np.maximum(TIME - 0.1, 0.0)
     exact = [-2.0 * s / lag**2 * np.exp(-s / lag), 2.0 * (1.0 - np.exp(-s / lag)), 1.0 - np.exp(-s / lag), np.ones(26)]
     assert np.abs(runs[1].sensitivities[:, 0, :] - np.column_stack(exact)).max() < 1e-4
-    one.host.close()
-    two.host.close()
+    one.pool.close()
+    two.pool.close()
 
 
 def test_the_first_failure_of_several_workers_is_told_and_all_go_on(tmp_path):
@@ -264,7 +263,7 @@ def test_the_first_failure_of_several_workers_is_told_and_all_go_on(tmp_path):
         with pytest.raises(SimulationError, match="fmi2DoStep returned error"):
             model.simulate(STEP, {"k": 1.0}, names)
         assert model.simulate(STEP, {"k": 0.5}, names).sensitivities.shape == (26, 1, 4)
-    model.host.close()
+    model.pool.close()
 
 
 def test_a_process_of_a_pool_uses_one_core(monkeypatch):

@@ -12,8 +12,7 @@ from scipy.signal import lsim
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu.host import Limits
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import Limits, read_fmu
 
 pytestmark = needs_compiler
 
@@ -113,16 +112,16 @@ def test_a_nominal_of_zero_is_floored(fmu):
 def test_a_worker_is_replaced_when_it_is_old_and_results_do_not_change(tmp_path):
     model = read_fmu(build(FAULTY, tmp_path), interface="co-simulation", limits=Limits(runs=3))
     rows = [simulate(model, experiment("s", TIME))["out"] for _ in range(7)]
-    assert model.host.started == 3 and all(np.array_equal(r, rows[0]) for r in rows)
+    assert model.pool.started == 3 and all(np.array_equal(r, rows[0]) for r in rows)
 
 
 def test_a_model_travels_without_its_worker(fmu):
     model = fmu(spring())
     here = simulate(model, STEP)["y"]
     there = pickle.loads(pickle.dumps(model))
-    assert there.host._processes is None
+    assert there.pool._processes is None
     assert np.array_equal(simulate(there, STEP)["y"], here)
-    there.host.close()
+    there.pool.close()
 
 
 def test_an_instance_that_forgets_to_reset_is_made_anew(tmp_path):
@@ -134,7 +133,7 @@ def test_an_instance_that_forgets_to_reset_is_made_anew(tmp_path):
     for values in ({"k": 20.0}, {}, {"k": 20.0}, {}):
         k = values.get("k", 8.0)
         assert np.abs(simulate(model, STEP, values)["y"] - response(TIME, k=k)).max() < 2e-7
-    model.host.close()
+    model.pool.close()
 
 
 def test_five_hundred_runs_leave_nothing_behind(fmu):
@@ -143,7 +142,7 @@ def test_five_hundred_runs_leave_nothing_behind(fmu):
     sizes = []
     for k in range(500):
         simulate(model, run, {"T": 0.05 + 1e-4 * k})
-        sizes.append(model.host.memory)
-    assert model.host.started == 1
+        sizes.append(model.pool.memory)
+    assert model.pool.started == 1
     assert sizes[-1] - sizes[49] < 2**20
-    model.host.close()
+    model.pool.close()

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from hvdc_ident.fmu.export import build
+from hvdc_ident.fmu.compile import compiler
 from tests.fmu_export import cases, driver
 
 
 @pytest.fixture(scope="session")
 def fmu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., driver.Exported]:
     """Gives the unpacked FMU of one of the cases by name, and version."""
-    if build.compiler() is None:
+    if compiler() is None:
         pytest.skip("there is no C compiler: nothing to run")
     folder: Path = tmp_path_factory.mktemp("fmu")
 

@@ -12,7 +12,7 @@ from fmpy.validation import validate_fmu
 
 from hvdc_ident.errors import ComputationError, ModelError
 from hvdc_ident.fmu.export import export_fmu
-from hvdc_ident.fmu.export.program import Program
+from hvdc_ident.fmu.export.c_code import CModel
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model, shipped_models
 from tests.fmu_export import cases
@@ -25,7 +25,7 @@ ALL = {
 
 @pytest.mark.parametrize("name", sorted(ALL))
 def test_the_validator_finds_nothing(tmp_path: Path, name: str) -> None:
-    program = Program(ALL[name]())  # the same for both versions
+    program = CModel(ALL[name]())  # the same for both versions
     for version in ("2.0", "3.0"):
         for kinds in (("model-exchange", "co-simulation"), ("model-exchange",), ("co-simulation",)):
             path = export_fmu(program, tmp_path / "x.fmu", version=version, kinds=kinds, binary=False).path

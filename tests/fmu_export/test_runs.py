@@ -7,7 +7,7 @@ import pytest
 from fmpy import simulate_fmu
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu.model import read_fmu
+from hvdc_ident.fmu import read_fmu
 from hvdc_ident.simulate import simulate
 from tests.fmu_export.driver import cosimulate
 
@@ -66,7 +66,7 @@ def test_a_row_at_a_jump_has_what_follows_it(fmu, version):
     assert worst(cosimulate(f, rows, inputs, outputs, tolerance=1e-10), expected) < 1e-8
     loaded = read_fmu(f.path, interface="co-simulation")
     found = loaded.simulate(experiment("rows", rows, inputs))
-    loaded.host.close()
+    loaded.pool.close()
     assert worst(np.column_stack([found[o] for o in outputs]), expected) < 1e-6
 
 

@@ -228,8 +228,8 @@ def _good_zip(folder: Path) -> list[bytes]:
 
 def _use_fmu(content: bytes, folder: Path) -> object:
     """What is done with an FMU before its code is run: the archive's checks and the description."""
+    from hvdc_ident.fmu import read_description
     from hvdc_ident.fmu.archive import check_archive
-    from hvdc_ident.fmu.description import read_description
 
     path = folder / "m.fmu"
     path.write_bytes(content)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hvdc_ident.fmu.export import build
+from hvdc_ident.fmu.compile import compiler
 from hvdc_ident.model import parse_card
 from tests.studies.study_module import expected, load
 
@@ -24,7 +24,7 @@ rate = "clip((Pref - y) / T, -2, 2)"
 """
 
 
-@pytest.mark.skipif(build.compiler() is None, reason="there is no C compiler")
+@pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
 def test_a_small_model_comes_back_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("CFLAGS", "-O0")
     row = STUDY.agreement(parse_card(CARD), tmp_path)

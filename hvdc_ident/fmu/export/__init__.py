@@ -1,5 +1,130 @@
-"""FMUs made from sympy models."""
+"""Any sympy model as an FMU: model exchange and co-simulation, FMI 2.0 or 3.0, plain C inside."""
 
-from hvdc_ident.fmu.export.fmu import FmuFile, export_fmu
+from __future__ import annotations
 
-__all__ = ["FmuFile", "export_fmu"]
+import io
+import re
+import uuid
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+from hvdc_ident.errors import ModelError
+from hvdc_ident.files import write_bytes
+from hvdc_ident.fmu.compile import binary_folder, compiled, compiler, library_suffix
+from hvdc_ident.fmu.export.c_code import CModel, tableau
+from hvdc_ident.fmu.export.model_description import KINDS, ExportedVariables, build_description, description
+from hvdc_ident.model import Model
+
+VERSIONS = ("2.0", "3.0")
+_SHARED = (
+    "linear.c",
+    "equations.c",
+    "start.c",
+    "history.c",
+    "integrate.c",
+    "tangent.c",
+    "instance.c",
+    "snapshot.c",
+)
+_NAMESPACE = uuid.UUID("4f1f2a5e-6d0b-5a43-9f0e-3d5c1f6e7a90")
+_DATE = (1980, 1, 1, 0, 0, 0)  # the same model gives the same file
+
+
+@dataclass(frozen=True)
+class FmuFile:
+    """An FMU that was written. binary: the folder of its binary, None where it holds sources only; note: what to say of it."""
+
+    path: Path
+    version: str
+    kinds: tuple[str, ...]
+    binary: str | None
+    note: str
+
+
+def export_fmu(
+    model: Model | CModel,
+    path: str | Path,
+    *,
+    version: str = "2.0",
+    kinds: Sequence[str] = tuple(KINDS),
+    binary: bool | None = None,
+    stop: float = 1.0,
+) -> FmuFile:
+    """The FMU, written to path. model: itself, or its equations as C, where several FMUs are made of it.
+
+    kinds: "model-exchange", "co-simulation" or both. binary: True needs a C compiler, False leaves the sources alone,
+    None compiles where there is a compiler. stop: end of the default experiment, s.
+
+    The FMU starts from the steady state of the inputs and parameters given to it before its initialisation ends (states
+    with a start of their own from that), with exact derivatives of that start. Raises ModelError for options that are
+    not known and for True without a compiler, ComputationError where the compiler refuses the sources.
+    """
+    chosen = tuple(k for k in KINDS if k in kinds)
+    if version not in VERSIONS:
+        raise ModelError("this version of FMI cannot be written", expected=" or ".join(VERSIONS), got=repr(version))
+    if not chosen or set(kinds) - set(KINDS):
+        raise ModelError("this kind of FMU is not known", expected=" or ".join(KINDS), got=", ".join(kinds) or "none")
+    command = None if binary is False else compiler()
+    if binary and command is None:
+        raise ModelError(
+            "there is no C compiler",
+            where=str(path),
+            expected="cc, gcc, clang or what CC names",
+            hint="leave the binary out",
+        )
+    program = model if isinstance(model, CModel) else CModel(model)
+    identifier = identifier_of(program.model.name)
+    content = _content(program, version, chosen, identifier, stop)
+    folder = None
+    if command:
+        folder = binary_folder(version)
+        sources = {n.removeprefix("sources/"): t for n, t in content.items() if n.startswith("sources/")}
+        library = compiled(command, {n: t.decode() for n, t in sources.items()}, identifier)
+        content[f"binaries/{folder}/{identifier}{library_suffix()}"] = library
+    note = f"binary for {folder}, and sources" if folder else "sources only: no C compiler was there"
+    if binary is False:
+        note = "sources only, as asked"
+    return FmuFile(write_bytes(Path(path), _zipped(content)), version, chosen, folder, note)
+
+
+def identifier_of(name: str) -> str:
+    """A model's name as an identifier of C."""
+    text = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    return text if re.match(r"[A-Za-z_]", text) else f"m_{text}"
+
+
+def _content(program: CModel, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
+    interface = "fmi2.c" if version == "2.0" else "fmi3.c"
+    runtime = resources.files("hvdc_ident.fmu.export") / "runtime"
+    names = ("model.c", *_SHARED, interface)
+
+    variables = ExportedVariables(program)
+    files = {"model.c": variables.program.source, "tableau.h": tableau()}
+    files |= {n: (runtime / n).read_text("utf-8") for n in (*_SHARED, interface, "internal.h")}
+
+    def described(token: str) -> str:
+        return description(variables, token, version, identifier, kinds, names, stop)
+
+    # The token names this very content: an importer's stored state of another model is refused.
+    everything = [described(""), variables.program.header(""), *(files[n] for n in sorted(files))]
+    token = f"{{{uuid.uuid5(_NAMESPACE, ''.join(everything))}}}"
+    files["model.h"] = variables.program.header(token)
+    content = {"modelDescription.xml": described(token)}
+    content |= {f"sources/{n}": t for n, t in files.items()}
+    if version == "3.0":
+        content["sources/buildDescription.xml"] = build_description(identifier, names)
+    return {n: t.encode() for n, t in content.items()}
+
+
+def _zipped(content: dict[str, bytes]) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in content.items():
+            entry = zipfile.ZipInfo(name, _DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = (0o755 if name.startswith("binaries/") else 0o644) << 16
+            archive.writestr(entry, data)
+    return stream.getvalue()

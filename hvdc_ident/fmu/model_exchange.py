@@ -1,6 +1,6 @@
-"""A run of a model-exchange FMU: scipy's LSODA between events, which are found on its interpolant. In the worker alone.
+"""A run of a model-exchange FMU: scipy's LSODA between events, which are located on its interpolant. In worker processes only.
 
-Sensitivities S = dx/dp ride along as more states, S' = A S + df/dp, each column one directional derivative.
+Sensitivities S = dx/dp are integrated as additional states, S' = A S + df/dp, each column one directional derivative.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu.binding import DISCARD, Block, Failure
-from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed
-from hvdc_ident.fmu.signals import Moving, Signals
-from hvdc_ident.fmu.tangent import Tangent
+from hvdc_ident.fmu.derivatives import VariationalEquations
+from hvdc_ident.fmu.fmi import DISCARD, FmiError, VariableGroup
+from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
+from hvdc_ident.fmu.piecewise_linear import Interpolant, PackedInputs
 
 MOST_STEPS = 200_000
 MOST_EVENTS = 100_000
@@ -41,7 +41,7 @@ class Counts:
 
 
 @dataclass
-class Run:
+class ModelExchangeRun:
     """One run. names: what is read. tangent: the derivatives for sensitivities, or None. start: (nx, np) dx0/dp.
 
     most: steps after which the run is given up.
@@ -49,26 +49,28 @@ class Run:
     outputs (n, names) and gradients (n, names, np) are filled row by row.
     """
 
-    plant: Plant
-    signals: Signals
+    instance: Instance
+    signals: PackedInputs
     time: Array
     names: tuple[str, ...]
     tolerance: float
-    tangent: Tangent | None = None
+    tangent: VariationalEquations | None = None
     start: Array | None = None
     counts: Counts = field(default_factory=Counts)
     most: int = MOST_STEPS
 
     def __post_init__(self) -> None:
-        self.b = self.plant.binding
-        self.nx = self.b.nx
-        self.inputs = [Moving(t, v) for t, v in self.signals.each()]
+        self.library = self.instance.library
+        self.nx = self.library.nx
+        self.inputs = [Interpolant(t, v) for t, v in self.signals.each()]
         self.moving = [k for k, m in enumerate(self.inputs) if not m.constant]
         self.u = np.array([m.at(float(self.time[0]), True) for m in self.inputs])
-        chosen = [list(self.plant.description.inputs.values())[k] for k in self.moving]
+        chosen = [list(self.instance.description.inputs.values())[k] for k in self.moving]
         self.follow = [k for k, v in zip(self.moving, chosen, strict=True) if v.continuous]
-        self.followed = Block(self.b, [list(self.plant.description.inputs.values())[k] for k in self.follow])
-        self.seen = self.plant.block(self.names)
+        self.followed = VariableGroup(
+            self.library, [list(self.instance.description.inputs.values())[k] for k in self.follow]
+        )
+        self.seen = self.instance.block(self.names)
         self.columns = self.tangent.count if self.tangent else 0
         self.outputs = np.empty((self.time.size, len(self.names)))
         self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
@@ -81,7 +83,7 @@ class Run:
         self.before = self.counts.accepted
 
     def go(self, values: Mapping[str, float]) -> None:
-        """Fill every row. Raises RunFailed, Failure or SensitivitiesLost; RunEnded with the rows up to the end."""
+        """Fill every row. Raises RunFailed, FmiError or SensitivitiesLost; RunEnded with the rows up to the end."""
         try:
             self._go(values)
         except RunEnded as e:
@@ -93,16 +95,16 @@ class Run:
 
     def _go(self, values: Mapping[str, float]) -> None:
         t = float(self.time[0])
-        self.plant.begin(values, self.u, t, self.end, self.tolerance)
-        x = self.b.get_states()
-        self.atol = 1e-2 * self.tolerance * self.plant.nominals()
+        self.instance.begin(values, self.u, t, self.end, self.tolerance)
+        x = self.library.get_states()
+        self.atol = 1e-2 * self.tolerance * self.instance.nominals()
         y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
         stops = [s for s in self.signals.breaks.tolist() if t <= s <= self.end]
         stops = sorted({*stops, self.end})
         y = self._arrive(t, y, stops)
         while t < self.end:
             stop = next(s for s in stops if s > t)
-            due = self.plant.next_time
+            due = self.instance.next_time
             if due is not None and due <= t:
                 y = self._state_event(t, y)
                 continue
@@ -118,7 +120,7 @@ class Run:
     def _segment(self, t: float, y: Array, end: float) -> tuple[float, Array]:
         """Return where the integration stopped, at `end` or at an event before it, with the event done."""
         self.counts.segments += 1
-        self.positive = self.b.get_indicators() > 0.0
+        self.positive = self.library.get_indicators() > 0.0
         self.flat = False
         self._place(t, y[: self.nx])
         self.flat = all(self.inputs[k].is_flat(t, end) for k in self.follow)
@@ -131,13 +133,13 @@ class Run:
 
     def _steps(self, t: float, y: Array, end: float, said: list[warnings.WarningMessage]) -> tuple[float, Array]:
         solver = self._solver(t, y, end)
-        rows, completed = self.time.tolist(), self.plant.description.completed_step
+        rows, completed = self.time.tolist(), self.instance.description.completed_step
         retries = 0
         while solver.status == "running":
             before = float(solver.t)
             try:
                 self._advance(solver, said)
-            except Failure as e:
+            except FmiError as e:
                 if e.status != DISCARD or retries == RETRIES:
                     raise
                 retries += 1
@@ -156,7 +158,7 @@ class Run:
             if completed or t >= end:
                 self._place(t, y[: self.nx], before_jump=t >= end)
             if completed:
-                wanted, over = self.b.completed_step()
+                wanted, over = self.library.completed_step()
                 if over:
                     raise RunEnded(t)
                 if wanted and t < end:
@@ -195,8 +197,8 @@ class Run:
 
     def _place(self, t: float, x: Array, *, before_jump: bool = False) -> None:
         """Set the instant, the state and the continuous inputs."""
-        self.b.set_time(t)
-        self.b.set_states(x)
+        self.library.set_time(t)
+        self.library.set_states(x)
         if self.follow and not (self.flat and t < self.segment_end):
             u = [self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.follow]
             if u != self.set:  # held inputs, as stairs, stand for thousands of calls
@@ -206,7 +208,7 @@ class Run:
     def _slopes(self, t: float, y: Array) -> Array:
         self.counts.evaluations += 1
         self._place(t, y[: self.nx])
-        slopes = self.b.get_slopes()
+        slopes = self.library.get_slopes()
         if not self.columns:
             return slopes.copy()
         found = np.empty(y.size)
@@ -228,7 +230,7 @@ class Run:
 
     def _crossing(self, solver: Any, before: float) -> float | None:
         """The instant just after the first indicator of a step changed its sign, or None."""
-        if not self.b.indicators.size:
+        if not self.library.indicators.size:
             return None
         t = float(solver.t)
         inside = [s for s in self.time[self.row :][: np.searchsorted(self.time[self.row :], t)].tolist() if s > before]
@@ -245,7 +247,7 @@ class Run:
 
     def _indicators(self, t: float, x: Array) -> Array:
         self._place(t, x)
-        return self.b.get_indicators()
+        return self.library.get_indicators()
 
     def _located(self, dense: Any, low: float, high: float) -> float:
         """The right end of a bracket of the first change of sign, as narrow as times can be told apart."""
@@ -285,19 +287,19 @@ class Run:
 
     def _through(self, t: float, y: Array, u: Array | None) -> Array:
         """The states after event mode at t, with inputs u set in it where they jump."""
-        old = self.b.get_slopes().copy() if self.columns else None
-        self.b.enter_events()
+        old = self.library.get_slopes().copy() if self.columns else None
+        self.library.enter_events()
         if u is not None:
-            self.plant.inputs.set(u)
+            self.instance.inputs.set(u)
             self.set = None
-        changed = self.plant.iterate(t)
-        self.b.enter_continuous()
-        x = self.b.get_states() if changed else y[: self.nx]
+        changed = self.instance.iterate(t)
+        self.library.enter_continuous()
+        x = self.library.get_states() if changed else y[: self.nx]
         if self.columns:
             jumped = bool(np.abs(x - y[: self.nx]).max(initial=0.0) > 0.0)
             if u is None and old is not None:
-                size = np.abs(old).max(initial=0.0) + np.abs(self.b.slopes.values).max(initial=0.0)
-                jumped |= bool(np.abs(self.b.get_slopes() - old).max(initial=0.0) > JUMP * max(size, 1e-300))
+                size = np.abs(old).max(initial=0.0) + np.abs(self.library.slopes.values).max(initial=0.0)
+                jumped |= bool(np.abs(self.library.get_slopes() - old).max(initial=0.0) > JUMP * max(size, 1e-300))
             if jumped:
                 raise SensitivitiesLost(f"a state or a derivative jumps at {t:.6g} s")
         return np.concatenate([x, y[self.nx :]]) if changed else y

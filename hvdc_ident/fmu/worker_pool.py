@@ -1,4 +1,4 @@
-"""The workers of an FMU as their owner sees them: started when needed, watched, and replaced when one dies, hangs or is old.
+"""The worker processes of an FMU: started when needed, watched, and replaced when one crashes, hangs or grows old.
 
 This contains crashes, hangs and leaks. It does not contain malice: load only FMUs you trust.
 """
@@ -6,8 +6,12 @@ This contains crashes, hangs and leaks. It does not contain malice: load only FM
 from __future__ import annotations
 
 import contextlib
+import linecache
+import math
 import multiprocessing
 import os
+import re
+import signal
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -20,12 +24,10 @@ from typing import Any
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, require_known
+from hvdc_ident.fmu.archive import Folder, shared_folder, unpacked_folder
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.endings import call_of, crash, more_memory, overdue
-from hvdc_ident.fmu.folder import Folder, joined
-from hvdc_ident.fmu.folder import unpacked as new_folder
 from hvdc_ident.fmu.worker import Setup
-from hvdc_ident.processes import MIB, ChildProcess, Ending, Message, Supervisor, Watch, packed, unpacked
+from hvdc_ident.processes import MIB, Budget, ChildProcess, Ending, Message, Supervisor, Watch, packed, unpacked
 from hvdc_ident.processes.server import is_worker
 from hvdc_ident.processes.supervisor import last_line
 
@@ -62,7 +64,7 @@ class Limits:
 
 
 @dataclass(eq=False)
-class _Worker:
+class _FmuWorker:
     """A process with the FMU in it. resident, space: its bytes of memory and of address space after its last answer."""
 
     process: ChildProcess
@@ -79,12 +81,12 @@ class _Worker:
 
 @dataclass(eq=False)
 class _Processes:
-    """The processes of a host: its supervisor, workers and folder. It ends with the host."""
+    """The processes of a pool: its supervisor, workers and folder. It ends with the pool."""
 
     owner: int
     folder: Folder
     supervisor: Supervisor | None = None
-    workers: dict[int, _Worker] = field(default_factory=dict)
+    workers: dict[int, _FmuWorker] = field(default_factory=dict)
 
     def close(self) -> None:
         """End all processes; remove the folder where no other process uses it."""
@@ -101,11 +103,11 @@ class _Processes:
 
 
 @dataclass(eq=False)
-class Host:
+class WorkerPool:
     """The workers of one FMU. It travels to other processes without them and starts its own there.
 
     learned: what was found out about the FMU in its first runs, kept for later workers: "restart", how it is brought
-    back to its start (see `hvdc_ident.fmu.restart`); "derivatives", by parameter whether a run confirmed its own.
+    back to its start (see `hvdc_ident.fmu.instance`); "derivatives", by parameter whether a run confirmed its own.
     started: processes so far. runs: whole runs of the FMU so far, those that derivatives took among them.
     """
 
@@ -121,9 +123,9 @@ class Host:
         self._single = False  # no second worker begins
         self._loading = self._shared = 0.0  # s that a worker takes to begin, and that shareable requests have taken
         self._busy = 1  # workers of the last request
-        self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.jobs`
+        self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.experiment_run`
         self._base: tuple[bytes, Array] | None = None  # the last run, and its outputs
-        self.kept: dict[bytes, Any] = {}  # runs that whoever asks keeps, see `hvdc_ident.fmu.ends`
+        self.kept: dict[bytes, Any] = {}  # runs that whoever asks keeps, see `hvdc_ident.fmu.terminal_effects`
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
@@ -215,7 +217,9 @@ class Host:
             raise failures[0]
         return answers
 
-    def _answer(self, number: int, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
+    def _answer(
+        self, number: int, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]
+    ) -> Message:
         """The answer of a worker that was asked, or of the one that replaces it."""
         fresh = worker.runs == 1
         answer, out = self._heard(worker, "run")
@@ -236,7 +240,7 @@ class Host:
 
     # --- one answer ---
 
-    def _sent(self, worker: _Worker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _Worker:
+    def _sent(self, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _FmuWorker:
         """The worker, once it is asked, with what others have found out meanwhile."""
         worker.runs += 1
         worker.process.begin()
@@ -246,7 +250,7 @@ class Host:
             worker.process.connection.send_bytes(packed({**heading, "found": news}, arrays))
         return worker
 
-    def _heard(self, worker: _Worker, what: str) -> Message:
+    def _heard(self, worker: _FmuWorker, what: str) -> Message:
         """The answer of a worker. Raises SimulationError where it ends or hangs."""
         deadline = self.limits.load if what == "loading" else self.limits.deadline
         watch = Watch(worker.process.progress, deadline)
@@ -265,7 +269,7 @@ class Host:
                 self._end(worker)
             return heading, arrays
 
-    def _failure(self, worker: _Worker, heading: Mapping[str, Any]) -> SimulationError:
+    def _failure(self, worker: _FmuWorker, heading: Mapping[str, Any]) -> SimulationError:
         """The failure that a worker told, with its memory where that was used up."""
         t = heading.get("time")
         said = heading.get("said", "")
@@ -282,7 +286,7 @@ class Host:
         name = self.description.path.name
         return SimulationError(what, where=f"{name}, {where}" if where else name, got=got, hint=hint)
 
-    def _hung(self, worker: _Worker, what: str, watch: Watch) -> SimulationError:
+    def _hung(self, worker: _FmuWorker, what: str, watch: Watch) -> SimulationError:
         """A worker that is past its deadline, which is ended."""
         instants, still = watch.instants(), watch.still()
         said = worker.process.last_line
@@ -291,7 +295,7 @@ class Host:
         text, hint = overdue(end, worker.process.budget, what, (limit, watch.deadline), instants, still)
         return self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
 
-    def _lost(self, worker: _Worker, when: str) -> Message:
+    def _lost(self, worker: _FmuWorker, when: str) -> Message:
         """The answer of a worker that is gone. Raises SimulationError where a new one cannot be expected to do better."""
         supervisor = self._supervisor()
         said = worker.process.last_line
@@ -310,7 +314,7 @@ class Host:
 
     # --- processes ---
 
-    def _ready(self, number: int) -> _Worker:
+    def _ready(self, number: int) -> _FmuWorker:
         """A worker that waits for a request."""
         if self._useless is not None:
             raise self._useless
@@ -321,7 +325,7 @@ class Host:
             worker = None
         return worker or self._start(number)
 
-    def _leaks(self, worker: _Worker) -> bool:
+    def _leaks(self, worker: _FmuWorker) -> bool:
         """Return whether the worker kept so much memory that the next run may find too little."""
         budget = worker.process.budget
         return budget.exhausted(budget.taken(worker.resident, worker.space))
@@ -332,8 +336,8 @@ class Host:
             self.unpacked = self._processes.folder.path
             self._closed()
         if self._processes is None:
-            folder = joined(self.unpacked) if self.unpacked is not None else None
-            self._processes = _Processes(os.getpid(), folder or new_folder(self.description.path))
+            folder = shared_folder(self.unpacked) if self.unpacked is not None else None
+            self._processes = _Processes(os.getpid(), folder or unpacked_folder(self.description.path))
             self._finalizer = Finalize(self, self._processes.close, exitpriority=20)
         return self._processes
 
@@ -348,15 +352,15 @@ class Host:
             )
         return processes.supervisor
 
-    def _start(self, number: int) -> _Worker:
+    def _start(self, number: int) -> _FmuWorker:
         """A worker that has loaded the FMU."""
         supervisor = self._supervisor()
         begun = time.monotonic()
         self.memory = 0
         self.started += 1
-        worker: _Worker | None = None
+        worker: _FmuWorker | None = None
         try:
-            worker = _Worker(supervisor.start(self.learned))
+            worker = _FmuWorker(supervisor.start(self.learned))
             self._mine().workers[number] = worker
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
@@ -376,7 +380,7 @@ class Host:
         self._loading = time.monotonic() - begun
         return worker
 
-    def _end(self, worker: _Worker) -> Ending | None:
+    def _end(self, worker: _FmuWorker) -> Ending | None:
         """End a worker; how it ended, or None where that is not known."""
         processes = self._mine()
         at = next((n for n, known in processes.workers.items() if known is worker), None)
@@ -430,3 +434,82 @@ def idle_cores(own: int) -> int:
     except OSError:
         others = 0.0
     return max(1, round(cores - others))
+
+
+CALL = re.compile(r"\b(fmi[23][A-Z]\w*)\s*\(|\b_(dlopen)\(")
+BOUND = re.compile(r"fmi[23][A-Z]\w*")  # the name of a function bound by `fmu.library`
+
+
+def key(name: str, value: float) -> str:
+    """Return how a limit is given: in the study, on the command line and in Python."""
+    text = f"{value:.10g}"
+    return f'`{name} = {text}` in the study\'s [model], --{name} {text}, or limits={{"{name}": {text}}} in Python'
+
+
+def call_of(end: Ending) -> str:
+    """Return where in the FMU a process was when it ended: "in fmi2DoStep"; empty where that is not known."""
+    for file, line, name in end.frames():
+        if BOUND.fullmatch(name):
+            return f"in {name}"
+        if call := CALL.search(linecache.getline(file, line)):
+            return f"in {call[1]}" if call[1] else "in loading its library"
+    return ""
+
+
+def more_memory(budget: Budget) -> str:
+    """Return the way to give more, in words."""
+    return f"a larger limit in MiB, if it needs that much: {key('memory', budget.larger)}"
+
+
+def crash(end: Ending, budget: Budget, when: str) -> tuple[str, str]:
+    """Return a process that ended by itself, in words, and what to try. when: "in the run"."""
+    how = f"its process {end}" if end.code < 0 else f"it ended itself with exit code {end.code} and no result"
+    place = call_of(end)
+    taken = budget.taken(end.resident, end.space)
+    what = f"the FMU crashed {when}{f', {place}' if place else ''}: {how}"
+    if budget.exhausted(taken):
+        return f"{what}; {budget.told(taken)}", more_memory(budget)
+    if end.code == -signal.SIGKILL:
+        what += f", from outside, as the system does where memory is short; it had used {taken / MIB:.0f} MiB"
+    return what, ""
+
+
+def overdue(
+    end: Ending, budget: Budget, what: str, limit: tuple[str, float], instants: Sequence[float], still: float | None
+) -> tuple[str, str]:
+    """Return a process that was ended for its deadline, in words, and what to try.
+
+    what: the work. limit: the deadline's key and value, s. instants: first, last and present instant of the run, s, nan
+    where not known. still: for how long, in s, the instant had not moved; None where it moved to the end.
+    """
+    name, deadline = limit
+    start, stop, now = instants
+    reached = not math.isnan(now)
+    scale = "" if math.isnan(stop) else f" of {stop:.6g} s"
+    taken = budget.taken(end.resident, end.space)
+    if still is None and reached and now > start and not math.isnan(stop):
+        times = (stop - start) / (now - start)
+        enough = deadline * times
+        text = (
+            f"the FMU is slow: at t = {now:.6g} s{scale} when the deadline of {deadline:g} s for one run came, its process"
+            f" was ended; at this pace {times:.2g} times the deadline would do"
+        )
+        hint = f"a longer deadline: {key(name, _above(1.2 * enough))}"
+    else:
+        text = f"the FMU hangs: no result of the {what} after {deadline:g} s, its process was ended"
+        place = [f"at t = {now:.6g} s{scale}"] if reached else []
+        place += list(filter(None, [call_of(end)]))
+        if place and still is not None and reached:
+            text += f"; it had stood {', '.join(place)} for {still:.2g} s"
+        elif place:
+            text += f"; it was {', '.join(place)}"
+        hint = f"a longer deadline, if it is only slow: {key(name, _above(5.0 * deadline))}"
+    if budget.exhausted(taken):
+        return f"{text}; {budget.told(taken)}", more_memory(budget)
+    return text, hint
+
+
+def _above(seconds: float) -> float:
+    """Return the number rounded up to two figures."""
+    step = 10.0 ** (math.floor(math.log10(seconds)) - 1)
+    return float(f"{math.ceil(seconds / step - 1e-9) * step:.12g}")

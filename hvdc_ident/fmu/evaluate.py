@@ -1,4 +1,4 @@
-"""One experiment with an FMU: names looked up, the worker asked, effects at its ends put on, the result made."""
+"""An FMU evaluated in its workers: over an experiment, with effects at its terminals, or at a point."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known, unknown_name
-from hvdc_ident.fmu.signals import Signals
+from hvdc_ident.fmu.model import FmuModel
+from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
+
 
 LARGE = 1e300
 """A bound where there is none: JSON has no infinity."""
@@ -25,7 +28,7 @@ LARGE = 1e300
 class Direction:
     """A way in which the inputs of a run move, of such a size that one of them moves by its range.
 
-    points: of all inputs, one after the other, as `Signals.values`. like: a name shared by directions for which the same
+    points: of all inputs, one after the other, as `PackedInputs.values`. like: a name shared by directions for which the same
     step of differences does.
     """
 
@@ -43,7 +46,7 @@ def simulate(
     partial: bool = False,
 ) -> Simulation:
     """The run, with its recording chains and effects. See `FmuModel.simulate`."""
-    from hvdc_ident.fmu.ends import chains, simulate_with_effects
+    from hvdc_ident.fmu.terminal_effects import chains, simulate_with_effects
 
     place = f"experiment '{experiment.name}'"
     given = {**experiment.values, **values}
@@ -97,7 +100,7 @@ def bare(
     that is no parameter's; derivatives along them come after those of the sensitivities.
     """
     along = directions or {}
-    signals = Signals.of(list(inputs_of(model, experiment, given).values()))
+    signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
     known = about(model, sensitivities)
     heading = {
         "do": "simulate",
@@ -122,7 +125,7 @@ def bare(
     }
     if along:
         arrays["directions"] = np.array([d.points for d in along.values()])
-    answer, out = model.host.ask(heading, arrays)
+    answer, out = model.pool.ask(heading, arrays)
     units = tuple(model.outputs[n].unit for n in names)
     accepted, events, evaluations, segments = answer["counts"]
     method = "lsoda" if model.has_equations else "co-simulation"
@@ -130,7 +133,7 @@ def bare(
     if not model.fmu.outputs and set(names) == set(model.fmu.shown):
         notes["outputs"] = "the FMU declares none: its states are recorded"
     errors = dict(zip(sensitivities, out["errors"].tolist(), strict=True))
-    model.host.sensitivity_error = max([model.host.sensitivity_error, *errors.values()])
+    model.pool.sensitivity_error = max([model.pool.sensitivity_error, *errors.values()])
     worst = max(errors, key=lambda n: errors[n], default=None)
     if worst is not None and errors[worst] > 0.0:
         notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {worst}, the least certain"
@@ -185,3 +188,73 @@ def about(model: FmuModel, sensitivities: Sequence[str]) -> dict[str, list[objec
         bounds.append([max(own.min, -LARGE), min(own.max, LARGE)] if own else [-LARGE, LARGE])
         starts.append(variable.start or 0.0)
     return {"sizes": list(sizes), "bounds": list(bounds), "starts": list(starts)}
+
+
+@dataclass(frozen=True, eq=False)
+class FmuPoint:
+    """x (nx,), its derivatives (nx,), outputs (ny,), and the Jacobian of both by [x, u, p], (nx + ny, nx + nu + np).
+
+    nominals: (nx,) sizes of the states. directional: which columns are the FMU's own. error: of the Jacobian, in shares
+    of each row's largest entry. near: whether differences of two step sizes disagree, as beside a limit.
+    """
+
+    x: Array
+    slopes: Array
+    outputs: Array
+    jacobian: Array
+    nominals: Array
+    directional: NDArray[np.bool_]
+    error: float
+    near: bool
+
+
+def smooth_inputs(model: FmuModel) -> tuple[str, ...]:
+    """The inputs that may change continuously: those a Jacobian has columns for."""
+    return tuple(n for n, v in model.fmu.inputs.items() if v.continuous)
+
+
+def at_point(
+    model: FmuModel,
+    values: Mapping[str, float],
+    states: Array | None,
+    outputs: Sequence[str],
+    parameters: Sequence[str] = (),
+    time: float = 0.0,
+    *,
+    check: bool = True,
+) -> FmuPoint:
+    """The FMU at values of parameters and inputs; states None: where its own initialisation puts them.
+
+    parameters: those the Jacobian has columns for. check: whether directional derivatives that once agreed with
+    differences are compared again. Raises ModelError where it has no equations, SimulationError where
+    it cannot be evaluated.
+    """
+    if not model.has_equations:
+        raise ModelError(
+            "a co-simulation FMU shows no equations",
+            where=f"model '{model.name}'",
+            expected="model exchange",
+            hint="export it with model exchange; simulate, sweep, identify and fit work on it as it is",
+        )
+    heading = {
+        "do": "point",
+        "values": changed(model, values),
+        "time": time,
+        "outputs": list(outputs),
+        "jacobian": True,
+        "check": check,
+        "parameters": list(parameters),
+        "sizes": about(model, parameters)["sizes"],
+    }
+    u = np.array([float(values.get(n, i.value)) for n, i in model.inputs.items()])
+    answer, out = model.pool.ask(heading, {"u": u, **({} if states is None else {"x": states})})
+    return FmuPoint(
+        out["x"],
+        out["slopes"],
+        out["outputs"],
+        out["jacobian"],
+        out["nominals"],
+        out["directional"] > 0.5,
+        float(answer["error"]),
+        bool(answer["near"]),
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,9 +11,8 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.fmu.export import text
 from hvdc_ident.model import Model
-from hvdc_ident.simulate import Elimination, ModelEquations, engine_of, steps
+from hvdc_ident.simulate import Elimination, Graph, ModelEquations, engine_of, steps
 
 TOLERANCE = 1e-8
 """Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""
@@ -35,7 +35,7 @@ _TANGENTS = ("model_tangent", "model_rest_tangent")
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class CModel:
     """The model's equations as C text, with the numbers that its files and its description share."""
 
     model: Model
@@ -89,8 +89,8 @@ class Program:
             "#ifndef HVDC_MODEL_H",
             "#define HVDC_MODEL_H",
             *(f"#define {n} {v}" for n, v in sizes.items()),
-            f"#define MODEL_TOKEN {text.string(token)}",
-            f"#define DEFAULT_TOLERANCE {text.number(TOLERANCE)}",
+            f"#define MODEL_TOKEN {c_string(token)}",
+            f"#define DEFAULT_TOLERANCE {c_number(TOLERANCE)}",
             "typedef struct {",
             "    const double *y, *yd, *w, *wd, *p, *dp, *m;",
             "} Args;",
@@ -116,15 +116,15 @@ class Program:
         names = [*s.states, *s.unknowns, *m.delays, *m.sampled]
         fixed = self.fixed
         return [
-            text.array("double", "model_parameter_values", (text.number(q.value) for q in m.parameters.values())),
-            text.array("double", "model_input_values", (text.number(q.value) for q in m.inputs.values())),
-            text.array("double", "model_rest_values", map(text.number, self.rest)),
-            text.array("double", "model_guesses", map(text.number, self.guesses)),
-            text.array("double", "model_nominals", map(text.number, self.nominals)),
-            text.array("int", "model_parameter_fixed", (str(int(n in fixed)) for n in m.parameters)),
-            text.array("int", "model_state_searched", (str(int(q.start is None)) for q in m.states.values())),
-            text.array("char *const", "model_rest_names", map(text.string, names)),
-            text.array("char *const", "model_memory_names", map(text.string, [*m.delays, *m.sampled])),
+            c_array("double", "model_parameter_values", (c_number(q.value) for q in m.parameters.values())),
+            c_array("double", "model_input_values", (c_number(q.value) for q in m.inputs.values())),
+            c_array("double", "model_rest_values", map(c_number, self.rest)),
+            c_array("double", "model_guesses", map(c_number, self.guesses)),
+            c_array("double", "model_nominals", map(c_number, self.nominals)),
+            c_array("int", "model_parameter_fixed", (str(int(n in fixed)) for n in m.parameters)),
+            c_array("int", "model_state_searched", (str(int(q.start is None)) for q in m.states.values())),
+            c_array("char *const", "model_rest_names", map(c_string, names)),
+            c_array("char *const", "model_memory_names", map(c_string, [*m.delays, *m.sampled])),
         ]
 
     def _functions(self) -> Iterator[str]:
@@ -132,11 +132,11 @@ class Program:
         known = {f.name: f for f in s.functions}
         for name, same in _SAME.items():
             f = known[same]
-            yield text.function(s.graph, name, f.nodes, f.live)
+            yield c_function(s.graph, name, f.nodes, f.live)
         roots = [*s.rhs, *s.observed, *s.graph.switches]
-        yield text.function(s.graph, "model_tangent", [(k, self._tangent(n)) for k, n in enumerate(roots)])
+        yield c_function(s.graph, "model_tangent", [(k, self._tangent(n)) for k, n in enumerate(roots)])
         rest = [node for _, node in known["rest"].nodes]
-        yield text.function(s.graph, "model_rest_tangent", [(k, self._tangent(n)) for k, n in enumerate(rest)])
+        yield c_function(s.graph, "model_rest_tangent", [(k, self._tangent(n)) for k, n in enumerate(rest)])
         if self._elimination:
             yield from _elimination_text(self._elimination)
 
@@ -166,7 +166,7 @@ def tableau() -> str:
     lines = [
         "/* RODAS5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the",
         "   Julia Differential Equations package, BIT 63 (2023). */",
-        f"#define RODAS_GAMMA {text.number(steps.RODAS_GAMMA)}",
+        f"#define RODAS_GAMMA {c_number(steps.RODAS_GAMMA)}",
     ]
     for name, table in tables.items():
         shape = "".join(f"[{k}]" for k in table.shape)
@@ -175,7 +175,7 @@ def tableau() -> str:
 
 
 def _braces(table: Array) -> str:
-    items = (text.number(float(v)) if np.ndim(v) == 0 else _braces(v) for v in table)
+    items = (c_number(float(v)) if np.ndim(v) == 0 else _braces(v) for v in table)
     return "{" + ", ".join(items) + "}"
 
 
@@ -185,7 +185,7 @@ def _comment(name: str) -> str:
 
 def _elimination_text(e: Elimination) -> Iterator[str]:
     """Straight-line elimination of the integrator's matrix, and the solution with its factors."""
-    body = text.function(e.graph, "model_factorise", e.function.nodes)
+    body = c_function(e.graph, "model_factorise", e.function.nodes)
     signature = (
         "void model_factorise(const double *jac, double shift, double *out) {\n    const double *y = jac, *w = &shift;"
     )
@@ -202,3 +202,121 @@ def _solution(e: Elimination) -> Sequence[str]:
         lines += [f"    x{k} -= factors[{e.places[k, j]}] * x{j};" for j in e.upper[k]]
         lines.append(f"    x[{k}] = x{k} *= factors[{e.places[k, k]}];")
     return lines
+
+
+GROUPS = ("y", "yd", "w", "wd", "p", "dp", "m")
+_BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+
+
+def c_number(value: float) -> str:
+    """A C constant of exactly this double."""
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "(-INFINITY)"
+    text = repr(float(value))
+    return f"({text})" if text.startswith("-") else text
+
+
+def c_string(text: str) -> str:
+    """A C string literal in ASCII."""
+    escaped = "".join(
+        c if " " <= c <= "~" and c not in '\\"?' else "".join(f"\\{b:03o}" for b in c.encode("utf-8")) for c in text
+    )
+    return f'"{escaped}"'
+
+
+def c_array(kind: str, name: str, items: Iterable[str]) -> str:
+    """A constant array; one element that is never read where there are none."""
+    listed = list(items)
+    filler = "0" if "*" not in kind else '""'
+    return f"const {kind} {name}[{max(len(listed), 1)}] = {{{', '.join(listed) or filler}}};"
+
+
+def c_function(graph: Graph, name: str, stores: Sequence[tuple[int, int]], live: bool = False) -> str:
+    """The function `void name(const Args *a, double *out)` that stores nodes at places of `out`.
+
+    live: conditions by comparison instead of by frozen mode. Everything is computed before anything is stored, so that
+    `out` may be one of the arguments.
+    """
+    lines: dict[int, str] = {}
+    groups: set[str] = set()
+    for node in _order(graph, [n for _, n in stores], live):
+        lines[node] = _line(graph, node, live, groups)
+    body = [f"    const double *{g} = a->{g};" for g in GROUPS if g in groups]
+    body += [f"    {text}" for text in lines.values() if text]
+    body += [f"    out[{place}] = {_name(graph, node)};" for place, node in stores]
+    if not groups:
+        body.insert(0, "    (void)a;")
+    if not stores:
+        body.append("    (void)out;")
+    return f"void {name}(const Args *a, double *out) {{\n" + "\n".join(body) + "\n}\n"
+
+
+def _arguments(graph: Graph, node: int, live: bool) -> tuple[int, ...]:
+    key = graph.nodes[node]
+    if key[0] == "switch":
+        return (graph.switches[key[1]],) if live else ()
+    return graph.arguments(node)
+
+
+def _order(graph: Graph, roots: Sequence[int], live: bool) -> list[int]:
+    """The nodes needed, each after what it is computed from."""
+    done: dict[int, None] = {}
+    stack = list(reversed(roots))
+    while stack:
+        node = stack[-1]
+        if node in done:
+            stack.pop()
+            continue
+        missing = [n for n in _arguments(graph, node, live) if n not in done]
+        if missing:
+            stack.extend(reversed(missing))
+        else:
+            done[node] = None
+            stack.pop()
+    return list(done)
+
+
+def _name(graph: Graph, node: int) -> str:
+    key = graph.nodes[node]
+    if key[0] == "const":
+        return c_number(key[1])
+    if key[0] == "bool":
+        return "1" if key[1] else "0"
+    if key[0] == "leaf":
+        return f"{key[1]}[{key[2]}]"
+    return f"v{node}"
+
+
+def _line(graph: Graph, node: int, live: bool, groups: set[str]) -> str:
+    op, *a = graph.nodes[node]
+    if op in ("const", "bool"):
+        return ""
+    if op == "leaf":
+        groups.add(a[0])
+        return ""
+    if op == "switch":
+        if live:
+            return f"const int v{node} = {_name(graph, graph.switches[a[0]])} < 0.0;"
+        groups.add("m")
+        return f"const int v{node} = m[{a[0]}] > 0.5;"
+    x = [_name(graph, n) for n in a]
+    if op in ("and", "or", "not"):
+        text = f"!{x[0]}" if op == "not" else f"{x[0]} {'&&' if op == 'and' else '||'} {x[1]}"
+        return f"const int v{node} = {text};"
+    return f"const double v{node} = {_value(op, x)};"
+
+
+def _value(op: str, x: list[str]) -> str:
+    if op in _BINARY:
+        return f"{x[0]} {_BINARY[op]} {x[1]}"
+    if op == "neg":
+        return f"-{x[0]}"
+    if op == "inverse":  # 1/x, and 0 where x is 0
+        return f"{x[0]} != 0.0 ? 1.0 / {x[0]} : 0.0"
+    if op == "sqrt0":  # the root of max(x, 0)
+        return f"sqrt({x[0]} > 0.0 ? {x[0]} : 0.0)"
+    if op == "select":
+        return f"{x[0]} ? {x[1]} : {x[2]}"
+    return f"{op}({', '.join(x)})"

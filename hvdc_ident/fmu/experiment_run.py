@@ -1,4 +1,4 @@
-"""Whole runs with their derivatives, and points, as a worker makes them when asked. Runs in the worker alone."""
+"""An experiment as a worker runs it, with derivatives by the best method for each parameter. In worker processes only."""
 
 from __future__ import annotations
 
@@ -11,14 +11,23 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu import co_simulation, exchange
-from hvdc_ident.fmu.binding import Block, Failure
+from hvdc_ident.fmu import co_simulation, model_exchange
+from hvdc_ident.fmu.derivatives import (
+    ENOUGH,
+    SHORT,
+    DifferenceStep,
+    PointEvaluation,
+    VariationalEquations,
+    derivative,
+    first,
+    noise_of,
+    pair,
+    rms,
+)
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.differences import ENOUGH, SHORT, Step, derivative, first, noise_of, pair, rms
-from hvdc_ident.fmu.plant import Plant, RunEnded, RunFailed, failure
-from hvdc_ident.fmu.restart import SPREAD, Make, Way, find_restart, moving
-from hvdc_ident.fmu.signals import Signals
-from hvdc_ident.fmu.tangent import Point, Tangent
+from hvdc_ident.fmu.fmi import FmiError, VariableGroup
+from hvdc_ident.fmu.instance import SPREAD, Instance, LoadFmu, Reuse, RunEnded, RunFailed, failure, find_reuse, moving
+from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.processes.messages import Message
 from hvdc_ident.processes.server import die_like, in_new_process
 
@@ -37,25 +46,25 @@ REPEATED = {
 
 
 @dataclass
-class Jobs:
+class RequestHandler:
     """An FMU with what was learned of it.
 
     make: loads it into this process. tell: called between runs of one job, so that nobody waits in vain. learned: kept
-    by the host over workers, see `hvdc_ident.fmu.host`.
+    by the pool over workers, see `hvdc_ident.fmu.worker_pool`.
     """
 
     description: Description
-    make: Make
+    make: LoadFmu
     tell: Callable[[], None]
     learned: dict[str, Any] = field(default_factory=dict)
-    steps: dict[bytes, Step] = field(default_factory=dict)
+    steps: dict[bytes, DifferenceStep] = field(default_factory=dict)
     noise: dict[bytes, Array] = field(default_factory=dict)
     last: tuple[bytes, Array] | None = None
-    made: Plant | None = None
+    made: Instance | None = None
     runs: int = 0
 
     @property
-    def plant(self) -> Plant:
+    def instance(self) -> Instance:
         """The FMU in this process; it is loaded where it was not."""
         if self.made is None:
             self.made = self.make(self.learned)
@@ -71,12 +80,12 @@ class Jobs:
         return isolated_result(self._loaded) if self.isolated else self._loaded()
 
     def _loaded(self) -> Message:
-        self.plant.instantiate()
+        self.instance.instantiate()
         return {}, {}
 
     def failed(self, error: Exception) -> RunFailed:
         """Return what an error amounts to; the instance is given up, for it cannot be trusted even to free itself."""
-        found = failure(error, self.made.binding.messages if self.made else ())
+        found = failure(error, self.made.library.messages if self.made else ())
         if self.made:
             self.made.abandon()
         return found
@@ -100,16 +109,16 @@ class Jobs:
         for name, value in found.items():
             kind, _, key = name.partition(" ")
             if kind == "step":
-                self.steps.setdefault(bytes.fromhex(key), Step(*value))
+                self.steps.setdefault(bytes.fromhex(key), DifferenceStep(*value))
             else:
                 self.noise.setdefault(bytes.fromhex(key), np.array(value))
 
     def _simulate(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-        return _Simulation(self, heading, arrays).answer()
+        return _ExperimentRun(self, heading, arrays).answer()
 
     def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-        point = Point(
-            self.plant, heading["values"], arrays.get("x"), arrays["u"], heading["time"], tuple(heading["outputs"])
+        point = PointEvaluation(
+            self.instance, heading["values"], arrays.get("x"), arrays["u"], heading["time"], tuple(heading["outputs"])
         )
         slopes, outputs = point.evaluate()
         found = {"x": point.x, "slopes": slopes, "outputs": outputs}
@@ -117,21 +126,21 @@ class Jobs:
             return {}, found
         d = point.derivatives(heading["parameters"], heading["sizes"], check=heading["check"])
         return {"error": d.error, "near": d.near}, {
-            **found, "jacobian": d.matrix, "directional": d.directional.astype(float), "nominals": self.plant.nominals()
+            **found, "jacobian": d.matrix, "directional": d.directional.astype(float), "nominals": self.instance.nominals()
         }  # fmt: skip
 
     def _starts(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Return what the parameters stand at where nobody sets them."""
         d = self.description
         u = np.array([v.start or 0.0 for v in d.inputs.values()])
-        self.plant.begin({}, u, 0.0, None, None)
-        return {}, {"parameters": Block(self.plant.binding, tuple(d.parameters.values())).get().copy()}
+        self.instance.begin({}, u, 0.0, None, None)
+        return {}, {"parameters": VariableGroup(self.instance.library, tuple(d.parameters.values())).get().copy()}
 
 
-class _Simulation:
+class _ExperimentRun:
     """One experiment: a run, and derivatives by the best way there is for each parameter."""
 
-    def __init__(self, jobs: Jobs, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    def __init__(self, jobs: RequestHandler, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         self.jobs, self.description, self.learned = jobs, jobs.description, jobs.learned
         self.values: dict[str, float] = heading["values"]
         self.names = tuple(heading["outputs"])
@@ -142,7 +151,7 @@ class _Simulation:
         self.starts: dict[str, float] = dict(zip(self.parameters, heading["starts"], strict=True))
         self.tolerance: float = heading["tolerance"]
         self.time = arrays["time"]
-        self.signals = Signals(arrays["sizes"], arrays["times"], arrays["points"], arrays["breaks"])
+        self.signals = PackedInputs(arrays["sizes"], arrays["times"], arrays["points"], arrays["breaks"])
         self.inputs = list(self.description.inputs)
         # Constants of the inputs' directions: parameters 0, of size 1, that move all inputs along a line of points.
         self.directions: dict[str, str] = heading.get("directions", {})
@@ -156,13 +165,13 @@ class _Simulation:
         self.partial = bool(heading.get("partial"))  # whether a run that the FMU ends counts, with its rows
         self.ended: tuple[float, int] | None = None  # when it ended this one, s, and the rows up to there
         self.notes: dict[str, str] = {}
-        self.counts = exchange.Counts()
+        self.counts = model_exchange.Counts()
         if "base" in arrays:
             self.jobs.last = (self._key_of(self.values, self.signals), arrays["base"])
 
     def answer(self) -> Message:
         if "restart" not in self.learned:
-            self._find_restart()
+            self._find_reuse()
         if REPEATED[self.learned["restart"]]:
             self.notes["restart"] = REPEATED[self.learned["restart"]]
         if self.description.interface == "co-simulation":
@@ -198,29 +207,29 @@ class _Simulation:
             outputs, gradients = outputs[:count], gradients[:count]
         return {"notes": self.notes, "counts": counts}, {"outputs": outputs, "gradients": gradients, "errors": errors}
 
-    def _find_restart(self) -> None:
+    def _find_reuse(self) -> None:
         """Learn how the FMU is brought back to its start, from runs of this experiment in processes of their own."""
         d = self.description
         names = tuple(dict.fromkeys([*self.names, *d.outputs, *d.states]))
 
-        def run(signals: Signals) -> Callable[[Plant], Array]:
-            def made(plant: Plant) -> Array:
+        def run(signals: PackedInputs) -> Callable[[Instance], Array]:
+            def made(instance: Instance) -> Array:
                 self.jobs.tell()
-                return self._rows(plant, self.values, signals, names, exchange.Counts())
+                return self._rows(instance, self.values, signals, names, model_exchange.Counts())
 
             return made
 
-        way, rows = find_restart(self.jobs.make, run(self.signals))
+        way, rows = find_reuse(self.jobs.make, run(self.signals))
         steps = [STIRRED * max(abs(v.start or 0.0), v.nominal) * v.continuous for v in d.inputs.values()]
         if any(steps) and not moving(rows).any():  # at rest throughout: the start of a run is its end
             third = float(self.time[0] + (self.time[-1] - self.time[0]) / 3.0)
             way = self._stirred(run(self.signals.stirred(steps, third)), way)
         self.learned["restart"] = way
 
-    def _stirred(self, run: Callable[[Plant], Array], way: Way) -> Way:
+    def _stirred(self, run: Callable[[Instance], Array], way: Reuse) -> Reuse:
         """Return the way as a run with inputs that move has it; the one found before where that run fails."""
         try:
-            return find_restart(self.jobs.make, run)[0]
+            return find_reuse(self.jobs.make, run)[0]
         except RunFailed:
             return way
 
@@ -228,21 +237,21 @@ class _Simulation:
         """Learn how a co-simulation FMU has to be called, where this experiment can show it."""
         names = tuple(dict.fromkeys([*self.names, *self.description.outputs]))
 
-        def run(calls: co_simulation.Calls, time: Array) -> Array:
+        def run(calls: co_simulation.CallPattern, time: Array) -> Array:
             self.jobs.tell()
 
-            def rows(plant: Plant) -> Array:
+            def rows(instance: Instance) -> Array:
                 try:
-                    return co_simulation.run(plant, self.values, self.signals, time, names, self.tolerance, calls)
+                    return co_simulation.run(instance, self.values, self.signals, time, names, self.tolerance, calls)
                 except RunEnded as e:
                     return self._padded(e, time.size)
 
             if self.jobs.isolated:
-                return self._in_its_own_process(rows, exchange.Counts())
+                return self._in_its_own_process(rows, model_exchange.Counts())
             self.jobs.runs += 1
             try:
-                return rows(self.jobs.plant)
-            except (Failure, RunFailed) as e:
+                return rows(self.jobs.instance)
+            except (FmiError, RunFailed) as e:
                 raise self.jobs.failed(e) from None
 
         co_simulation.find_calls(self.learned, self.description, self.signals, self.time, self.tolerance, run)
@@ -253,7 +262,7 @@ class _Simulation:
         """Where a parameter stands; for an input, or a direction of inputs, what is added of it, 0."""
         return 0.0 if name in self.inputs or name in self.along else self.values.get(name, self.starts[name])
 
-    def _with(self, moved: Mapping[str, float]) -> tuple[dict[str, float], Signals]:
+    def _with(self, moved: Mapping[str, float]) -> tuple[dict[str, float], PackedInputs]:
         """Values and signals of a run with parameters elsewhere, or something added to inputs."""
         signals = self.signals
         for name in moved.keys() & self.along.keys():
@@ -263,18 +272,18 @@ class _Simulation:
         ours = {n: v for n, v in moved.items() if n not in self.inputs and n not in self.along}
         return {**self.values, **ours}, signals
 
-    def _run(self, values: Mapping[str, float], signals: Signals | None = None) -> Array:
+    def _run(self, values: Mapping[str, float], signals: PackedInputs | None = None) -> Array:
         """(n, outputs) of a run without derivatives, checked to be finite; the last one is kept for whoever asks again."""
         moved = self.signals if signals is None else signals
         own = values is self.values and moved is self.signals
         key = self._key_of(values, moved)
         if own and self.jobs.last is not None and self.jobs.last[0] == key:
             return self.jobs.last[1]
-        counts = self.counts if own else exchange.Counts()
+        counts = self.counts if own else model_exchange.Counts()
         if self.jobs.isolated:
             outputs = self._in_its_own_process(lambda p: self._rows(p, values, moved, self.names, counts), counts)
         else:
-            outputs = self._rows(self.jobs.plant, values, moved, self.names, counts)
+            outputs = self._rows(self.jobs.instance, values, moved, self.names, counts)
         reached = outputs if self.ended is None else outputs[: self.ended[1]]
         bad = ~np.isfinite(reached).all(axis=0)
         if bad.any():
@@ -287,17 +296,17 @@ class _Simulation:
             self.jobs.last = (key, outputs)
         return outputs
 
-    def _key_of(self, values: Mapping[str, float], signals: Signals) -> bytes:
+    def _key_of(self, values: Mapping[str, float], signals: PackedInputs) -> bytes:
         """Return everything that decides the outputs of a run."""
         return self.key + signals.values.tobytes() + repr(sorted(values.items())).encode()
 
-    def _in_its_own_process(self, run: Callable[[Plant], Array], counts: exchange.Counts) -> Array:
+    def _in_its_own_process(self, run: Callable[[Instance], Array], counts: model_exchange.Counts) -> Array:
         """(n, outputs) of a run in a process made for it; what it finds out of the FMU is kept."""
 
         def work() -> Message:
-            plant = self.jobs.make({k: v for k, v in self.learned.items() if k != "restart"})
-            rows = run(plant)
-            return {"learned": plant.learned, "counts": asdict(counts), "end": self.ended}, {"rows": rows}
+            instance = self.jobs.make({k: v for k, v in self.learned.items() if k != "restart"})
+            rows = run(instance)
+            return {"learned": instance.learned, "counts": asdict(counts), "end": self.ended}, {"rows": rows}
 
         heading, arrays = isolated_result(work)
         self.jobs.runs += 1
@@ -308,11 +317,11 @@ class _Simulation:
 
     def _rows(
         self,
-        plant: Plant,
+        instance: Instance,
         values: Mapping[str, float],
-        signals: Signals,
+        signals: PackedInputs,
         names: tuple[str, ...],
-        counts: exchange.Counts,
+        counts: model_exchange.Counts,
         finer: float = 1.0,
     ) -> Array:
         """(n, names) of a run as the FMU gives them; NaN after an end that it asked for, where such a run counts.
@@ -321,12 +330,14 @@ class _Simulation:
         """
         self.jobs.runs += 1
         try:
-            if plant.binding.exchange:
-                run = exchange.Run(plant, signals, self.time, names, finer * self.tolerance, counts=counts)
+            if instance.library.exchange:
+                run = model_exchange.ModelExchangeRun(
+                    instance, signals, self.time, names, finer * self.tolerance, counts=counts
+                )
                 run.go(values)
                 return run.outputs
             counts.segments += 1
-            return co_simulation.run(plant, values, signals, self.time, names, self.tolerance)
+            return co_simulation.run(instance, values, signals, self.time, names, self.tolerance)
         except RunEnded as e:
             rows = self._padded(e, self.time.size)
             self.ended = (float(e.t or 0.0), len(e.rows) if e.rows is not None else 0)
@@ -361,18 +372,18 @@ class _Simulation:
         other figures, and some move the parameter: so the run with sensitivities has to be the run without, the
         parameters have to stand after it as before, and each column has to be the difference of runs.
         """
-        plant = self.jobs.plant
-        plain = exchange.Counts()
-        outputs = self._rows(plant, self.values, self.signals, self.names, plain)
-        noise = rms(outputs - self._rows(plant, self.values, self.signals, self.names, exchange.Counts(), 0.5))
-        parameters = Block(plant.binding, tuple(self.description.parameters.values()))
+        instance = self.jobs.instance
+        plain = model_exchange.Counts()
+        outputs = self._rows(instance, self.values, self.signals, self.names, plain)
+        noise = rms(outputs - self._rows(instance, self.values, self.signals, self.names, model_exchange.Counts(), 0.5))
+        parameters = VariableGroup(instance.library, tuple(self.description.parameters.values()))
         before = parameters.get().copy()
         try:
-            run = self._tangent_run(names, exchange.Counts(), EXCESS * plain.accepted + 1000)
+            run = self._tangent_run(names, model_exchange.Counts(), EXCESS * plain.accepted + 1000)
             moved = not np.array_equal(before, parameters.get(), equal_nan=True)
-        except (RunFailed, Failure, exchange.SensitivitiesLost):
+        except (RunFailed, FmiError, model_exchange.SensitivitiesLost):
             moved = True
-        plant.renew()
+        instance.renew()
         size = np.abs(outputs).max(axis=0, initial=0.0)
         if moved or (rms(run.outputs - outputs) > SPREAD * (noise + self.tolerance * size)).any():
             return {n: len(names) > 1 and self._confirmed([n])[n] for n in names}
@@ -390,14 +401,14 @@ class _Simulation:
         return bool((told & (rms(column - found) <= doubt + ENOUGH * strength)).all())
 
     def _tangent_run(
-        self, names: Sequence[str], counts: exchange.Counts, most: int = exchange.MOST_STEPS
-    ) -> exchange.Run:
+        self, names: Sequence[str], counts: model_exchange.Counts, most: int = model_exchange.MOST_STEPS
+    ) -> model_exchange.ModelExchangeRun:
         """Return the run with sensitivities. Raises SensitivitiesLost where an event makes them wrong."""
-        plant = self.jobs.plant
+        instance = self.jobs.instance
         start = np.column_stack([self._start_slope(n) for n in names])
-        tangent = Tangent(plant, names, [self.sizes[n] for n in names], self.names)
-        run = exchange.Run(
-            plant, self.signals, self.time, self.names, self.tolerance, tangent, start, counts=counts, most=most
+        tangent = VariationalEquations(instance, names, [self.sizes[n] for n in names], self.names)
+        run = model_exchange.ModelExchangeRun(
+            instance, self.signals, self.time, self.names, self.tolerance, tangent, start, counts=counts, most=most
         )
         run.go(self.values)
         return run
@@ -406,7 +417,7 @@ class _Simulation:
         """(n, outputs) with the gradients filled in; None where an event makes the columns wrong."""
         try:
             run = self._tangent_run(names, self.counts)
-        except exchange.SensitivitiesLost as e:
+        except model_exchange.SensitivitiesLost as e:
             self.notes["events"] = f"{e}: derivatives come from differences of runs"
             return None
         gradients[:, :, [self.parameters.index(n) for n in names]] = run.gradients
@@ -418,12 +429,12 @@ class _Simulation:
         """(nx,) dx0/dp, from initialisations at two steps, extrapolated."""
         t = float(self.time[0])
         low, high = self.bounds[name]
-        plant = self.jobs.plant
+        instance = self.jobs.instance
 
         def start(value: float) -> Array:
             values, signals = self._with({name: value})
-            plant.begin(values, signals.at(self.time[:1], "left")[0], t, None, self.tolerance)
-            return plant.binding.get_states()[:, None]
+            instance.begin(values, signals.at(self.time[:1], "left")[0], t, None, self.tolerance)
+            return instance.library.get_states()[:, None]
 
         at = self._now(name)
         h = START_STEP * self.sizes[name]

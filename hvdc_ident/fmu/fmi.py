@@ -1,6 +1,6 @@
-"""The two versions of FMI behind one set of calls, over FMPy's bindings. Runs in the worker alone.
+"""The functions of FMI 2.0 and 3.0 behind one interface, over FMPy's bindings. Used in worker processes only.
 
-Vectors are numpy arrays whose address is taken once: what is called ten thousand times a run allocates nothing.
+Vectors are numpy arrays whose address is taken once: a function that is called ten thousand times a run allocates nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import REAL, Description, Variable
 from hvdc_ident.processes.messages import NOW, START, STOP, no_progress
 
-Failure = FMICallException
+FmiError = FMICallException
 """Raised by a call that returned discard, error or fatal; `.function`, `.status`."""
 WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
 Function = Callable[..., None]
@@ -74,7 +74,7 @@ def refusal(d: Description, said: str) -> str:
 
 
 @dataclass(frozen=True)
-class Update:
+class DiscreteUpdate:
     """Result of one event iteration: another iteration wanted, the end, states or nominals changed, the next time event, s."""
 
     again: bool
@@ -83,7 +83,7 @@ class Update:
     next_time: float | None
 
 
-class Ended(Exception):
+class TerminationRequested(Exception):
     """The FMU asked for the end of the run in a step. reached: the instant that it stands at, s."""
 
     def __init__(self, reached: float) -> None:
@@ -103,16 +103,16 @@ class Vector:
         self.address = addressof(self.pointer)
 
 
-class Block:
+class VariableGroup:
     """Some variables of an FMU, to be read or set together: values in their order, whatever their types."""
 
-    def __init__(self, binding: Binding, variables: Sequence[Variable]) -> None:
-        self._binding = binding
+    def __init__(self, library: FmiLibrary, variables: Sequence[Variable]) -> None:
+        self._library = library
         self.variables = tuple(variables)
         self.values: Array = np.zeros(len(self.variables))
         self._fast = all(v.kind in ("Real", "Float64") for v in variables)
         self._vector = Vector(len(self.variables))
-        self._references = binding.references([v.reference for v in variables])
+        self._references = library.references([v.reference for v in variables])
         groups: dict[str, list[int]] = {}
         for i, v in enumerate(variables):
             groups.setdefault(v.kind, []).append(i)
@@ -122,10 +122,10 @@ class Block:
         """The values now, (n,); the array is used again by the next call."""
         if self._fast:
             if self._vector.size:
-                self._binding.get_reals(self._references, self._vector)
+                self._library.get_reals(self._references, self._vector)
             return self._vector.values
         for kind, places in self._groups.items():
-            found = getattr(self._binding.fmu, f"get{_call_of(kind, self._binding.version)}")(
+            found = getattr(self._library.fmu, f"get{_call_of(kind, self._library.version)}")(
                 [self.variables[i].reference for i in places]
             )
             self.values[places] = [float(x) for x in found]
@@ -136,12 +136,12 @@ class Block:
         if self._fast:
             if self._vector.size:
                 self._vector.values[:] = values
-                self._binding.set_reals(self._references, self._vector)
+                self._library.set_reals(self._references, self._vector)
             return
         for kind, places in self._groups.items():
             given = [float(values[i]) if kind in REAL else round(float(values[i])) for i in places]
             exact = [bool(x) for x in given] if kind == "Boolean" else given
-            getattr(self._binding.fmu, f"set{_call_of(kind, self._binding.version)}")(
+            getattr(self._library.fmu, f"set{_call_of(kind, self._library.version)}")(
                 [self.variables[i].reference for i in places], exact
             )
 
@@ -152,8 +152,8 @@ def _call_of(kind: str, version: int) -> str:
 
 
 @dataclass(frozen=True)
-class Calls:
-    """The functions of an FMU that are called in every step, each of which raises Failure.
+class FmiFunctions:
+    """The functions of an FMU that are called in every step, each of which raises FmiError.
 
     Vectors go in as addresses. They are bound here because FMPy's own way to them, which can log each call, takes as
     long as a small FMU does.
@@ -171,7 +171,7 @@ class Calls:
     step: Function
 
     @classmethod
-    def of(cls, library: Any, version: int, exchange: bool) -> Calls:
+    def of(cls, library: Any, version: int, exchange: bool) -> FmiFunctions:
         """Return those of a library; of what its interface has not, calls that raise."""
         sized = [c_size_t] if version == 3 else []
         real, slopes = ("Real", "Derivatives") if version == 2 else ("Float64", "ContinuousStateDerivatives")
@@ -210,7 +210,7 @@ def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
     def call(*arguments: Any) -> None:
         status = function(*arguments)
         if status > WARNING:
-            raise Failure(function=name, status=status)
+            raise FmiError(function=name, status=status)
 
     call.__code__ = call.__code__.replace(co_name=name)  # by which a crash or a hang tells where it was
     return call
@@ -218,12 +218,12 @@ def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
 
 def _missing(name: str) -> Function:
     def call(*arguments: Any) -> None:
-        raise Failure(function=name, status=ERROR)
+        raise FmiError(function=name, status=ERROR)
 
     return call
 
 
-class Binding:
+class FmiLibrary:
     """An FMU's library with at most one instance. Methods are the calls of FMI, without their prefixes."""
 
     def __init__(self, description: Description, folder: str) -> None:
@@ -243,7 +243,7 @@ class Binding:
             modelIdentifier=description.identifier,
             instanceName="hvdc_ident",
         )
-        self._call = Calls.of(self.fmu.dll, self.version, self.exchange)
+        self._call = FmiFunctions.of(self.fmu.dll, self.version, self.exchange)
         self._flags = (_flag(self.version)(), _flag(self.version)())
         self._sized = int(self.version == 3)  # FMI 3.0 gives the number of values, too
         self._callbacks = self._made_callbacks()
@@ -393,11 +393,11 @@ class Binding:
     def enter_continuous(self) -> None:
         self.fmu.enterContinuousTimeMode()
 
-    def update(self) -> Update:
+    def update(self) -> DiscreteUpdate:
         """One iteration of the discrete part."""
         found = self.fmu.newDiscreteStates() if self.version == 2 else self.fmu.updateDiscreteStates()
         again, end, _, states, defined, when = found
-        return Update(bool(again), bool(end), bool(states), float(when) if defined else None)
+        return DiscreteUpdate(bool(again), bool(end), bool(states), float(when) if defined else None)
 
     def completed_step(self) -> tuple[bool, bool]:
         """Return whether the FMU wants an event, and whether it wants to end."""
@@ -411,7 +411,7 @@ class Binding:
         """Return the instant from which to go on, and the one that outputs belong to.
 
         They differ for an FMU of FMI 3.0 whose own steps do not end at t + h: it goes on from there all the same, and
-        early return alone moves the communication point. Raises Ended where the FMU asks for the end of the run.
+        early return alone moves the communication point. Raises TerminationRequested where the FMU asks for the end of the run.
         """
         self.progress[NOW] = t
         if self.version == 2:
@@ -425,7 +425,7 @@ class Binding:
             return t + h, t + h
         _, end, early, reached = self.fmu.doStep(t, h)
         if end:
-            raise Ended(float(reached))
+            raise TerminationRequested(float(reached))
         return float(reached) if early else t + h, float(reached)
 
     def _discarded(self, t: float, discard: FMICallException) -> float:
@@ -440,10 +440,10 @@ class Binding:
             reached = float(self.fmu.getRealStatus(fmi2LastSuccessfulTime))
         except FMICallException:
             if end:
-                raise Ended(t) from None
+                raise TerminationRequested(t) from None
             raise discard from None
         if end:
-            raise Ended(reached)
+            raise TerminationRequested(reached)
         if not reached > t:
             raise discard
         return reached
