@@ -28,7 +28,7 @@ class Setup(NamedTuple):
 
 def prepare(setup: Setup) -> None:
     """Load what workers need: what one of them loads later would count as the FMU's memory."""
-    import hvdc_ident.fmu.experiment_run  # noqa: F401
+    import hvdc_ident.fmu.sensitivity_run  # noqa: F401
 
     if setup.description.interface == "model-exchange":
         import scipy.integrate  # noqa: F401
@@ -41,9 +41,9 @@ def finish(setup: Setup) -> None:
 
 def serve(connection: Connection, progress: memoryview[float], setup: Setup, begun: Mapping[str, Any]) -> None:
     """Answer requests until the connection closes or the FMU ends the process. begun: what the pool has learned."""
-    from hvdc_ident.fmu.experiment_run import RequestHandler
     from hvdc_ident.fmu.fmi import why_not_loaded
     from hvdc_ident.fmu.instance import Instance, RunFailed
+    from hvdc_ident.fmu.sensitivity_run import RequestHandler
 
     folder = str(setup.folder.binaries)
 

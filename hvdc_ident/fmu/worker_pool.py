@@ -123,7 +123,7 @@ class WorkerPool:
         self._single = False  # no second worker begins
         self._loading = self._shared = 0.0  # s that a worker takes to begin, and that shareable requests have taken
         self._busy = 1  # workers of the last request
-        self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.experiment_run`
+        self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.sensitivity_run`
         self._base: tuple[bytes, Array] | None = None  # the last run, and its outputs
         self.kept: dict[bytes, Any] = {}  # runs that whoever asks keeps, see `hvdc_ident.fmu.terminal_effects`
         self.memory = 0

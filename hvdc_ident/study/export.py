@@ -243,7 +243,7 @@ def _fmu(source: Study | Model, chosen: ValueSet | None, path: Path, options: Fm
 
 
 def _modelica(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
-    from hvdc_ident.fmu.export.modelica import save_modelica
+    from hvdc_ident.fmu.export.modelica_model import save_modelica
 
     return Written(save_modelica(_described(source, chosen), path))
 

@@ -11,7 +11,7 @@ import sympy as sp
 
 import hvdc_ident as hi
 from hvdc_ident.expression import FUNCTIONS, GrammarFunction, functions, parse, symbol, to_text
-from hvdc_ident.fmu.export.modelica import ModelicaPrinter
+from hvdc_ident.fmu.export.modelica_model import ModelicaPrinter
 from hvdc_ident.linearize.system import evaluate
 from hvdc_ident.simulate import Graph
 

@@ -7,7 +7,7 @@ import pytest
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ExpressionError
-from hvdc_ident.fmu.export.modelica import modelica, output_name
+from hvdc_ident.fmu.export.modelica_model import modelica, output_name
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
