@@ -11,7 +11,8 @@ import numpy as np
 
 from hvdc_ident.fit import fit
 from hvdc_ident.fit.objective import LeastSquares
-from hvdc_ident.fit.profile import TWO_SIDED, profiles
+from hvdc_ident.fit.profile import profiles
+from hvdc_ident.fit.uncertainty import TWO_SIDED
 
 from .integrators import installed
 from .plant import FREE, Line, Plant, recorded

@@ -18,7 +18,7 @@ _FEW_ROWS = 8  # too few for a standard deviation before the event
 _ROWS_OF_SCATTER = 32  # see row_scatter
 _MAD_TO_STD = 1.482602218505602  # of a normal distribution
 _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
-_GAP = 1.5  # times the median stride between recorded rows, the same share as `fit.whitening.GAP`
+_GAP = 1.5  # times the median stride between recorded rows, the same share as `fit.noise_model.GAP`
 _DEPARTURE = 6.0  # standard deviations
 _OUTLIER = 5.0  # standard deviations
 

@@ -9,7 +9,7 @@ For whoever searches (the discrepancy room):
         probe.model_names(use)                            # the same under the names that the model then has
 
 `probe.free` names the parameters to estimate, the others keep the probe's value. A range that spans more than a decade
-above 0 is one for a logarithmic scale, as `hvdc_ident.fit.unknown.FitParameter` takes it. `clearance(effect, values)` measures
+above 0 is one for a logarithmic scale, as `hvdc_ident.fit.fit_parameter.FitParameter` takes it. `clearance(effect, values)` measures
 how far a set of values is from neutral, as something whose interval can be compared with 0. `sources(model, place)`
 lists the signals that an effect with `needs_source` may bring in at this place without closing a circle;
 `resistances(model, place)` the parameters that may stand for R in an effect with a `resistance` (none: do not try it

@@ -15,13 +15,13 @@ from scipy.special import chdtrc, fdtrc, stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.noise import from_misfit
-from hvdc_ident.fit.nuisance import observe, unknown_of
+from hvdc_ident.fit.adequacy import ljung_box
+from hvdc_ident.fit.noise_model import from_misfit
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import compared_rows, per_deviation, stretches
-from hvdc_ident.fit.residual_tests import ljung_box
 from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.simulator import observe, unknown_of
 from hvdc_ident.immutable import FrozenMap
 
 

@@ -11,26 +11,34 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
-from hvdc_ident.fit.adequacy import adequacy
+from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
-from hvdc_ident.fit.clock import has_clocks, searched
-from hvdc_ident.fit.intervals import estimates_of
-from hvdc_ident.fit.noise import floor_of, source_of, source_text
-from hvdc_ident.fit.nuisance import unknown_of
+from hvdc_ident.fit.multistart import (
+    DISTINCT,
+    LocalMinimum,
+    Refined,
+    best_first,
+    cost_of,
+    distinct,
+    has_clocks,
+    latin_hypercube,
+    prepared,
+    searched,
+    weighted,
+    whitened_by_residuals,
+)
+from hvdc_ident.fit.noise_model import floor_of, source_of, source_text
+from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
 from hvdc_ident.fit.objective import promised
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers import catalogue
 from hvdc_ident.fit.optimisers import optimiser as named
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.refined import Refined
 from hvdc_ident.fit.residual import ResidualBlock
-from hvdc_ident.fit.residual_tests import residual_tests
 from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, StartOutcome, Status
-from hvdc_ident.fit.rough import LUCK, Trend, residual_at, threshold_of, trend_of
-from hvdc_ident.fit.starts import DISTINCT, LocalMinimum, best_first, distinct, latin_hypercube
-from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
-from hvdc_ident.fit.weights import cost_of, prepared, weighted, whitened_by_residuals
+from hvdc_ident.fit.simulator import unknown_of
+from hvdc_ident.fit.uncertainty import Uncertainty, estimates_of, uncertainty
 from hvdc_ident.immutable import FrozenMap
 
 STARTS = 8

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.unknown import Coordinates, FitParameter
 
 LONGEST = 10.0
 """A step changes a logarithm by at most this: no parabola holds over four decades, and on a plateau its minimum lies anywhere."""

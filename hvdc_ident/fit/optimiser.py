@@ -1,11 +1,19 @@
-"""What an optimiser is: options, and one run from one start."""
+"""Optimisers: options that run from one start, and a problem's cost as optimisation libraries want it.
+
+A point where the simulation fails has no cost. Libraries need a number there all the same: they get one worse than any
+that was seen, which only ranks the point last; it is never a result. The best admissible point is kept here, whatever
+the library returns, and so is the budget.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
+import numpy as np
+
 from hvdc_ident.data import Array
+from hvdc_ident.errors import InputError, SimulationError
 from hvdc_ident.fit.problem import Problem
 
 OptimiserStatus = Literal["converged", "max-evaluations", "stopped", "stalled", "flat", "failed"]
@@ -35,3 +43,152 @@ class Optimiser(Protocol):
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Where the run from `start`, (p,) inside the bounds, ended."""
+
+
+class BudgetSpentError(Exception):
+    """The run has used the evaluations it may take."""
+
+
+@dataclass
+class OptimiserRun:
+    """One run of a library's method. limit: evaluations it may take, of the whole set of experiments."""
+
+    problem: Problem
+    start: Array
+    limit: int
+    evaluations: int = 0
+    failures: int = 0
+    best: Array = field(init=False)
+    cost: float | None = None
+    failure: str = ""
+    _worst: float = 0.0
+    _last: tuple[bytes, Array, Array] | None = None
+
+    def __post_init__(self) -> None:
+        self.start = np.asarray(self.start, dtype=float)
+        self.best = self.start.copy()
+
+    # --- coordinates: `scaled` ones keep infinite bounds; in the unit cube everything is finite ---
+
+    @property
+    def x0(self) -> Array:
+        """The start in scaled coordinates, (p,), inside the bounds."""
+        low, high = self.problem.coordinates.bounds
+        return np.clip(self.problem.coordinates.scaled(self.start), low, high)
+
+    @property
+    def cube(self) -> Array:
+        """The start in the unit cube of where starts are drawn from, (p,)."""
+        shares = []
+        for u, v in zip(self.problem.unknowns, self.start, strict=True):
+            low, high = u.drawn
+            shares.append(np.log(v / low) / np.log(high / low) if u.log else (v - low) / (high - low))
+        return np.clip(np.array(shares), 0.0, 1.0)
+
+    def from_cube(self, shares: Array) -> Array:
+        """Theta of a point of the unit cube, (p,); outside of it the nearest point inside."""
+        inside = np.clip(shares, 0.0, 1.0)
+        return np.array([u.draw(float(s)) for u, s in zip(self.problem.unknowns, inside, strict=True)])
+
+    # --- values ---
+
+    def at_cube(self, shares: Array) -> float:
+        """The cost at a point of the unit cube, simulated without sensitivities."""
+        return self.value(self.from_cube(shares))
+
+    def value(self, theta: Array) -> float:
+        """The cost at theta, or a number worse than any seen."""
+        self._count()
+        try:
+            cost = self.problem.cost(theta)
+        except SimulationError as error:
+            return self._failed(error)
+        self._seen(theta, cost)
+        return cost
+
+    def residual(self, x: Array) -> Array:
+        """The residual at scaled coordinates, (N,); not finite where the simulation fails. Raises it at the start."""
+        found = self._evaluated(x)
+        return np.full(self._rows, np.inf) if found is None else found[0]
+
+    def jacobian(self, x: Array) -> Array:
+        """Its derivatives by scaled coordinates, (N, p)."""
+        found = self._evaluated(x)
+        assert found is not None
+        return found[1]
+
+    def value_and_gradient(self, x: Array) -> tuple[float, Array]:
+        """The cost at scaled coordinates and its gradient, (p,); where the simulation fails a worse cost and 0."""
+        found = self._evaluated(x)
+        if found is None:
+            return 2.0 * self._worst + 1.0, np.zeros_like(x)
+        r, jacobian = found
+        return 0.5 * float(r @ r), jacobian.T @ r
+
+    def _evaluated(self, x: Array) -> tuple[Array, Array] | None:
+        """Residual and derivatives, computed once for a point however often it is asked for."""
+        key = np.asarray(x, dtype=float).tobytes()
+        if self._last is not None and self._last[0] == key:
+            return self._last[1], self._last[2]
+        self._count()
+        theta = self.problem.coordinates.unscaled(np.asarray(x, dtype=float))
+        try:
+            r, jacobian = self.problem.residual(theta)
+        except SimulationError as error:
+            self._failed(error)
+            return None
+        self._rows = r.size
+        scaled = jacobian * self.problem.coordinates.slope(theta)
+        self._last = (key, r, scaled)
+        self._seen(theta, 0.5 * float(r @ r))
+        return r, scaled
+
+    def _count(self) -> None:
+        if self.evaluations >= self.limit:
+            raise BudgetSpentError
+        self.evaluations += 1
+
+    def _failed(self, error: SimulationError) -> float:
+        self.failures += 1
+        self.failure = str(error)
+        return 2.0 * self._worst + 1.0
+
+    def _seen(self, theta: Array, cost: float) -> None:
+        self._worst = max(self._worst, cost)
+        if self.cost is None or cost < self.cost:
+            self.cost, self.best = cost, np.asarray(theta, dtype=float).copy()
+
+    # --- the end ---
+
+    def ended(self, converged: bool, message: str) -> OptimiserResult:
+        """The result: the best point seen. Without any admissible point the run failed."""
+        if self.cost is None:
+            return OptimiserResult(
+                self.start, None, "failed", f"no point could be simulated: {self.failure}", self.evaluations
+            )
+        status: OptimiserStatus = "converged" if converged else "stopped"
+        more = f"; {self.failures} of {self.evaluations} points could not be simulated" if self.failures else ""
+        return OptimiserResult(self.best, self.cost, status, message + more, self.evaluations)
+
+    def spent(self) -> OptimiserResult:
+        """The result where the evaluations were used up."""
+        end = self.ended(False, f"no optimum within {self.limit} evaluations")
+        return end if end.status == "failed" else replace(end, status="max-evaluations")
+
+    def refused(self, message: str) -> OptimiserResult:
+        """The result where the method gave up."""
+        return replace(self.ended(False, message), status="failed")
+
+
+def generator(seed: int, start: Array) -> np.random.Generator:
+    """The random numbers of a run: a stream of its own for every start, the same at every repetition."""
+    return np.random.default_rng([seed, *np.ascontiguousarray(start, dtype=float).view(np.uint32).tolist()])
+
+
+def missing(package: str, optimiser: str) -> InputError:
+    """The error where a package of the extra `optimisers` is not installed."""
+    return InputError(
+        f"the optimiser '{optimiser}' needs the package {package}, which is not installed",
+        where="fit.optimiser",
+        hint="pip install 'hvdc_ident[optimisers]', or another optimiser",
+    )

@@ -13,17 +13,21 @@ from scipy.linalg import block_diag
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, StudyError, unknown_name
-from hvdc_ident.fit.initial_states import centred, recentred, unknown_initial_states
-from hvdc_ident.fit.loss import LOSSES, Loss
-from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
-from hvdc_ident.fit.nuisance import unknown_of, unknowns
-from hvdc_ident.fit.prior import Prior, prior_rows
-from hvdc_ident.fit.residual import ComparedRecord, ResidualBlock, Treatment, records, residual_blocks
-from hvdc_ident.fit.rounding import QuantisedNoise
-from hvdc_ident.fit.simulator import Simulator
-from hvdc_ident.fit.spectrum import Band
-from hvdc_ident.fit.unknown import Coordinates, FitParameter
-from hvdc_ident.fit.whitening import AR
+from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
+from hvdc_ident.fit.likelihood import LOSSES, Loss, Prior, QuantisedNoise, prior_rows
+from hvdc_ident.fit.noise_model import AR, GIVEN, sigmas, source_of
+from hvdc_ident.fit.residual import (
+    Band,
+    ComparedRecord,
+    ResidualBlock,
+    Treatment,
+    centred,
+    recentred,
+    records,
+    residual_blocks,
+    unknown_initial_states,
+)
+from hvdc_ident.fit.simulator import Simulator, unknown_of, unknowns
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -41,7 +45,7 @@ class Problem:
     guard: rows this close to a break of an input are not compared, s. band: Hz; given, the residual is the misfit's
     spectrum there. loss: what a residual costs. priors: by unknown ("EXPERIMENT:NUISANCE" for a nuisance).
     free_initial_states: whether the records, held-out ones too, begin elsewhere than at rest; what unknown starts of the states
-    can make good is then taken out of residuals and jacobians (`fit.initial_states`).
+    can make good is then taken out of residuals and jacobians.
     Theta, wherever it appears, holds the unknowns in the order of `unknowns`, each in its own unit.
     Raises StudyError or UnknownNameError where the parts do not fit.
     """

@@ -1,22 +1,26 @@
-"""The residuals of one experiment, weighted and if asked whitened or turned into a spectrum, with their derivatives."""
+"""The residuals of one experiment with their derivatives: weighted, and if asked whitened or turned into a spectrum.
+
+Where a record does not begin at rest, what the states' unknown starts can make good is taken out of the residuals. What
+moves a system by itself, a periodic disturbance say, has moved it before the record's first row too; the steady start of a
+run is then one of many, and the difference dies out like any other answer to the states' start. The best start for given
+parameters is found by a step from the steady one; about it the starts are eliminated: variable projection (Golub and
+Pereyra 1973) with the jacobian of Kaufman (1975), whose gradient is exact because it is taken at the best start.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Experiment
+from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import SimulationError, StudyError
-from hvdc_ident.fit.initial_states import freed
-from hvdc_ident.fit.nuisance import observe
-from hvdc_ident.fit.rounding import QuantisedNoise
-from hvdc_ident.fit.simulator import Simulator
-from hvdc_ident.fit.spectrum import Band, transformed
-from hvdc_ident.fit.whitening import AR, GAP, segments, whitened
+from hvdc_ident.fit.likelihood import QuantisedNoise
+from hvdc_ident.fit.noise_model import AR, GAP, segments, whitened
+from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, WithStates, observe
 from hvdc_ident.immutable import FrozenMap
 
 LARGEST = 1e100
@@ -204,7 +208,7 @@ def residual_blocks(
     """One block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
 
     sigma: standard deviation by output, in its unit. derivatives: whether jacobians are wanted; else they have no column.
-    unknown_starts: states, given starts by the experiment, that are taken for unknown and eliminated (`fit.initial_states`).
+    unknown_starts: states, given starts by the experiment, that are taken for unknown and eliminated.
     compared: the experiment's records with the treatment's guard, where they are at hand.
     Raises SimulationError where the run fails, StudyError where nothing can be compared.
     """
@@ -249,3 +253,108 @@ def residual_blocks(
         blocks.append(block)
         raw.append(slopes[:, k : k + len(unknown_starts)])
     return freed(blocks, raw, slice(k, k + len(unknown_starts))) if unknown_starts else tuple(blocks)
+
+
+Band = tuple[float, float]
+
+
+def transformed(signal: Array, time: Array, band: Band, where: str) -> Array:
+    """The real and imaginary parts of the signal's spectrum within the band, (k,) or (k, p).
+
+    signal: (m,) or (m, p) over evenly spaced instants time, (m,) s. band: Hz, ends included. The transform is unitary:
+    over the whole band the sum of squares is that of the signal, and white noise stays white.
+    Raises StudyError for uneven rows or a band without a frequency.
+    """
+    if len(segments(time, where)) > 1:
+        raise StudyError(
+            "the frequency-domain residual needs rows without a gap",
+            where=where,
+            expected="evenly spaced rows with finite measurements and no guard",
+            hint="a window without gaps, or the time-domain residual",
+        )
+    n = time.size
+    step = (time[-1] - time[0]) / max(n - 1, 1)
+    frequency = np.fft.rfftfreq(n, step) if step > 0 else np.zeros(1)
+    inside = (frequency >= band[0]) & (frequency <= band[1])
+    spectrum = np.fft.rfft(signal, axis=0) / np.sqrt(n)
+    single = (np.arange(frequency.size) == 0) | ((np.arange(frequency.size) == n // 2) & (n % 2 == 0))
+    both = spectrum[inside & ~single] * np.sqrt(2.0)
+    result = np.concatenate([spectrum[inside & single].real, both.real, both.imag])
+    if not result.shape[0]:
+        raise StudyError(
+            "the band holds no frequency of the record",
+            where=where,
+            expected=f"within 0 to {frequency[-1]:g} Hz in steps of {1.0 / (n * step) if step else 0:g} Hz",
+            got=f"{band[0]:g} to {band[1]:g} Hz",
+        )
+    return result
+
+
+TELLS = 1e-7
+"""Singular value, relative to the largest of columns of length 1, from which a direction counts."""
+
+
+def unknown_initial_states(simulator: Simulator, experiment: Experiment) -> tuple[str, ...]:
+    """The states whose start is neither given nor estimated; none of a simulator that does not show its states."""
+    known = {*experiment.starts, *experiment.nuisance}
+    return tuple(n for n in simulator.states if n not in known) if isinstance(simulator, WithStates) else ()
+
+
+def centred(
+    simulator: Simulator,
+    experiment: Experiment,
+    values: Mapping[str, float],
+    states: Sequence[str],
+    nuisance: Mapping[str, float],
+) -> Experiment:
+    """The experiment with the steady start of these states given as numbers. Raises SimulationError where there is none."""
+    first = experiment.time[:1]
+    blank = Trajectory(first, np.zeros((1, len(states))), tuple(states), tuple("" for _ in states))
+    asked = experiment.with_(time=first, measured=blank, window=None, instrument=FrozenMap())
+    own = {n: v for n, v in nuisance.items() if n != TIME_SHIFT}
+    at = observe(simulator, asked, values, (), own, derivatives=False).values
+    return experiment.with_(starts=experiment.starts | {n: float(at[n][0]) for n in states})
+
+
+def recentred(experiment: Experiment, blocks: Sequence[ResidualBlock], states: Sequence[str]) -> Experiment:
+    """The experiment with these states' starts moved to where its residuals are least, to first order.
+
+    blocks: at the starts as they are; their first columns are by the starts. A start that the records hardly show is kept
+    by a weak prior, as wide as its own value (or 1): it would otherwise be moved by noise, and far.
+    """
+    at = np.array([experiment.starts[n] for n in states])
+    size = np.where(at != 0.0, np.abs(at), 1.0)
+    columns = np.vstack([b.jacobian[:, : len(states)] for b in blocks]) * size
+    residual = np.concatenate([b.residual for b in blocks])
+    # Stacked, not squared: of columns that are alike and large, the prior would be lost in rounding.
+    whole, wanted = np.vstack([columns, np.eye(len(states))]), np.append(-residual, np.zeros(len(states)))
+    step = np.linalg.lstsq(whole, wanted)[0]
+    moved = {n: float(v) for n, v in zip(states, at + size * step, strict=True)}
+    return experiment.with_(starts=experiment.starts | moved)
+
+
+def freed(blocks: Sequence[ResidualBlock], raw: Sequence[Array], columns: slice) -> tuple[ResidualBlock, ...]:
+    """The blocks of one experiment without what the starts can make good.
+
+    columns: the jacobians' columns by the starts, which are gone from the result. raw: by block, (m, starts) the derivative
+    of its misfit by them, neither weighted nor whitened.
+    """
+    slopes = np.vstack([b.jacobian[:, columns] for b in blocks])
+    norms = np.linalg.norm(slopes, axis=0)
+    norms = np.where(norms > 0, norms, np.inf)
+    u, s, vt = np.linalg.svd(slopes / norms, full_matrices=False)
+    kept = s > TELLS * s.max(initial=0.0)
+    u = u[:, kept]
+    residual = np.concatenate([b.residual for b in blocks])
+    rest = np.vstack([np.delete(b.jacobian, columns, axis=1) for b in blocks])
+    start = -(vt[kept].T @ ((u.T @ residual) / s[kept])) / norms
+    residual, rest = residual - u @ (u.T @ residual), rest - u @ (u.T @ rest)
+    found, at = [], 0
+    for k, (b, d) in enumerate(zip(blocks, raw, strict=True)):
+        own = slice(at, at + b.residual.size)
+        taken = int(np.count_nonzero(kept)) if k == 0 else 0
+        found.append(
+            replace(b, misfit=b.misfit + d @ start, residual=residual[own], jacobian=rest[own], taken=taken)
+        )  # fmt: skip
+        at = own.stop
+    return tuple(found)

@@ -13,8 +13,8 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
-from hvdc_ident.fit.noise import unknown_noise
-from hvdc_ident.fit.profile import ProfileOptions
+from hvdc_ident.fit.noise_model import unknown_noise
+from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability import narrow, verdicts
 from hvdc_ident.identifiability.evidence import pair_of, thresholds, told_by_noise

@@ -14,8 +14,8 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
-from hvdc_ident.fit.profile import ONE_SIDED, TWO_SIDED, Profile
-from hvdc_ident.fit.profile_pair import PairProfile, profile_pair
+from hvdc_ident.fit.profile import PairProfile, Profile, profile_pair
+from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability.pilot import Optimum
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap

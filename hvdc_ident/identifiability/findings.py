@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from hvdc_ident.executor import Progress
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.profile import ProfileOptions
+from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.optima import OtherOptimum
 from hvdc_ident.identifiability.pilot import Optimum

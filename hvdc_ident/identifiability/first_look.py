@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.noise import from_misfit
+from hvdc_ident.fit.noise_model import from_misfit
 from hvdc_ident.identifiability.combinations import combinations_of
 from hvdc_ident.identifiability.pilot import unfitted
 from hvdc_ident.immutable import FrozenMap

@@ -10,7 +10,7 @@ from typing import Any
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.individual import Group, part_of
+from hvdc_ident.fit.partial_fits import Group, part_of
 from hvdc_ident.fit.simulator import Simulator
 from hvdc_ident.identifiability.assess import identifiability
 from hvdc_ident.identifiability.heterogeneity import Misspecification

@@ -14,8 +14,8 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.multistart import latin_hypercube
 from hvdc_ident.fit.simulator import sensitivity_error
-from hvdc_ident.fit.starts import latin_hypercube
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, held_of
 from hvdc_ident.sensitivity import SENSITIVITY_ERROR, null_directions
 

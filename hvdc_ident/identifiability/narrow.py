@@ -11,9 +11,10 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.executor import Executor
+from hvdc_ident.fit.nonsmooth import LUCK, Trend, roughness, trend_of
 from hvdc_ident.fit.objective import LeastSquares
-from hvdc_ident.fit.profile import Profile, ProfileOptions, Profiles, profiles, trend_profiles
-from hvdc_ident.fit.rough import LUCK, Trend, roughness, trend_of
+from hvdc_ident.fit.profile import Profile, Profiles, profiles, trend_profiles
+from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.identifiability import verdicts
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, partners
 from hvdc_ident.identifiability.evidence import (

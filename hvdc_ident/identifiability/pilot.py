@@ -13,15 +13,14 @@ from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import adequacy
-from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, source_of
-from hvdc_ident.fit.nuisance import unknown_of
+from hvdc_ident.fit.multistart import misfit_weights
+from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit, source_of
+from hvdc_ident.fit.nonsmooth import Trend
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import FitResult
-from hvdc_ident.fit.rough import Trend
-from hvdc_ident.fit.simulator import sensitivity_error
+from hvdc_ident.fit.simulator import sensitivity_error, unknown_of
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
-from hvdc_ident.fit.weights import misfit_weights
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import Information
 

@@ -9,8 +9,8 @@ from typing import Literal
 
 from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.bootstrap import Bootstrap
+from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.profile import Profile
-from hvdc_ident.fit.unknown import FitParameter
 
 VerdictName = Literal[
     "structurally-unidentifiable",

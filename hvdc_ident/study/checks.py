@@ -56,9 +56,9 @@ def check_questions(study: Study, where: str) -> None:
             "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
         )
     if s.fit:
-        from hvdc_ident.fit.loss import LOSSES
+        from hvdc_ident.fit.likelihood import LOSSES
         from hvdc_ident.fit.optimisers import catalogue, need
-        from hvdc_ident.fit.tolerance import tolerance
+        from hvdc_ident.fit.windowed_errors import tolerance
 
         require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
         try:
@@ -314,7 +314,7 @@ def best_cost_is_told(data: Mapping[str, Any]) -> Iterator[str]:
     cost = data.get("cost")
     if data.get("status") not in FINISHED or cost is None or not costs:
         return
-    from hvdc_ident.fit.starts import DISTINCT, TIE
+    from hvdc_ident.fit.multistart import DISTINCT, TIE
 
     rows = sum(t["n"] for line in (data.get("residual_tests") or {}).values() for t in line.values())
     effective = sum((data.get("effective_samples") or {}).values())

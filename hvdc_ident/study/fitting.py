@@ -12,10 +12,9 @@ import sympy as sp
 from hvdc_ident.fit import FitParameter, FitResult, Group, Problem, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.frequency_data import with_responses
-from hvdc_ident.fit.individual import part_of
-from hvdc_ident.fit.loss import loss
-from hvdc_ident.fit.tolerance import tolerance
-from hvdc_ident.fit.windowed import windowed_errors
+from hvdc_ident.fit.likelihood import loss
+from hvdc_ident.fit.partial_fits import part_of
+from hvdc_ident.fit.windowed_errors import tolerance, windowed_errors
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.model import Model
 from hvdc_ident.study.checks import need_candidates, need_experiments, need_start

@@ -24,9 +24,9 @@ from hvdc_ident.data import (
     same_unit,
 )
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit.noise import MISFIT, source_of
-from hvdc_ident.fit.nuisance import observe, unknowns
-from hvdc_ident.fit.unknown import FitParameter
+from hvdc_ident.fit.fit_parameter import FitParameter
+from hvdc_ident.fit.noise_model import MISFIT, source_of
+from hvdc_ident.fit.simulator import observe, unknowns
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import ModelSimulator
 

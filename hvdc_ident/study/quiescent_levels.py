@@ -27,7 +27,7 @@ from scipy.stats import norm
 
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.fit.unknown import FitParameter
+from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import ModelSimulator, engine_of
 from hvdc_ident.study.level_comparison import (

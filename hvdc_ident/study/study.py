@@ -26,7 +26,7 @@ from hvdc_ident.study.parse import parse_study
 from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
 
 if TYPE_CHECKING:
-    from hvdc_ident.fit.prior import Prior
+    from hvdc_ident.fit.likelihood import Prior
     from hvdc_ident.model import AnyModel
 
 
@@ -381,8 +381,8 @@ def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> FitParam
 
 def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> FrozenMap[Prior]:
     """The priors by unknown of a fit; one of a parameter that each experiment has for itself holds in every experiment."""
-    from hvdc_ident.fit.nuisance import unknown_of
-    from hvdc_ident.fit.prior import Prior
+    from hvdc_ident.fit.likelihood import Prior
+    from hvdc_ident.fit.simulator import unknown_of
 
     found: dict[str, Prior] = {}
     for name, line in settings.parameters.items():

@@ -15,7 +15,7 @@ import numpy as np
 from hvdc_ident.data import Experiment, InputSignal, experiment
 from hvdc_ident.fit import FitParameter, Problem, fit, fit_each
 from hvdc_ident.fit.bootstrap import cluster_sandwich
-from hvdc_ident.fit.per_experiment import half_width, spread
+from hvdc_ident.fit.partial_fits import half_width, spread
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model

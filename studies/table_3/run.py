@@ -22,7 +22,7 @@ from common import ending, paper  # noqa: E402
 from common.ending import interval, markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
-from hvdc_ident.fit.per_experiment import half_width, spread  # noqa: E402
+from hvdc_ident.fit.partial_fits import half_width, spread  # noqa: E402
 
 FULL, QUICK = 30, 4
 STARTS = {n: start for n, (_, _, start, _) in paper.TABLE_2.items()}

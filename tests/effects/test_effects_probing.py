@@ -9,7 +9,7 @@ import pytest
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import EffectUse, SlotSignal, alone, clearance, effects, probes, resistances, sources
-from hvdc_ident.fit.unknown import FitParameter
+from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate

@@ -81,7 +81,7 @@ def test_without_a_noise_the_rows_themselves_judge_where_they_show_white_noise()
 def test_outliers_are_no_misfit_under_a_robust_loss():
     from dataclasses import replace
 
-    from hvdc_ident.fit.loss import loss
+    from hvdc_ident.fit.likelihood import loss
 
     y = 1 + 2 * T + white(2)
     y[::20] += 3.0

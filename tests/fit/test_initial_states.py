@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from hvdc_ident import Model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.initial_states import recentred
+from hvdc_ident.fit.residual import recentred
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 

@@ -14,10 +14,9 @@ from scipy.stats import binom
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.fit import FitParameter, Problem, fit
-from hvdc_ident.fit.loss import LOSSES, loss
-from hvdc_ident.fit.prior import Prior
-from hvdc_ident.fit.spectrum import transformed
-from hvdc_ident.fit.whitening import autoregression, before_event, segments, whitened
+from hvdc_ident.fit.likelihood import LOSSES, Prior, loss
+from hvdc_ident.fit.noise_model import autoregression, before_event, segments, whitened
+from hvdc_ident.fit.residual import transformed
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded
 
 RNG = np.random.default_rng

@@ -9,7 +9,7 @@ from hvdc_ident import Model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit import FitParameter, Problem, fit
-from hvdc_ident.fit.nuisance import unit_of
+from hvdc_ident.fit.simulator import unit_of
 from hvdc_ident.simulate import ModelSimulator
 from tests.fit.link import STEPS, TIME, TRUTH, link, step
 from tests.fit.simulators import Closed, decay, parameters, recorded

@@ -9,7 +9,7 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit import fit, fit_each
-from hvdc_ident.fit.per_experiment import half_width, spread
+from hvdc_ident.fit.partial_fits import half_width, spread
 from tests.fit.test_interval_coverage import pair
 
 PUBLISHED = [  # std, n, width of the interval: Vanfretti, Murad, Gomez Lopez 2017, Table III; n = 6 is inferred

@@ -11,10 +11,9 @@ import pytest
 
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.fit import windowed
+from hvdc_ident.fit import windowed_errors as windowed_module
 from hvdc_ident.fit.assessment import Curve
-from hvdc_ident.fit.tolerance import shipped, tolerance
-from hvdc_ident.fit.windowed import event_end, windowed_errors
+from hvdc_ident.fit.windowed_errors import event_end, shipped, tolerance, windowed_errors
 from tests.fit.simulators import recorded
 
 T = np.round(np.arange(0, 4.0001, 0.01), 9)
@@ -131,5 +130,5 @@ def test_a_profile_that_is_wrong_is_refused(tmp_path, old, new, message):
 
 def test_nobody_is_told_to_comply():
     texts = [f.read_text(encoding="utf-8") for f in (files("hvdc_ident.fit") / "tolerances").iterdir()]
-    texts.append(Path(windowed.__file__).read_text(encoding="utf-8"))
+    texts.append(Path(windowed_module.__file__).read_text(encoding="utf-8"))
     assert texts and not any(re.search("complian|comply", t, re.IGNORECASE) for t in texts)

@@ -13,8 +13,7 @@ from hvdc_ident.errors import StudyError
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.bootstrap import bootstrap, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares
-from hvdc_ident.fit.profile import profiles
-from hvdc_ident.fit.profile_pair import JOINT, profile_pair
+from hvdc_ident.fit.profile import JOINT, profile_pair, profiles
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.combinations import in_words
 from hvdc_ident.identifiability.evidence import bootstrap_rise, thresholds

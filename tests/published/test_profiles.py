@@ -14,7 +14,8 @@ from scipy.optimize import brentq, minimize_scalar
 
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.objective import LeastSquares, Smooth
-from hvdc_ident.fit.profile import ProfileOptions, profiles
+from hvdc_ident.fit.profile import profiles
+from hvdc_ident.fit.profile_path import ProfileOptions
 
 EXACT = ProfileOptions(tolerance=1e-10)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.fit.tolerance import WINDOWS
+from hvdc_ident.fit.windowed_errors import WINDOWS
 from hvdc_ident.report.sections import errors, gains, residuals
 from hvdc_ident.study import fitting
 from hvdc_ident.study.examples import write_starter

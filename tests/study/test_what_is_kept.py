@@ -19,7 +19,7 @@ import hvdc_ident
 from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.fit.bootstrap import _refit
 from hvdc_ident.fit.optimiser import Optimiser
-from hvdc_ident.fit.per_experiment import _alone
+from hvdc_ident.fit.partial_fits import _alone
 from hvdc_ident.immutable import FrozenMap
 
 BOUND = {

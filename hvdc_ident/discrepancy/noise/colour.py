@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.whitening import whitened
+from hvdc_ident.fit.noise_model import whitened
 
 TANH = np.linspace(-0.55, 3.0, 72)
 """artanh of the coefficients that are tried: from -0.5 to 0.995."""

@@ -14,11 +14,10 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, event_time, noise_floor
 from hvdc_ident.discrepancy.noise.colour import TANH, Colour, Likelihood, likelihood, together, without_common
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit.noise import scatter_of
+from hvdc_ident.fit.likelihood import QuantisedNoise
+from hvdc_ident.fit.noise_model import AR, autoregression, scatter_of, segments
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
-from hvdc_ident.fit.rounding import QuantisedNoise
-from hvdc_ident.fit.whitening import AR, autoregression, segments
 from hvdc_ident.immutable import FrozenMap
 
 FEWEST = 8

@@ -11,7 +11,7 @@ from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.refits.nominal import Nominal
 from hvdc_ident.discrepancy.scores.reach import Reach
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit.nuisance import observe
+from hvdc_ident.fit.simulator import observe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, insertion_point
 from hvdc_ident.simulate import ModelSimulator, Tolerance

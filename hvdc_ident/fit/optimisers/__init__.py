@@ -13,8 +13,7 @@ from dataclasses import fields
 from typing import Any
 
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.fit.optimiser import Optimiser
-from hvdc_ident.fit.search import missing
+from hvdc_ident.fit.optimiser import Optimiser, missing
 
 
 def catalogue() -> dict[str, Any]:

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun, generator, missing
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator, missing
 
 NAME = "cma-es"
 SUMMARY = "evolution strategy with covariance adaptation (package cma, an extra), without derivatives"

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun, generator
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator
 
 NAME = "differential-evolution"
 SUMMARY = "a population of differences over the whole range (SciPy), without derivatives"

@@ -12,9 +12,8 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit.objective import promised
-from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun, generator
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator
 
 NAME = "dual-annealing"
 SUMMARY = "simulated annealing with local descents over the whole range (SciPy)"

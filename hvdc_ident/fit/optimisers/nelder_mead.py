@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun
 
 NAME = "nelder-mead"
 SUMMARY = "the simplex of Nelder and Mead (SciPy), without derivatives"

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun, generator, missing
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import BudgetSpentError, OptimiserRun, generator, missing
 
 NAME = "particle-swarm"
 SUMMARY = "a swarm of particles (package pyswarms, an extra), without derivatives"

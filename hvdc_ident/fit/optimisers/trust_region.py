@@ -14,11 +14,11 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.fit_parameter import Coordinates
+from hvdc_ident.fit.nonsmooth import RUNS, roughness
 from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserStatus
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.rough import RUNS, roughness
 from hvdc_ident.fit.simulator import approximate
-from hvdc_ident.fit.unknown import Coordinates
 
 NAME = "trust-region"
 SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"

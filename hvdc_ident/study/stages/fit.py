@@ -187,7 +187,7 @@ def _conditions(data: Mapping[str, Any]) -> list[str]:
 
 def _note(estimate: Mapping[str, Any]) -> str:
     """The reason that goes with an estimate, and the interval of independent residuals where it is a far smaller one."""
-    from hvdc_ident.fit.intervals import WIDER
+    from hvdc_ident.fit.uncertainty import WIDER
 
     plain, ci95 = estimate.get("ci95_independent"), estimate["ci95"]
     text = estimate["reason"]

@@ -1,4 +1,4 @@
-"""A quantity to be estimated: where it starts, where it may go, how it is scaled."""
+"""A quantity to be estimated: its starting value, its bounds and its scaling."""
 
 from __future__ import annotations
 

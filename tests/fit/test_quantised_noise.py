@@ -7,9 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from hvdc_ident.fit import rounded
-from hvdc_ident.fit.rounded import TAIL
-from hvdc_ident.fit.rounding import QuantisedNoise
+from hvdc_ident.fit import likelihood
+from hvdc_ident.fit.likelihood import TAIL, QuantisedNoise
 
 MISFITS = np.array([-3.0, -1.2, -0.5, -0.3, -0.01, 0.02, 0.4, 0.5, 0.9, 2.5])
 
@@ -29,7 +28,7 @@ def test_the_logarithm_of_the_normal_distribution_has_all_digits_in_its_tail() -
     from scipy.special import log_ndtr
 
     x = np.concatenate([np.linspace(-80.0, 9.0, 400), [-1e4, TAIL, np.nextafter(TAIL, 0.0)]])
-    np.testing.assert_allclose([rounded.log_ndtr(v) for v in x], log_ndtr(x), rtol=1e-13)
+    np.testing.assert_allclose([likelihood.log_ndtr(v) for v in x], log_ndtr(x), rtol=1e-13)
 
 
 def test_noise_far_above_the_step_hides_it() -> None:

@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import binom
 
 from hvdc_ident.fit import FitParameter, Problem, fit
-from hvdc_ident.fit.rough import SLIGHT, TWO_SIDED, roughness, trend_of
+from hvdc_ident.fit.nonsmooth import SLIGHT, roughness, trend_of
+from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.identifiability.assess import identifiability
 from tests.fit.simulators import Closed, decay, parameters, recorded
 

@@ -1,4 +1,4 @@
-"""Optima of a cost that is rough: the trend over the width of the interval, not the lowest of many teeth.
+"""Optima of a nonsmooth cost: that of its trend over the width of the interval, not the lowest of many local minima.
 
 Events that pass rows, and adaptive steps of a solver that takes others at each parameter value, make the residuals jump from
 one value to the next. The cost is then a saw on a parabola: its lowest tooth lies anywhere within sqrt(2 roughness) standard
@@ -20,10 +20,8 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.simulator import approximate
-from hvdc_ident.fit.uncertainty import SINGULAR
+from hvdc_ident.fit.uncertainty import SINGULAR, TWO_SIDED
 
-TWO_SIDED = 1.92
-"""Rise of the cost at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
 FINE = 0.05
 """Share of its half-width by which an end may be off: 1.96 times 0.95 to 1.05 standard deviations cover 94 to 96 of 100."""
 SLIGHT = 2.0 * FINE

@@ -1,7 +1,7 @@
-"""The walk along one side of a profile, step by step; who takes the steps is up to the caller.
+"""One side of a profile likelihood, step by step.
 
-A side is walked in steps that adapt to the rise, each begun on the tangent of the last; the crossing is refined in the
-signed root of the rise, which is nearly a straight line. The walk asks for each descent and is sent where it ended, so
+A side is followed in steps that adapt to the rise, each begun on the tangent of the last; the crossing is refined in the
+signed root of the rise, which is nearly a straight line. The path asks for each descent and is sent where it ended, so
 that descents can be run anywhere, and kept one by one.
 """
 
@@ -18,13 +18,9 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
 from hvdc_ident.fit.objective import LONGEST, DescentResult
-from hvdc_ident.fit.unknown import Coordinates, FitParameter
-
-TWO_SIDED = 1.92
-"""Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
-ONE_SIDED = 1.353
-"""The same for the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 
 BEYOND = 10.0
 """Without bounds a walk goes on to so many times where a parabola would cross: the typical size is often a guess."""

@@ -1,19 +1,26 @@
 """Errors in the language of model validation: maximum, mean and mean absolute error before, during and after an event.
 
-The error is model - reference. Kinds of error and windows after IEC 61400-27-2; a tolerance profile has the numbers.
+The error is model - reference. Kinds of error and windows after IEC 61400-27-2; a tolerance profile, one data file each in
+`tolerances/`, has the windows around the event and the limits of the errors in them.
 """
 
 from __future__ import annotations
 
+import math
+import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
+from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.fit.assessment import Curve
-from hvdc_ident.fit.tolerance import WINDOWS, ToleranceProfile
+from hvdc_ident.immutable import FrozenMap
 
 Span = tuple[float, float]
 
@@ -110,3 +117,91 @@ def event_end(e: Experiment, reference: Array, settling: float) -> tuple[float, 
     last = float(np.mean(y[-max(1, y.size // 50) :]))
     out = np.flatnonzero(np.abs(y - last) > settling * float(np.ptp(y)))
     return (float(t[min(out[-1] + 1, t.size - 1)]) if out.size else e.event), "settling"
+
+
+WINDOWS = ("before", "during", "after")
+ERRORS = ("max", "mean", "mean_absolute")
+LENGTHS = ("before", "gap_before", "gap_start", "gap_end", "gap_cleared", "after", "settling")
+DEFAULT = "set-point-step-simulation"
+
+
+@dataclass(frozen=True)
+class ToleranceProfile:
+    """A tolerance profile.
+
+    windows: lengths in s by name (`LENGTHS`), settling as a share. limits: by window and kind of error, in `unit`.
+    version, source, notes: where the numbers come from.
+    """
+
+    name: str
+    version: str
+    title: str
+    source: str
+    notes: str
+    windows: FrozenMap[float]
+    limits: FrozenMap[FrozenMap[float]]
+    unit: str
+
+
+def shipped() -> tuple[str, ...]:
+    """The names of the profiles that come with the package."""
+    folder = files("hvdc_ident.fit") / "tolerances"
+    return tuple(sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")))
+
+
+def tolerance(name: str = DEFAULT, folder: Path | None = None) -> ToleranceProfile:
+    """The profile of a name, or of a TOML file at a path from `folder`.
+
+    Raises UnknownNameError for a name that is not shipped, StudyError for a file that is missing or wrong.
+    """
+    if not name.endswith(".toml"):
+        if name not in shipped():
+            raise unknown_name("tolerance profile", name, shipped())
+        return _profile((files("hvdc_ident.fit") / "tolerances" / f"{name}.toml").read_bytes(), f"{name}.toml")
+    path = (folder or Path()) / name
+    try:
+        return _profile(path.read_bytes(), name)
+    except OSError as e:
+        raise StudyError(
+            "the tolerance profile cannot be read",
+            where=name,
+            got=(e.strerror or str(e)).lower(),
+            hint=f"one of the shipped profiles: {', '.join(shipped())}",
+        ) from None
+
+
+def _profile(content: bytes, where: str) -> ToleranceProfile:
+    try:
+        table = tomllib.loads(content.decode("utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
+        raise StudyError("the tolerance profile is not TOML", where=where, got=str(e)) from None
+    _keys(table, ("schema", "name", "version", "title", "source", "notes", "windows", "limits"), where)
+    if table["schema"] != 1:
+        raise StudyError("a schema this version does not read", where=where, expected="1", got=str(table["schema"]))
+    windows, limits = table["windows"], table["limits"]
+    _keys(windows, LENGTHS, f"{where}, windows")
+    _keys(limits, ("unit", *WINDOWS), f"{where}, limits")
+    for name in WINDOWS:
+        _keys(limits[name], ERRORS, f"{where}, limits.{name}")
+    words = {k: str(table[k]) for k in ("name", "version", "title", "source", "notes")}
+    return ToleranceProfile(
+        **words,
+        windows=_numbers(windows, f"{where}, windows"),
+        limits=FrozenMap({n: _numbers(limits[n], f"{where}, limits.{n}") for n in WINDOWS}),
+        unit=str(limits["unit"]),
+    )
+
+
+def _keys(table: Any, wanted: tuple[str, ...], where: str) -> None:
+    if not isinstance(table, Mapping) or set(table) != set(wanted):
+        got = ", ".join(table) if isinstance(table, Mapping) else type(table).__name__
+        raise StudyError("a tolerance profile's keys are wrong", where=where, expected=", ".join(wanted), got=got)
+
+
+def _numbers(table: Mapping[str, Any], where: str) -> FrozenMap[float]:
+    for name, value in table.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value >= 0):
+            raise StudyError(
+                f"'{name}' is wrong", where=where, expected="a finite number, not negative", got=repr(value)
+            )
+    return FrozenMap({k: float(v) for k, v in table.items()})
