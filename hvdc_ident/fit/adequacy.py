@@ -18,8 +18,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtri
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.fit.multistart import MAD
-from hvdc_ident.fit.noise_model import ESTIMATED, FLOOR, GIVEN, MISFIT, from_misfit, scatter_of
+from hvdc_ident.fit.noise_model import ESTIMATED, FLOOR, GIVEN, MAD, MISFIT, from_misfit, scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap

@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from hvdc_ident.data import Array
-from hvdc_ident.errors import StudyError, unknown_name
+from hvdc_ident.errors import StudyError, require_known
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Loss:
 
     @property
     def linear(self) -> bool:
-        """Whether it is least squares."""
+        """True for least squares."""
         return self.name == "linear"
 
     def applied(self, residual: Array, jacobian: Array) -> tuple[Array, Array]:
-        """s(r), (n,), and ds/dtheta, (n, p), from r and dr/dtheta."""
+        """Return s(r), (n,), and ds/dtheta, (n, p), from r and dr/dtheta."""
         if self.linear:
             return residual, jacobian
         s = np.sign(residual) * np.sqrt(2.0 * self.rho(residual))
@@ -54,7 +54,7 @@ class Loss:
         return loss, (self.name,)  # functions do not travel to other processes, names do
 
     def efficiency(self, residual: Array) -> float:
-        """mean(psi')^2 / mean(psi^2): what information a sample has of that of least squares with this sigma.
+        """Return mean(psi')^2 / mean(psi^2), a sample's information relative to that of least squares with this sigma.
 
         The inverse is the factor of the estimates' variance (Huber 1964, doi 10.1214/aoms/1177703732).
         """
@@ -100,9 +100,8 @@ LOSSES = {
 
 
 def loss(name: str) -> Loss:
-    """The loss of that name. Raises UnknownNameError."""
-    if name not in LOSSES:
-        raise unknown_name("loss", name, LOSSES)
+    """Return the loss of that name. Raises UnknownNameError."""
+    require_known("loss", [name], LOSSES, "")
     return LOSSES[name]
 
 
@@ -123,7 +122,7 @@ class Prior:
 
 
 def prior_rows(priors: Mapping[str, Prior], names: Sequence[str], theta: Array) -> tuple[Array, Array]:
-    """Residuals (theta - mean)/std, (k,), and their derivatives, (k, p), of the unknowns that have a prior."""
+    """Return the residuals (theta - mean)/std, (k,), and their derivatives, (k, p), of the unknowns that have a prior."""
     chosen = [(i, priors[n]) for i, n in enumerate(names) if n in priors]
     residual = np.array([(theta[i] - p.mean) / p.std for i, p in chosen])
     jacobian = np.zeros((len(chosen), len(names)))
@@ -132,6 +131,9 @@ def prior_rows(priors: Mapping[str, Prior], names: Sequence[str], theta: Array) 
     return residual, jacobian
 
 
+REACH = 10.0
+"""Standard deviations beyond half a step to which the mean of g^2 is integrated."""
+POINTS = 4001
 HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 TAIL = -30.0
 """From where log Phi is by its expansion: erfc is nearly 0 there."""
@@ -143,7 +145,7 @@ FAR = 1e3
 
 @njit(cache=True, error_model="numpy")
 def log_ndtr(x):  # type: ignore[no-untyped-def]
-    """log Phi(x), to rounding also far in the lower tail (Abramowitz and Stegun 26.2.12)."""
+    """Return log Phi(x), to rounding also far in the lower tail (Abramowitz and Stegun 26.2.12)."""
     if x > 0.0:
         return math.log1p(-0.5 * math.erfc(x / math.sqrt(2.0)))
     if x > TAIL:
@@ -155,7 +157,7 @@ def log_ndtr(x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def log_chance(z, step):  # type: ignore[no-untyped-def]
-    """log(Phi(z + step/2) - Phi(z - step/2)) for z >= 0 in units of the noise, also where that is below the smallest number."""
+    """Return log(Phi(z + step/2) - Phi(z - step/2)) for z >= 0 in units of the noise, also where that is below the smallest number."""
     upper, lower = log_ndtr(0.5 * step - z), log_ndtr(-0.5 * step - z)
     d = lower - upper
     # log(1 - exp(d)) with all digits on either side
@@ -166,16 +168,16 @@ def log_chance(z, step):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def log_chances(z, step):  # type: ignore[no-untyped-def]
-    """`log_chance` of every row, (n,)."""
-    found = np.empty(z.size)
+    """Return `log_chance` of every row, (n,)."""
+    result = np.empty(z.size)
     for k in range(z.size):
-        found[k] = log_chance(z[k], step)
-    return found
+        result[k] = log_chance(z[k], step)
+    return result
 
 
 @njit(cache=True, error_model="numpy")
-def residuals(misfit, step, noise):  # type: ignore[no-untyped-def]
-    """g and dg/dz of every row, (n,), from misfit (n,), step and noise, all in the output's unit."""
+def quantised_residuals(misfit, step, noise):  # type: ignore[no-untyped-def]
+    """Return g and dg/dz of every row, (n,), from misfit (n,), step and noise, all in the output's unit."""
     g, slope = np.empty(misfit.size), np.empty(misfit.size)
     wide = step / noise
     half = 0.5 * wide
@@ -201,26 +203,21 @@ def residuals(misfit, step, noise):  # type: ignore[no-untyped-def]
     return g, slope
 
 
-REACH = 10.0
-"""Standard deviations beyond half a step to which the mean of g^2 is integrated."""
-POINTS = 4001
-
-
 @dataclass(frozen=True)
 class QuantisedNoise:
-    """QuantisedNoise to multiples of `step`, of values with white noise of standard deviation `noise`; both in the output's unit."""
+    """White noise of standard deviation `noise`, its values rounded to multiples of `step`; both in the output's unit."""
 
     step: float
     noise: float
 
     def residual(self, misfit: Array) -> tuple[Array, Array]:
-        """g, without unit, and dg/dz, per unit of the output, of measured - simulated, any shape.
+        """Return g, without unit, and dg/dz, per unit of the output, of measured - simulated, any shape.
 
         For noise much above the step g is z/sqrt(noise^2 + step^2/12); for noise much below it is 0 within half a step
         and (|z| - step/2)/noise beyond.
         """
         rows = np.asarray(misfit, dtype=float)
-        g, slope = residuals(rows.ravel(), self.step, self.noise)
+        g, slope = quantised_residuals(rows.ravel(), self.step, self.noise)
         return g.reshape(rows.shape), slope.reshape(rows.shape)
 
     @property
@@ -236,5 +233,5 @@ class QuantisedNoise:
 def _spare(step: float) -> float:
     """1 - (1/D) integral of P g^2 over all misfits, in units of the noise: each level's rounded values, over all levels."""
     z = np.linspace(0.0, 0.5 * step + REACH, POINTS)
-    g, _ = residuals(z, step, 1.0)
+    g, _ = quantised_residuals(z, step, 1.0)
     return 1.0 - 2.0 * float(np.trapezoid(np.exp(log_chances(z, step)) * g**2, z)) / step

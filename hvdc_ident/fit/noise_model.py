@@ -14,14 +14,25 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, noise_estimate, noise_floor, row_scatter
 from hvdc_ident.errors import StudyError
 
+AR = tuple[float, ...]
+
 FLOOR = 1e-6
 """No standard deviation is below this share of an output's range."""
-
 GIVEN = "given"
 ESTIMATED = "estimated before the event"
 MISFIT = "misfit"
 FEWEST_QUIET = 8
-"""Rows before an event from which the noise of a record is told."""
+"""Rows before an event from which the noise of a record is estimated."""
+MAD = 1.482602218505602
+"""Standard deviation over median absolute deviation, of a normal distribution."""
+MOST = 8
+"""The highest AR order that is tried."""
+FEWEST = 20
+"""From fewer rows no AR model of the noise is made."""
+GAP = 1.5
+"""A step over so many median steps is a gap: a new record begins."""
+UNEVEN = 0.02
+"""Steps may differ from the median by this share."""
 
 
 def from_misfit(source: str) -> bool:
@@ -29,8 +40,8 @@ def from_misfit(source: str) -> bool:
     return source.startswith(MISFIT)
 
 
-def quiet(experiments: Sequence[Experiment], output: str) -> bool:
-    """Return whether every record of an output has rows enough before its event to tell its noise by."""
+def _has_quiet_rows(experiments: Sequence[Experiment], output: str) -> bool:
+    """Return whether every record of an output has enough rows before its event to estimate its noise from."""
     measured = [e for e in experiments if output in e.outputs and e.measured is not None]
     counts = [
         0 if e.event is None else int(np.isfinite(e.measured[output][e.time < e.event]).sum())
@@ -41,22 +52,22 @@ def quiet(experiments: Sequence[Experiment], output: str) -> bool:
 
 
 def unknown_noise(experiments: Sequence[Experiment], sources: Mapping[str, str]) -> dict[str, str]:
-    """Why an output's standard deviation is that of the misfit, by output, as a clause. sources: `noise_source`.
+    """Return by output, as a clause, the reason why its standard deviation is that of the misfit. sources: `noise_source`.
 
     Data have no noise only where the model itself meets them to the last digits; a record that was measured has some, if not
     in the rows before the event.
     """
-    found = {}
+    reasons = {}
     for output, source in sources.items():
         if not from_misfit(source):
             continue
         if source != MISFIT:
-            found[output] = "the record has no noise (the model meets it to 1e-6 of its range)"
-        elif quiet(experiments, output) and not _moves_before(experiments, output):
-            found[output] = "the record shows no noise before the event"
+            reasons[output] = "the record has no noise (the model meets it to 1e-6 of its range)"
+        elif _has_quiet_rows(experiments, output) and not _moves_before(experiments, output):
+            reasons[output] = "the record shows no noise before the event"
         else:
-            found[output] = "its noise is not given, and no quiet rows before an event tell it"
-    return found
+            reasons[output] = "its noise is not given, and no quiet rows before an event tell it"
+    return reasons
 
 
 def _moves_before(experiments: Sequence[Experiment], output: str) -> bool:
@@ -76,33 +87,35 @@ def scatter_of(experiments: Sequence[Experiment], output: str) -> tuple[float, i
     In the output's unit, over all its records, each by its rows; None where one of them does not show it (`row_scatter`), or
     is a frequency response, which is as rough as the plant makes it.
     """
-    found = []
+    scatters = []
     for e in experiments:
         if output in e.outputs and e.measured is not None:
             if e.domain != "time":
                 return None
             keep = e.compared & np.isfinite(e.measured[output])
-            one = row_scatter(e.time[keep], e.measured[output][keep])
-            if one is None:
+            scatter = row_scatter(e.time[keep], e.measured[output][keep])
+            if scatter is None:
                 return None
-            found.append((one, int(keep.sum())))
-    rows = sum(n for _, n in found)
-    return (float(np.sqrt(sum(s * s * n for s, n in found) / rows)), rows) if rows else None
+            scatters.append((scatter, int(keep.sum())))
+    rows = sum(n for _, n in scatters)
+    return (float(np.sqrt(sum(s * s * n for s, n in scatters) / rows)), rows) if rows else None
 
 
-def source_text(experiments: Sequence[Experiment], output: str, floor: bool) -> str:
-    """Where an output's standard deviation comes from, in words. floor: whether the misfit is no larger than `floor_of`."""
+def source_text(experiments: Sequence[Experiment], output: str, weight: float | None) -> str:
+    """Return the source of an output's standard deviation, in words. weight: that of the misfit, in the output's unit."""
     if source_of(experiments, output) == MISFIT:
+        floor = weight is not None and weight <= floor_of(experiments, output)
         return f"{MISFIT}, at the floor of 1e-6 of the range" if floor else MISFIT
-    told = [e for e in experiments if output in e.outputs]
-    estimated = [e.name for e in told if output in e.noise_dof]
+    measured = [e for e in experiments if output in e.outputs]
+    estimated = [e.name for e in measured if output in e.noise_dof]
     if not estimated:
         return GIVEN
-    return ESTIMATED if len(estimated) == len(told) else f"{ESTIMATED} in {', '.join(estimated)}, given for the others"
+    everywhere = len(estimated) == len(measured)
+    return ESTIMATED if everywhere else f"{ESTIMATED} in {', '.join(estimated)}, given for the others"
 
 
 def range_of(experiments: Sequence[Experiment], output: str) -> float:
-    """The largest range of an output within one record, in its unit; its size, or 1, where it stands still."""
+    """Return the largest range of an output within one record, in its unit; its size, or 1, where it stands still."""
     records = [e.measured[output] for e in experiments if e.measured is not None and output in e.measured]
     records = [r[np.isfinite(r)] for r in records]
     records = [r for r in records if r.size]
@@ -112,12 +125,12 @@ def range_of(experiments: Sequence[Experiment], output: str) -> float:
 
 
 def floor_of(experiments: Sequence[Experiment], output: str) -> float:
-    """The smallest standard deviation an output may have, in its unit."""
+    """Return the smallest standard deviation an output may have, in its unit."""
     return FLOOR * range_of(experiments, output)
 
 
 def source_of(experiments: Sequence[Experiment], output: str) -> str:
-    """Where an output's standard deviation comes from: "given", or "misfit".
+    """Return the source of an output's standard deviation: "given", or "misfit".
 
     It is the misfit where a record has no noise, or where all noise given is the floor: such data are deterministic.
     """
@@ -127,12 +140,12 @@ def source_of(experiments: Sequence[Experiment], output: str) -> str:
 
 
 def sigmas(experiment: Experiment, experiments: Sequence[Experiment], weights: Mapping[str, float]) -> dict[str, float]:
-    """The standard deviation of each output of an experiment, in the output's unit, never below the floor.
+    """Return the standard deviation of each output of an experiment, in the output's unit, never below the floor.
 
     The first that is there: `weights`, the experiment's own noise where `source_of` says "given", a tenth of the range
     (a first weight, to be replaced by the misfit). Raises StudyError for a noise that is not positive.
     """
-    found: dict[str, float] = {}
+    deviations: dict[str, float] = {}
     for output in experiment.outputs:
         given = experiment.noise.get(output)
         if given is not None and not (np.isfinite(given) and given >= 0):
@@ -147,23 +160,12 @@ def sigmas(experiment: Experiment, experiments: Sequence[Experiment], weights: M
             known = given
         if known is None:
             known = 0.1 * range_of([*experiments, experiment], output)
-        found[output] = max(known, floor_of([*experiments, experiment], output))
-    return found
-
-
-AR = tuple[float, ...]
-MOST = 8
-"""The highest order that is tried."""
-FEWEST = 20
-"""From fewer rows no model of the noise is made."""
-GAP = 1.5
-"""A step over so many median steps is a gap: a new record begins."""
-UNEVEN = 0.02
-"""Steps may differ from the median by this share."""
+        deviations[output] = max(known, floor_of([*experiments, experiment], output))
+    return deviations
 
 
 def segments(time: Array, where: str) -> tuple[slice, ...]:
-    """The stretches of evenly spaced rows; a gap, or a second row at one instant, begins a new one.
+    """Return the stretches of evenly spaced rows; a gap, or a second row at one instant, begins a new one.
 
     Raises StudyError where steps within a stretch differ: an AR model from row to row would then mean nothing.
     """
@@ -172,7 +174,7 @@ def segments(time: Array, where: str) -> tuple[slice, ...]:
 
 @lru_cache(maxsize=256)
 def _segments(instants: bytes, where: str) -> tuple[slice, ...]:
-    """Those of the bytes of the instants: a fit asks for the same ones at every step."""
+    """Return the stretches from the bytes of the instants: a fit asks for the same ones at every step."""
     time = np.frombuffer(instants)
     steps = np.diff(time)
     positive = steps[steps > 0]
@@ -194,7 +196,7 @@ def _segments(instants: bytes, where: str) -> tuple[slice, ...]:
 
 
 def whitened(signal: Array, model: AR, parts: Sequence[slice] | None = None) -> Array:
-    """The signal, (m,) or (m, p), as white noise of the same size if it was AR noise of that model.
+    """Return the signal, (m,) or (m, p), as white noise of the same size if it was AR noise of that model.
 
     The first rows of every stretch by the Cholesky factor of their covariance, then the innovations: the exact
     likelihood of a stationary AR noise, up to a constant. Raises StudyError for a model that is not stationary.
@@ -217,7 +219,7 @@ def whitened(signal: Array, model: AR, parts: Sequence[slice] | None = None) -> 
 
 @lru_cache(maxsize=64)
 def _stationary(model: AR) -> tuple[Array, float]:
-    """What whitens the first rows, (p, p), and one over the innovations' share of the standard deviation."""
+    """Return the matrix that whitens the first rows, (p, p), and the inverse of the innovations' share of the std."""
     p = len(model)
     roots = np.roots([1.0, *(-c for c in model)])
     if not np.isfinite(model).all() or np.abs(roots).max(initial=0.0) >= 1.0:
@@ -242,7 +244,7 @@ def _stationary(model: AR) -> tuple[Array, float]:
 
 
 def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
-    """The AR model of the noise in several records together, its order by BIC; () where it is white.
+    """Return the AR model of the noise in several records together, its order by BIC; () where it is white.
 
     Yule-Walker on the pooled autocovariances, by Levinson's recursion: the model is stationary whatever the data.
     records: (n,) each, evenly sampled, without trend.
@@ -270,7 +272,7 @@ def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
 
 
 def before_event(experiments: Sequence[Experiment], outputs: Sequence[str]) -> Mapping[str, AR]:
-    """The noise model of each output, from the rows before the event of every experiment.
+    """Return the noise model of each output, from the rows before the event of every experiment.
 
     Raises StudyError for an output with fewer than 20 such rows, or whose record does not move there.
     """
@@ -289,7 +291,7 @@ def before_event(experiments: Sequence[Experiment], outputs: Sequence[str]) -> M
 
 
 def _quiet(experiment: Experiment, output: str) -> list[Array]:
-    """The stretches of an output before the event, without their straight line."""
+    """Return the stretches of an output before the event, without their straight line."""
     assert experiment.measured is not None
     if experiment.event is None:
         return []
@@ -298,10 +300,10 @@ def _quiet(experiment: Experiment, output: str) -> list[Array]:
     if rows.size < 3:
         return []
     t, y = experiment.time[rows], y[rows]
-    found = []
+    stretches = []
     for part in segments(t, f"experiment '{experiment.name}'"):
         if part.stop - part.start >= 3:
             x = t[part] - t[part].mean()
             level = y[part] - y[part].mean()
-            found.append(level - x * float(x @ level) / float(x @ x))
-    return found
+            stretches.append(level - x * float(x @ level) / float(x @ x))
+    return stretches

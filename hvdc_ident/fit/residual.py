@@ -23,6 +23,10 @@ from hvdc_ident.fit.noise_model import AR, GAP, segments, whitened
 from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, WithStates, observe
 from hvdc_ident.immutable import FrozenMap
 
+Band = tuple[float, float]
+
+TELLS = 1e-7
+"""Singular value, relative to the largest of columns of length 1, from which a direction counts."""
 LARGEST = 1e100
 """Residuals and derivatives beyond this leave the range of floats (1e308) once products of two are scaled and summed: no
 factorisation of them would end."""
@@ -37,10 +41,10 @@ class ResidualBlock:
     residual: (n,) misfit/(sigma profile), treated; positive where the measurement lies above the model. No unit.
     jacobian: (n, p) d residual/d unknown, so minus the treated sensitivity over sigma.
     rows: (m,) the experiment's rows that are compared.
-    taken: how many independent directions the elimination of unknown starts has taken out of the experiment's blocks,
-    told with the first of them: chance then leaves so much less in the sum of squares.
+    taken: number of independent directions that the elimination of unknown initial states has taken out of the experiment's
+    blocks, counted in the first of them: chance then leaves so much less in the sum of squares.
     slope: (m,) d residual/d misfit, per unit of the output, where the record is rounded; else None: it is 1/sigma, treated.
-    spare: what the mean square of a rounded record's residuals lacks of 1 where only noise is left.
+    spare: 1 less the mean square of a rounded record's residuals where only noise is left.
     """
 
     experiment: str
@@ -56,12 +60,12 @@ class ResidualBlock:
     profile: Array | None = None
 
     def scaled(self, values: Array) -> Array:
-        """Values of the compared rows, (m,) or (m, k) in the output's unit, in standard deviations."""
+        """Return values of the compared rows, (m,) or (m, k) in the output's unit, in standard deviations."""
         return per_deviation(values, self.sigma, self.profile)
 
     @property
     def stretches(self) -> tuple[slice, ...]:
-        """The stretches of residuals between which rows are missing; a spectrum is one."""
+        """Stretches of residuals between which rows are missing; a spectrum is one."""
         if self.residual.size != self.rows.size:
             return (slice(0, self.residual.size),)
         return stretches(self.rows)
@@ -72,40 +76,37 @@ class ResidualBlock:
         return float(np.sqrt(np.mean(self.misfit**2)))
 
     def among(self, columns: Sequence[int], width: int) -> ResidualBlock:
-        """The block with a jacobian of `width` columns, its own at these places, if any, and 0 elsewhere."""
+        """Return the block with a jacobian of `width` columns, its own at these indices, if any, and 0 elsewhere."""
         jacobian = np.zeros((self.residual.size, width))
         if columns:
             jacobian[:, columns] = self.jacobian
-        return ResidualBlock(
-            self.experiment, self.output, self.rows, self.misfit, self.sigma, self.residual, jacobian, self.taken,
-            self.slope, self.spare, self.profile,
-        )  # fmt: skip
+        return replace(self, jacobian=jacobian)
 
     @property
     def squares(self) -> Array:
-        """(n,) squared residuals, of mean 1 under noise: their sums differ from -2 log likelihood by a constant."""
+        """Squared residuals, (n,), of mean 1 under noise: their sums differ from -2 log likelihood by a constant."""
         return np.asarray(self.residual**2 + self.spare)
 
     @property
     def chi2(self) -> float:
-        """The sum of the squares."""
+        """Sum of the squares."""
         return float(self.residual @ self.residual) + self.spare * self.residual.size
 
     @property
     def score(self) -> Array:
-        """(n,) what each row says of its level, of mean 0 under noise also where the level lies askew between two steps."""
+        """Score of each row for its level, (n,), of mean 0 under noise also where the level lies askew between two steps."""
         return self.residual if self.slope is None else self.residual * self.slope * self.sigma
 
 
 def per_deviation(values: Array, sigma: float, profile: Array | None) -> Array:
-    """Values, (m,) or (m, k), over the standard deviation of each row."""
+    """Return values, (m,) or (m, k), over the standard deviation of each row."""
     if profile is None:
         return values / sigma
     return np.asarray(values / (sigma * profile).reshape(-1, *([1] * (values.ndim - 1))))
 
 
 def stretches(rows: NDArray[np.intp]) -> tuple[slice, ...]:
-    """The stretches of compared rows without a gap; a step over 1.5 median ones is one, as between instants."""
+    """Return the stretches of compared rows without a gap; a step over 1.5 median ones is one, as between instants."""
     steps = np.diff(rows)
     if not steps.size or steps.max() == 1:
         return (slice(0, rows.size),)
@@ -114,7 +115,7 @@ def stretches(rows: NDArray[np.intp]) -> tuple[slice, ...]:
 
 
 def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> NDArray[np.intp]:
-    """The rows of an output that are compared: inside the window, with a finite measurement, off the guarded instants.
+    """Return the rows of an output that are compared: inside the window, with a finite measurement, off the guarded instants.
 
     guard: s on either side of every break of an input. Raises StudyError where there are none.
     """
@@ -137,7 +138,7 @@ def compared_rows(experiment: Experiment, output: str, guard: float = 0.0) -> ND
 
 @dataclass(frozen=True, eq=False)
 class ComparedRecord:
-    """What of an output's record is compared with every run: (m,) rows, and values in its unit at instants in s.
+    """The part of an output's record that is compared with every run: (m,) rows, values in its unit, instants in s.
 
     whole: whether it is every row. profile: (m,) as in `ResidualBlock`.
     """
@@ -150,24 +151,32 @@ class ComparedRecord:
     profile: Array | None = None
 
 
-def records(experiment: Experiment, guard: float = 0.0) -> tuple[ComparedRecord, ...]:
-    """One record for each measured output. guard: as in `compared_rows`. Raises StudyError where nothing can be compared."""
-    return tuple(_record(experiment, o, guard) for o in experiment.outputs)
+def compared_records(experiment: Experiment, guard: float = 0.0) -> tuple[ComparedRecord, ...]:
+    """Return one record for each measured output.
 
-
-def _record(experiment: Experiment, output: str, guard: float) -> ComparedRecord:
-    rows = compared_rows(experiment, output, guard)
-    assert experiment.measured is not None
-    values, time = experiment.measured[output][rows], experiment.time[rows]
-    profile = experiment.noise_profile.get(output)
-    return ComparedRecord(
-        output, rows, values, time, rows.size == experiment.time.size, None if profile is None else profile[rows]
-    )
+    guard: as in `compared_rows`. Raises StudyError where an output has no row to compare.
+    """
+    records = []
+    for output in experiment.outputs:
+        rows = compared_rows(experiment, output, guard)
+        assert experiment.measured is not None
+        profile = experiment.noise_profile.get(output)
+        records.append(
+            ComparedRecord(
+                output,
+                rows,
+                experiment.measured[output][rows],
+                experiment.time[rows],
+                rows.size == experiment.time.size,
+                None if profile is None else profile[rows],
+            )
+        )
+    return tuple(records)
 
 
 @dataclass(frozen=True)
 class Treatment:
-    """What is done to misfits before they are residuals.
+    """The steps that turn misfits into residuals.
 
     whitening: the noise model by output. guard: rows this close to a break of an input are left out, s. band: Hz; given,
     residuals are the misfit's spectrum within it; None, they are samples in time. quantised_noise: by output whose record is
@@ -180,14 +189,14 @@ class Treatment:
     quantised_noise: FrozenMap[QuantisedNoise] = field(default_factory=FrozenMap)
 
     def applied(self, signal: Array, time: Array, output: str, where: str) -> Array:
-        """The signal over the compared instants, (m,) or (m, p), as a residual: (n,) or (n, p)."""
+        """Return the signal over the compared instants, (m,) or (m, p), as a residual: (n,) or (n, p)."""
         model = self.whitening.get(output, ())
         if any(model):
             signal = whitened(signal, model, segments(time, where))
         return signal if self.band is None else transformed(signal, time, self.band, where)
 
     def quantised(self, output: str) -> QuantisedNoise | None:
-        """The quantised noise of an output, where its residuals are to know of it: not in a spectrum, nor where they are whitened."""
+        """Return the quantised noise of an output; None where there is none, in a spectrum, and where residuals are whitened."""
         known = self.quantised_noise.get(output)
         return None if self.band is not None or any(self.whitening.get(output, ())) else known
 
@@ -202,13 +211,13 @@ def residual_blocks(
     nuisance: Mapping[str, float] | None = None,
     treatment: Treatment | None = None,
     derivatives: bool = True,
-    unknown_starts: Sequence[str] = (),
+    eliminated: Sequence[str] = (),
     compared: Sequence[ComparedRecord] | None = None,
 ) -> tuple[ResidualBlock, ...]:
-    """One block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
+    """Return one block for each measured output; unknowns are `sensitivities`, then the nuisances in their order.
 
     sigma: standard deviation by output, in its unit. derivatives: whether jacobians are wanted; else they have no column.
-    unknown_starts: states, given starts by the experiment, that are taken for unknown and eliminated.
+    eliminated: states, given starts by the experiment, that are taken for unknown and eliminated.
     compared: the experiment's records with the treatment's guard, where they are at hand.
     Raises SimulationError where the run fails, StudyError where nothing can be compared.
     """
@@ -216,18 +225,18 @@ def residual_blocks(
     wanted = sensitivities if derivatives else ()
     k = len(wanted)
     given = dict(nuisance or {})
-    seen = observe(
+    observed = observe(
         simulator,
         experiment,
         values,
-        (*wanted, *unknown_starts),
+        (*wanted, *eliminated),
         given,
-        derivatives=derivatives or bool(unknown_starts),
+        derivatives=derivatives or bool(eliminated),
     )
     blocks, raw = [], []
-    for record in compared if compared is not None else records(experiment, treatment.guard):
+    for record in compared if compared is not None else compared_records(experiment, treatment.guard):
         output, weight = record.output, sigma[record.output]
-        y, dy = seen.values[output], seen.gradient[output]
+        y, dy = observed.values[output], observed.gradient[output]
         misfit = record.values - (y if record.whole else y[record.rows])
         slopes = -(dy if record.whole else dy[record.rows])
         quantised = treatment.quantised(output) if record.profile is None else None
@@ -235,31 +244,28 @@ def residual_blocks(
             residual, slope = quantised.residual(misfit)
             jacobian, spare = slopes * slope[:, None], quantised.spare
         else:
-            both = np.empty((misfit.size, 1 + slopes.shape[1]))
-            both[:, 0] = per_deviation(misfit, weight, record.profile)
-            both[:, 1:] = per_deviation(slopes, weight, record.profile)
-            if not np.abs(both).max(initial=0.0) < LARGEST:
+            scaled = np.empty((misfit.size, 1 + slopes.shape[1]))
+            scaled[:, 0] = per_deviation(misfit, weight, record.profile)
+            scaled[:, 1:] = per_deviation(slopes, weight, record.profile)
+            if not np.abs(scaled).max(initial=0.0) < LARGEST:
                 raise SimulationError(
                     f"output '{output}' or its sensitivity grows beyond all bounds",
                     where=f"experiment '{experiment.name}'",
                     expected=f"below {LARGEST:g} standard deviations",
                 )
-            treated = treatment.applied(both, record.time, output, f"experiment '{experiment.name}'")
+            treated = treatment.applied(scaled, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
         block = ResidualBlock(
             experiment.name, output, record.rows, misfit, weight, residual, jacobian, slope=slope, spare=spare,
             profile=record.profile,
         )  # fmt: skip
         blocks.append(block)
-        raw.append(slopes[:, k : k + len(unknown_starts)])
-    return freed(blocks, raw, slice(k, k + len(unknown_starts))) if unknown_starts else tuple(blocks)
-
-
-Band = tuple[float, float]
+        raw.append(slopes[:, k : k + len(eliminated)])
+    return eliminate_initial_states(blocks, raw, slice(k, k + len(eliminated))) if eliminated else tuple(blocks)
 
 
 def transformed(signal: Array, time: Array, band: Band, where: str) -> Array:
-    """The real and imaginary parts of the signal's spectrum within the band, (k,) or (k, p).
+    """Return the real and imaginary parts of the signal's spectrum within the band, (k,) or (k, p).
 
     signal: (m,) or (m, p) over evenly spaced instants time, (m,) s. band: Hz, ends included. The transform is unitary:
     over the whole band the sum of squares is that of the signal, and white noise stays white.
@@ -290,51 +296,49 @@ def transformed(signal: Array, time: Array, band: Band, where: str) -> Array:
     return result
 
 
-TELLS = 1e-7
-"""Singular value, relative to the largest of columns of length 1, from which a direction counts."""
-
-
 def unknown_initial_states(simulator: Simulator, experiment: Experiment) -> tuple[str, ...]:
-    """The states whose start is neither given nor estimated; none of a simulator that does not show its states."""
+    """Return the states whose start is neither given nor estimated; none of a simulator that does not show its states."""
     known = {*experiment.starts, *experiment.nuisance}
     return tuple(n for n in simulator.states if n not in known) if isinstance(simulator, WithStates) else ()
 
 
-def centred(
+def with_steady_start(
     simulator: Simulator,
     experiment: Experiment,
     values: Mapping[str, float],
     states: Sequence[str],
     nuisance: Mapping[str, float],
 ) -> Experiment:
-    """The experiment with the steady start of these states given as numbers. Raises SimulationError where there is none."""
+    """Return the experiment with the steady start of these states given as numbers. Raises SimulationError where there is none."""
     first = experiment.time[:1]
     blank = Trajectory(first, np.zeros((1, len(states))), tuple(states), tuple("" for _ in states))
     asked = experiment.with_(time=first, measured=blank, window=None, instrument=FrozenMap())
-    own = {n: v for n, v in nuisance.items() if n != TIME_SHIFT}
-    at = observe(simulator, asked, values, (), own, derivatives=False).values
-    return experiment.with_(starts=experiment.starts | {n: float(at[n][0]) for n in states})
+    nuisance = {n: v for n, v in nuisance.items() if n != TIME_SHIFT}
+    steady = observe(simulator, asked, values, (), nuisance, derivatives=False).values
+    return experiment.with_(starts=experiment.starts | {n: float(steady[n][0]) for n in states})
 
 
-def recentred(experiment: Experiment, blocks: Sequence[ResidualBlock], states: Sequence[str]) -> Experiment:
-    """The experiment with these states' starts moved to where its residuals are least, to first order.
+def with_best_start(experiment: Experiment, blocks: Sequence[ResidualBlock], states: Sequence[str]) -> Experiment:
+    """Return the experiment with these states' starts moved to where its residuals are least, to first order.
 
     blocks: at the starts as they are; their first columns are by the starts. A start that the records hardly show is kept
     by a weak prior, as wide as its own value (or 1): it would otherwise be moved by noise, and far.
     """
-    at = np.array([experiment.starts[n] for n in states])
-    size = np.where(at != 0.0, np.abs(at), 1.0)
+    start = np.array([experiment.starts[n] for n in states])
+    size = np.where(start != 0.0, np.abs(start), 1.0)
     columns = np.vstack([b.jacobian[:, : len(states)] for b in blocks]) * size
     residual = np.concatenate([b.residual for b in blocks])
     # Stacked, not squared: of columns that are alike and large, the prior would be lost in rounding.
-    whole, wanted = np.vstack([columns, np.eye(len(states))]), np.append(-residual, np.zeros(len(states)))
-    step = np.linalg.lstsq(whole, wanted)[0]
-    moved = {n: float(v) for n, v in zip(states, at + size * step, strict=True)}
+    matrix, target = np.vstack([columns, np.eye(len(states))]), np.append(-residual, np.zeros(len(states)))
+    step = np.linalg.lstsq(matrix, target)[0]
+    moved = {n: float(v) for n, v in zip(states, start + size * step, strict=True)}
     return experiment.with_(starts=experiment.starts | moved)
 
 
-def freed(blocks: Sequence[ResidualBlock], raw: Sequence[Array], columns: slice) -> tuple[ResidualBlock, ...]:
-    """The blocks of one experiment without what the starts can make good.
+def eliminate_initial_states(
+    blocks: Sequence[ResidualBlock], raw: Sequence[Array], columns: slice
+) -> tuple[ResidualBlock, ...]:
+    """Return the blocks of one experiment without the part of their residuals that the starts can make good.
 
     columns: the jacobians' columns by the starts, which are gone from the result. raw: by block, (m, starts) the derivative
     of its misfit by them, neither weighted nor whitened.
@@ -346,15 +350,15 @@ def freed(blocks: Sequence[ResidualBlock], raw: Sequence[Array], columns: slice)
     kept = s > TELLS * s.max(initial=0.0)
     u = u[:, kept]
     residual = np.concatenate([b.residual for b in blocks])
-    rest = np.vstack([np.delete(b.jacobian, columns, axis=1) for b in blocks])
+    jacobian = np.vstack([np.delete(b.jacobian, columns, axis=1) for b in blocks])
     start = -(vt[kept].T @ ((u.T @ residual) / s[kept])) / norms
-    residual, rest = residual - u @ (u.T @ residual), rest - u @ (u.T @ rest)
-    found, at = [], 0
+    residual, jacobian = residual - u @ (u.T @ residual), jacobian - u @ (u.T @ jacobian)
+    projected, first = [], 0
     for k, (b, d) in enumerate(zip(blocks, raw, strict=True)):
-        own = slice(at, at + b.residual.size)
+        rows = slice(first, first + b.residual.size)
         taken = int(np.count_nonzero(kept)) if k == 0 else 0
-        found.append(
-            replace(b, misfit=b.misfit + d @ start, residual=residual[own], jacobian=rest[own], taken=taken)
-        )  # fmt: skip
-        at = own.stop
-    return tuple(found)
+        projected.append(
+            replace(b, misfit=b.misfit + d @ start, residual=residual[rows], jacobian=jacobian[rows], taken=taken)
+        )
+        first = rows.stop
+    return tuple(projected)

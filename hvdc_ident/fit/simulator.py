@@ -1,4 +1,4 @@
-"""What a fit needs of a model: parameters with bounds, runs with sensitivities, and nuisances of single experiments.
+"""Simulators as a fit needs them: parameters with bounds, runs with sensitivities, and nuisances of single experiments.
 
 A nuisance is unknown about one experiment alone and estimated with it. It stands by name in `Experiment.nuisance` and has
 one unknown an experiment (`unknowns`):
@@ -22,6 +22,10 @@ from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.sensitivity import SENSITIVITY_ERROR
+
+TIME_SHIFT = "time-shift"
+REACH = 0.2
+"""An offset may reach this share of its input's largest magnitude, or of 1 where that is 0."""
 
 
 class SimulationRun(Protocol):
@@ -79,14 +83,13 @@ class Approximate(Protocol):
 
     @property
     def sensitivity_error(self) -> float:
-        """The relative error of a sensitivity column, by its own account: below it a rank cannot be told."""
+        """Relative error of a sensitivity column, by its own account: below it a rank cannot be determined."""
 
 
 def sensitivity_error(simulator: Simulator) -> float:
-    """The relative error of the simulator's sensitivities; what the engine's own have where it does not say."""
+    """Return the relative error of the simulator's sensitivities; that of the engine's own where it does not say."""
     wrapped = (simulator, getattr(simulator, "model", None))  # a model that runs itself may say it for its simulator
-    own = [float(s.sensitivity_error) for s in wrapped if isinstance(s, Approximate)]
-    return max([*own, SENSITIVITY_ERROR])
+    return max([float(s.sensitivity_error) for s in wrapped if isinstance(s, Approximate)] + [SENSITIVITY_ERROR])
 
 
 def approximate(simulator: Simulator) -> bool:
@@ -95,20 +98,15 @@ def approximate(simulator: Simulator) -> bool:
 
 
 def inputs_of(simulator: Simulator, experiments: Sequence[Experiment]) -> dict[str, Input]:
-    """The simulator's inputs; of one that does not name them, those of the experiments, as they began."""
+    """Return the simulator's inputs; of one that does not name them, those of the experiments, as they began."""
     if isinstance(simulator, WithInputs):
         return dict(simulator.inputs)
-    found: dict[str, Input] = {}
+    inputs: dict[str, Input] = {}
     for e in experiments:
         for name, signal in e.inputs.items():
             if name not in e.drive:
-                found.setdefault(name, Input(float(signal.values[0])))
-    return found
-
-
-TIME_SHIFT = "time-shift"
-REACH = 0.2
-"""An offset may reach this share of its input's largest magnitude, or of 1 where that is 0."""
+                inputs.setdefault(name, Input(float(signal.values[0])))
+    return inputs
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,23 +118,23 @@ class Observation:
 
 
 def unknown_of(experiment: str, nuisance: str) -> str:
-    """The name of an experiment's nuisance among the unknowns of a fit."""
+    """Return the name of an experiment's nuisance among the unknowns of a fit."""
     return f"{experiment}:{nuisance}"
 
 
 def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[FitParameter, ...]:
-    """The unknowns of the experiment alone, in the order it names them.
+    """Return the unknowns of the experiment alone, in the order it names them.
 
     A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0, a state's start at
     the model's guess, without bounds. A parameter has the start and the bounds of the experiment's `search`, else the
     simulator's.
     Raises StudyError for a nuisance that is not known here.
     """
-    return tuple(_free(simulator, experiment, name) for name in experiment.nuisance)
+    return tuple(_nuisance_parameter(simulator, experiment, name) for name in experiment.nuisance)
 
 
 def unit_of(simulator: Simulator, nuisance: str) -> str:
-    """The unit of a nuisance."""
+    """Return the unit of a nuisance."""
     if nuisance == TIME_SHIFT:
         return "s"
     for names in (simulator.parameters, _inputs(simulator), _states(simulator)):
@@ -146,51 +144,41 @@ def unit_of(simulator: Simulator, nuisance: str) -> str:
 
 
 def _inputs(simulator: Simulator) -> Mapping[str, Input]:
-    """The inputs, of a simulator that says what they are."""
+    """Return the inputs; none of a simulator that does not name them."""
     return simulator.inputs if isinstance(simulator, WithInputs) else {}
 
 
 def _states(simulator: Simulator) -> Mapping[str, Any]:
-    """The states whose start may be given, of a simulator that says what they are."""
+    """Return the states whose start may be given; none of a simulator that does not name them."""
     return simulator.states if isinstance(simulator, WithStates) else {}
 
 
-def _free(simulator: Simulator, experiment: Experiment, nuisance: str) -> FitParameter:
-    name = unknown_of(experiment.name, nuisance)
-    if nuisance == TIME_SHIFT:
-        return _clock(experiment, name)
-    if nuisance in simulator.parameters:
+def _nuisance_parameter(simulator: Simulator, experiment: Experiment, nuisance: str) -> FitParameter:
+    name, where = unknown_of(experiment.name, nuisance), f"experiment '{experiment.name}'"
+    inputs, states = _inputs(simulator), _states(simulator)
+    if nuisance in simulator.parameters and nuisance != TIME_SHIFT:
         search = dict(zip(("start", "min", "max"), experiment.search.get(nuisance, ()), strict=False))
         return FitParameter.of(name, simulator.parameters[nuisance], **search)
-    known, states = _inputs(simulator), _states(simulator)
-    if nuisance in states:
+    if nuisance in states and nuisance != TIME_SHIFT:
         return FitParameter(name, states[nuisance].guess or 0.0, scale=1.0)
-    if nuisance in known or (known and nuisance in experiment.drive):
-        return _offset(experiment, nuisance, known, name)
-    names = ", ".join(map(repr, [TIME_SHIFT, *known, *(experiment.drive if known else ()), *states]))
-    raise StudyError(
-        f"nuisance '{nuisance}' cannot be estimated",
-        where=f"experiment '{experiment.name}'",
-        expected=f"{names} or a parameter",
-        hint="hold the input's offset with `values`, or leave the nuisance out",
-    )
-
-
-def _clock(experiment: Experiment, name: str) -> FitParameter:
-    steps = np.diff(np.unique(experiment.time))
-    if not steps.size:
+    if nuisance == TIME_SHIFT:
+        steps = np.diff(np.unique(experiment.time))
+        if not steps.size:
+            raise StudyError("a time shift needs more than one instant", where=where, got="one row")
+        reach = max(0.02 * float(np.ptp(experiment.time)), 2.0 * float(np.median(steps)))
+    elif nuisance in inputs or (inputs and nuisance in experiment.drive):
+        signal = experiment.inputs.get(nuisance)
+        level = inputs[nuisance].value if nuisance in inputs else 0.0
+        size = np.abs(signal.values).max() if signal is not None else abs(experiment.values.get(nuisance, level))
+        reach = REACH * (float(size) or 1.0)
+    else:
+        names = ", ".join(map(repr, [TIME_SHIFT, *inputs, *(experiment.drive if inputs else ()), *states]))
         raise StudyError(
-            "a time shift needs more than one instant", where=f"experiment '{experiment.name}'", got="one row"
+            f"nuisance '{nuisance}' cannot be estimated",
+            where=where,
+            expected=f"{names} or a parameter",
+            hint="hold the input's offset with `values`, or leave the nuisance out",
         )
-    reach = max(0.02 * float(np.ptp(experiment.time)), 2.0 * float(np.median(steps)))
-    return FitParameter(name, 0.0, -reach, reach, scale=reach)
-
-
-def _offset(experiment: Experiment, nuisance: str, known: Mapping[str, Input], name: str) -> FitParameter:
-    signal = experiment.inputs.get(nuisance)
-    level = known[nuisance].value if nuisance in known else 0.0
-    size = np.abs(signal.values).max() if signal is not None else abs(experiment.values.get(nuisance, level))
-    reach = REACH * (float(size) or 1.0)
     return FitParameter(name, 0.0, -reach, reach, scale=reach)
 
 
@@ -203,30 +191,32 @@ def observe(
     *,
     derivatives: bool = True,
 ) -> Observation:
-    """The measured outputs as the model gives them, with derivatives by `sensitivities` and then by each nuisance.
+    """Return the measured outputs as the model gives them, with derivatives by `sensitivities` and then by each nuisance.
 
     nuisance: value of each nuisance by its name in the experiment; "time-shift" tau in s: the recorder's clock is late
     by tau, so a row at t shows y(t - tau); before the first row the outputs stand still. derivatives: whether they are
     wanted; without them the gradient has no column.
     Raises SimulationError where the run fails, has no steady start or returns a value that is not finite.
     """
-    given = dict(nuisance or {})
-    asked, own, rows = _asked(simulator, experiment, given) if given else (experiment, {}, None)
-    wanted = (*sensitivities, *(n for n in given if n != TIME_SHIFT)) if derivatives else ()
+    nuisance = dict(nuisance or {})
+    simulated, own, rows = _with_nuisances(simulator, experiment, nuisance) if nuisance else (experiment, {}, None)
+    wanted = (*sensitivities, *(n for n in nuisance if n != TIME_SHIFT)) if derivatives else ()
     try:
-        run = simulator.simulate(asked, {**values, **own}, wanted)
+        run = simulator.simulate(simulated, {**values, **own}, wanted)
     except SteadyStateError as error:
         raise SimulationError(f"no steady start: {error}") from error
     outputs = {o: np.asarray(run.trajectory[o], dtype=float) for o in experiment.outputs}
-    none = np.empty((asked.time.size, 0))
+    none = np.empty((simulated.time.size, 0))
     gradients = {o: np.asarray(run.gradient(o), dtype=float) if wanted else none for o in experiment.outputs}
     if rows is not None:
         gradients = {o: g[rows] for o, g in gradients.items()}
         if derivatives:
-            place = len(sensitivities) + list(given).index(TIME_SHIFT)
-            before = experiment.time - given[TIME_SHIFT] < experiment.time[0]
-            slopes = {o: np.where(before, 0.0, -_slope(asked.time, y, experiment)[rows]) for o, y in outputs.items()}
-            gradients = {o: np.insert(g, place, slopes[o], axis=1) for o, g in gradients.items()}
+            column = len(sensitivities) + list(nuisance).index(TIME_SHIFT)
+            before = experiment.time - nuisance[TIME_SHIFT] < experiment.time[0]
+            slopes = {
+                o: np.where(before, 0.0, -_slope(simulated.time, y, experiment)[rows]) for o, y in outputs.items()
+            }
+            gradients = {o: np.insert(g, column, slopes[o], axis=1) for o, g in gradients.items()}
         outputs = {o: y[rows] for o, y in outputs.items()}
     for output, y in outputs.items():
         if not (np.isfinite(y).all() and (not derivatives or np.isfinite(gradients[output]).all())):
@@ -239,45 +229,36 @@ def observe(
     return Observation(outputs, gradients)
 
 
-def _asked(
-    simulator: Simulator, experiment: Experiment, given: Mapping[str, float]
+def _with_nuisances(
+    simulator: Simulator, experiment: Experiment, nuisance: Mapping[str, float]
 ) -> tuple[Experiment, dict[str, float], NDArray[np.intp] | None]:
-    """What is run for an experiment with nuisances: it, the parameters it has of its own, and with a late clock for each row
-    the place of its instant."""
-    own = {n: v for n, v in given.items() if n in simulator.parameters}
-    starts = {n: v for n, v in given.items() if n in _states(simulator) and n not in own}
-    offsets = {n: v for n, v in given.items() if n != TIME_SHIFT and n not in own and n not in starts}
-    asked, rows = experiment, None
-    if TIME_SHIFT in given:
-        grid, rows = _shifted(experiment.time, given[TIME_SHIFT])
-        asked = experiment if given[TIME_SHIFT] == 0.0 else _on(grid, experiment)
+    """Return the experiment to simulate, the parameters it has of its own, and with a late clock each row's instant.
+
+    The instants begin where the record begins. The outputs keep their names, for they decide what is computed.
+    """
+    own = {n: v for n, v in nuisance.items() if n in simulator.parameters}
+    starts = {n: v for n, v in nuisance.items() if n in _states(simulator) and n not in own}
+    offsets = {n: v for n, v in nuisance.items() if n != TIME_SHIFT and n not in own and n not in starts}
+    simulated, time, rows = experiment, experiment.time, None
+    if TIME_SHIFT in nuisance:
+        rows = np.arange(time.size)
+        if nuisance[TIME_SHIFT] != 0.0:
+            moved = time - nuisance[TIME_SHIFT]
+            later = moved > time[0]
+            rows = np.where(later, np.cumsum(later), 0)
+            grid, names = np.concatenate([time[:1], moved[later]]), experiment.outputs
+            blank = Trajectory(grid, np.zeros((grid.size, len(names))), names) if names else None
+            simulated = experiment.with_(time=grid, measured=blank)
     if starts:
-        asked = asked.with_(starts=asked.starts | starts)
+        simulated = simulated.with_(starts=simulated.starts | starts)
     if offsets:
-        asked = asked.with_(offsets=asked.offsets | {n: asked.offsets.get(n, 0.0) + v for n, v in offsets.items()})
-    return asked, own, rows
-
-
-def _shifted(time: Array, tau: float) -> tuple[Array, NDArray[np.intp]]:
-    """The instants to simulate, beginning where the record begins, and for each row the place of its instant."""
-    if tau == 0.0:
-        return time, np.arange(time.size)
-    moved = time - tau
-    later = moved > time[0]
-    rows = np.zeros(time.size, dtype=np.intp)
-    rows[later] = 1 + np.arange(int(later.sum()))
-    return np.concatenate([time[:1], moved[later]]), rows
-
-
-def _on(grid: Array, experiment: Experiment) -> Experiment:
-    """The experiment over other instants; its outputs keep their names, for they decide what is computed."""
-    names = experiment.outputs
-    blank = Trajectory(grid, np.zeros((grid.size, len(names))), names) if names else None
-    return experiment.with_(time=grid, measured=blank)
+        total = {n: simulated.offsets.get(n, 0.0) + v for n, v in offsets.items()}
+        simulated = simulated.with_(offsets=simulated.offsets | total)
+    return simulated, own, rows
 
 
 def _slope(time: Array, y: Array, experiment: Experiment) -> Array:
-    """dy/dt at every instant from its neighbours, never across a jump or a corner of an input."""
+    """Return dy/dt at every instant from its neighbours, never across a jump or a corner of an input."""
     breaks = np.concatenate([np.empty(0), *(signal.breaks for signal in experiment.inputs.values())])
     piece = np.searchsorted(np.unique(breaks), time, side="right")
     cut = (np.diff(piece) != 0) | (np.diff(time) == 0)

@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.multistart import latin_hypercube
+from hvdc_ident.fit.multistart import starting_points
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.identifiability.combinations import Combination, combinations_of, held_of
 from hvdc_ident.sensitivity import SENSITIVITY_ERROR, null_directions
@@ -53,7 +53,7 @@ def local_rank(problem: Problem, seed: int = 0, *, wide: bool = False) -> LocalR
     names = tuple(f.name for f in problem.free)
     error = sensitivity_error(problem.simulator)
     stacked, failures = [], []
-    others = latin_hypercube(problem.unknowns, (), WIDE, seed) if wide else []
+    others = starting_points(problem.unknowns, (), WIDE, seed) if wide else []
     for k, theta in enumerate([*_points(problem, seed), problem.start, *others]):
         try:
             _, jacobian = problem.residual(theta)

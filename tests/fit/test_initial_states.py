@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from hvdc_ident import Model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.residual import recentred
+from hvdc_ident.fit.residual import with_best_start
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -86,6 +86,6 @@ def test_starts_that_the_records_show_alike_and_strongly_are_shared_between_them
     jacobian = np.column_stack([column, column])
     block = SimpleNamespace(jacobian=jacobian, residual=-jacobian @ [0.5, 0.5])
     e = experiment("e", np.array([0.0, 1.0])).with_(starts=FrozenMap({"a": 1.0, "b": 1.0}))
-    moved = recentred(e, [block], ("a", "b"))
+    moved = with_best_start(e, [block], ("a", "b"))
     assert moved.starts["a"] == pytest.approx(1.5)
     assert moved.starts["b"] == pytest.approx(1.5)
