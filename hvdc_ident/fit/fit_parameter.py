@@ -51,41 +51,41 @@ class FitParameter:
 
     @classmethod
     def of(cls, name: str, parameter: Parameter, **changes: float) -> FitParameter:
-        """The unknown that a model's parameter is, given and begun at its value; with some of the fields changed."""
+        """Return the unknown that a model's parameter is, given and started at its value; with some of the fields changed."""
         value = changes.get("given", parameter.value)
         fields = {"start": value, "given": value}
         fields |= {"min": parameter.min, "max": parameter.max, "scale": parameter.scale}
         return cls(name, **{**fields, **changes})
 
     def on_bound(self, value: float) -> bool:
-        """Whether a value stands on one of the bounds."""
+        """Return whether a value lies on one of the bounds."""
         return value <= self.min or value >= self.max
 
     @property
     def log(self) -> bool:
-        """Whether the unknown is scaled by its logarithm."""
+        """True for an unknown that is scaled by its logarithm."""
         return self.min > 0 and self.max / self.min > LOG_FROM
 
     @property
     def size(self) -> float:
-        """A typical size in the unknown's unit, never 0."""
+        """Typical size in the unknown's unit, never 0."""
         return self.scale or abs(self.start) or 1.0
 
     @property
     def span(self) -> float:
-        """The range between the bounds, or the typical size where a bound is infinite; in the unknown's unit."""
+        """Range between the bounds, or the typical size where a bound is infinite; in the unknown's unit."""
         width = self.max - self.min
         return width if math.isfinite(width) else self.size
 
     @property
     def drawn(self) -> tuple[float, float]:
-        """Where starts are drawn from: the bounds; for an infinite one ten typical sizes from the start."""
+        """Range that starts are drawn from: the bounds; for an infinite one ten typical sizes from the start."""
         low = self.min if math.isfinite(self.min) else min(self.start, self.max) - 10.0 * self.size
         high = self.max if math.isfinite(self.max) else max(self.start, self.min) + 10.0 * self.size
         return low, high
 
     def draw(self, share: float) -> float:
-        """The value at a share in [0, 1] of where starts are drawn from, even in the scaled unknown.
+        """Return the value at a share in [0, 1] of the range that starts are drawn from, even in the scaled unknown.
 
         Where a bound is infinite the range is no more than a guess of the size: then even in the logarithm of the distance
         from the other bound, or from 0, from a hundredth of the typical size on; of two signs the start's own gets three
@@ -110,7 +110,7 @@ class FitParameter:
 
 
 def _even_in_log(far: float, size: float, share: float) -> float:
-    """The distance at a share in [0, 1] of the way, in the logarithm, from a hundredth of the size to `far`."""
+    """Return the distance at a share in [0, 1] of the way, in the logarithm, from a hundredth of the size to `far`."""
     near = 0.01 * size
     return near * (max(far, size) / near) ** share
 
@@ -123,36 +123,36 @@ class Coordinates:
 
     @cached_property
     def log(self) -> Array:
-        """(p,) bool: which are logarithms."""
+        """True for each coordinate that is a logarithm, (p,)."""
         return np.array([u.log for u in self.unknowns], dtype=bool)
 
     @cached_property
     def span(self) -> Array:
-        """(p,): the length of a coordinate's unit where it is not a logarithm, in the unknown's unit."""
+        """Length of a coordinate's unit, (p,), where it is not a logarithm, in the unknown's unit."""
         return np.array([u.span for u in self.unknowns])
 
     @cached_property
     def ranges(self) -> Array:
-        """(p,): how far apart the bounds are in scaled coordinates; 1 where a bound is infinite."""
+        """Distance of the bounds in scaled coordinates, (p,); 1 where a bound is infinite."""
         return np.array([np.log(u.drawn[1] / u.drawn[0]) if u.log else 1.0 for u in self.unknowns])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """(p,), (p,): the bounds in scaled coordinates."""
+        """Bounds in scaled coordinates, (p,) and (p,)."""
         low, high = self._limits
         return self.scaled(low), self.scaled(high)
 
     @cached_property
     def _limits(self) -> tuple[Array, Array]:
-        """(p,), (p,): the bounds in the unknowns' units."""
+        """Bounds in the unknowns' units, (p,) and (p,)."""
         return np.array([u.min for u in self.unknowns]), np.array([u.max for u in self.unknowns])
 
     def scaled(self, theta: Array) -> Array:
-        """x of theta, (p,)."""
+        """Return x of theta, (p,)."""
         return np.where(self.log, np.log(np.where(self.log, theta, 1.0)), theta / self.span)
 
     def unscaled(self, x: Array) -> Array:
-        """Theta of x, (p,), inside the bounds to the last digit."""
+        """Return theta of x, (p,), inside the bounds to the last digit."""
         theta = np.where(self.log, np.exp(np.where(self.log, np.minimum(x, LARGEST_LOG), 0.0)), x * self.span)
         low, high = self._limits
         x_low, x_high = self.bounds
@@ -162,5 +162,5 @@ class Coordinates:
         return np.clip(theta, low, high)
 
     def slope(self, theta: Array) -> Array:
-        """dtheta/dx, (p,)."""
+        """Return dtheta/dx, (p,)."""
         return np.where(self.log, theta, self.span)

@@ -1,4 +1,10 @@
-"""What can be minimised and profiled: a cost with its gradient and curvature, and a bounded descent on it."""
+"""Objectives, costs with gradient and curvature that can be minimised and profiled, and a bounded descent on them.
+
+The descent stands beside `optimisers.trust_region` because their tasks differ: it takes any objective, holds some unknowns
+and begins near a minimum, as each of a profile's or bootstrap's hundreds of descents does, and stops where less than a given
+fall is left. The other begins anywhere, works on the residuals' own QR factors for full precision, and tells a minimum from
+the scatter of the simulation. They share the active set of the bounds.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +38,10 @@ class Objective(Protocol):
 
     @property
     def unknowns(self) -> tuple[FitParameter, ...]:
-        """The unknowns with their bounds."""
+        """Unknowns with their bounds."""
 
     def evaluate(self, theta: Array) -> Evaluated:
-        """Cost, gradient and curvature at theta, (p,). Raises SimulationError where theta is inadmissible."""
+        """Return cost, gradient and curvature at theta, (p,). Raises SimulationError where theta is inadmissible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +52,13 @@ class LeastSquares:
     residual: Callable[[Array], tuple[Array, Array]]
 
     def evaluate(self, theta: Array) -> Evaluated:
-        """Half of r'r with the Gauss-Newton curvature J'J."""
+        """Return half of r'r with the Gauss-Newton curvature J'J."""
         r, jacobian = self.residual(theta)
         return Evaluated(0.5 * float(r @ r), jacobian.T @ r, jacobian.T @ jacobian)
 
     @classmethod
     def of(cls, problem: Problem) -> LeastSquares:
-        """The cost of a fit."""
+        """Return the cost of a fit."""
         return cls(problem.unknowns, problem.residual)
 
 
@@ -64,7 +70,7 @@ class Smooth:
     cost: Callable[[Array], tuple[float, Array]]
 
     def evaluate(self, theta: Array) -> Evaluated:
-        """The cost with a curvature made positive, from central differences of the gradient."""
+        """Return the cost with a curvature made positive, from central differences of the gradient."""
         value, gradient = self.cost(theta)
         p = theta.size
         rows = np.zeros((p, p))
@@ -78,7 +84,7 @@ class Smooth:
 
 @dataclass(frozen=True, eq=False)
 class DescentResult:
-    """Where a descent ended: theta, (p,), what the objective is there, and how many evaluations it took."""
+    """End of a descent: theta, (p,), the objective evaluated there, and the number of evaluations used."""
 
     theta: Array
     at: Evaluated
@@ -88,7 +94,7 @@ class DescentResult:
 def descend(
     objective: Objective, theta: Array, fixed: NDArray[np.bool_], *, enough: float, max_evaluations: int = 80
 ) -> DescentResult:
-    """The minimum over the unknowns that are not fixed, within their bounds, by damped Gauss-Newton steps.
+    """Return the minimum over the unknowns that are not fixed, within their bounds, by damped Gauss-Newton steps.
 
     enough: a predicted fall of the cost not worth a step. Raises SimulationError where theta is inadmissible.
     """
@@ -98,36 +104,36 @@ def descend(
     x = np.clip(space.scaled(np.asarray(theta, dtype=float)), low, high)
     x[fixed] = space.scaled(np.asarray(theta, dtype=float))[fixed]
     theta = space.unscaled(x)
-    here = objective.evaluate(theta)
+    current = objective.evaluate(theta)
     used, damping, rejected = 1, 0.0, 0
     while used < max_evaluations and rejected < 12:
         slope = space.slope(theta)
-        g, h = here.gradient * slope, here.curvature * np.outer(slope, slope)
-        back, forth = np.maximum(low - x, -longest), np.minimum(high - x, longest)
-        p = bounded_step(g, h, damping, np.where(fixed, 0.0, back), np.where(fixed, 0.0, forth))
+        g, h = current.gradient * slope, current.curvature * np.outer(slope, slope)
+        down, up = np.maximum(low - x, -longest), np.minimum(high - x, longest)
+        p = bounded_step(g, h, damping, np.where(fixed, 0.0, down), np.where(fixed, 0.0, up))
         predicted = -float(g @ p + 0.5 * p @ h @ p)
         if predicted <= enough:
             break
         used += 1
         trial = space.unscaled(x + p)
         try:
-            there = objective.evaluate(trial)
+            proposal = objective.evaluate(trial)
         except SimulationError:
-            there = None
-        if there is None or not there.cost < here.cost:
+            proposal = None
+        if proposal is None or not proposal.cost < current.cost:
             rejected += 1
             damping = max(10.0 * damping, 1e-3)
             continue
-        good = (here.cost - there.cost) / predicted
-        damping = 0.0 if good > 0.75 and damping < 1e-4 else damping * (0.2 if good > 0.25 else 4.0)
+        ratio = (current.cost - proposal.cost) / predicted
+        damping = 0.0 if ratio > 0.75 and damping < 1e-4 else damping * (0.2 if ratio > 0.25 else 4.0)
         rejected = 0
-        theta, here = trial, there
+        theta, current = trial, proposal
         x = space.scaled(theta)
-    return DescentResult(theta, here, used)
+    return DescentResult(theta, current, used)
 
 
 def promised(problem: Problem, theta: Array) -> float:
-    """How much lower the cost would be after a Gauss-Newton step within the bounds. Raises SimulationError."""
+    """Return the fall of the cost that a Gauss-Newton step within the bounds promises. Raises SimulationError."""
     space = problem.coordinates
     r, jacobian = problem.residual(theta)
     columns = jacobian * space.slope(theta)
@@ -139,21 +145,36 @@ def promised(problem: Problem, theta: Array) -> float:
 
 
 def bounded_step(g: Array, h: Array, damping: float, low: Array, high: Array) -> Array:
-    """The p in [low, high] that minimises g'p + p'(h + damping diag h)p/2, (p,); directions without curvature stay.
+    """Return the p in [low, high] that minimises g'p + p'(h + damping diag h)p/2, (p,); p is 0 where h is.
 
-    Unknowns that would leave are put on their bound one after the other, the first to leave first.
+    Least squares at each stage: directions whose curvature is rounding do not move it.
     """
     d = np.diag(h)
     scale = np.sqrt(np.where(d > 0, d, 1.0))
-    matrix = h / np.outer(scale, scale)
-    matrix = matrix + damping * np.eye(g.size)
-    target, p = -g / scale, np.zeros(g.size)
-    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (d > 0)
-    while free.any():
-        part = np.ix_(free, free)
+    matrix = h / np.outer(scale, scale) + damping * np.eye(g.size)
+    target = -g / scale
+
+    def solve(free: NDArray[np.bool_], p: Array) -> Array:
         rhs = target[free] - matrix[np.ix_(free, ~free)] @ (p * scale)[~free]
+        return np.asarray(np.linalg.lstsq(matrix[np.ix_(free, free)], rhs, rcond=1e-12)[0]) / scale[free]
+
+    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (d > 0)
+    return active_set(solve, free, low, high)
+
+
+def active_set(
+    solve: Callable[[NDArray[np.bool_], Array], Array], free: NDArray[np.bool_], low: Array, high: Array
+) -> Array:
+    """Return the step p in [low, high], (p,), whose free entries solve a quadratic problem.
+
+    solve: from the mask of the free entries and p, the minimum over the free ones with the others as they are in p.
+    free: (p,) at first; the others stay at 0. Entries that would leave are put on their bound one after the other, the first
+    to leave first.
+    """
+    p = np.zeros(low.size)
+    while free.any():
         trial = p.copy()
-        trial[free] = _solve(matrix[part], rhs) / scale[free]
+        trial[free] = solve(free, p)
         outside = (trial < low) | (trial > high)
         if not outside.any():
             return trial
@@ -162,8 +183,3 @@ def bounded_step(g: Array, h: Array, damping: float, low: Array, high: Array) ->
         first = int(np.argmin(share))
         p[first], free[first] = limit[first], False
     return p
-
-
-def _solve(matrix: Array, rhs: Array) -> Array:
-    """The least solution, blind to directions whose curvature is rounding."""
-    return np.asarray(np.linalg.lstsq(matrix, rhs, rcond=1e-12)[0])

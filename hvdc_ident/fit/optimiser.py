@@ -21,7 +21,7 @@ OptimiserStatus = Literal["converged", "max-evaluations", "stopped", "stalled", 
 
 @dataclass(frozen=True, eq=False)
 class OptimiserResult:
-    """Where a run ended.
+    """End of a run.
 
     theta: (p,) the best admissible point seen, each unknown in its unit; the start where nothing else was admissible.
     status: converged, at an optimum by the method's own criterion; max-evaluations; stopped, by another rule of the
@@ -42,7 +42,7 @@ class Optimiser(Protocol):
     """An options object that can run. Raises nothing for a simulation that fails: that is a status."""
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run from `start`, (p,) inside the bounds, ended."""
+        """Return the end of the run from `start`, (p,) inside the bounds."""
 
 
 class BudgetSpentError(Exception):
@@ -72,13 +72,13 @@ class OptimiserRun:
 
     @property
     def x0(self) -> Array:
-        """The start in scaled coordinates, (p,), inside the bounds."""
+        """Start in scaled coordinates, (p,), inside the bounds."""
         low, high = self.problem.coordinates.bounds
         return np.clip(self.problem.coordinates.scaled(self.start), low, high)
 
     @property
     def cube(self) -> Array:
-        """The start in the unit cube of where starts are drawn from, (p,)."""
+        """Start in the unit cube of where starts are drawn from, (p,)."""
         shares = []
         for u, v in zip(self.problem.unknowns, self.start, strict=True):
             low, high = u.drawn
@@ -86,18 +86,18 @@ class OptimiserRun:
         return np.clip(np.array(shares), 0.0, 1.0)
 
     def from_cube(self, shares: Array) -> Array:
-        """Theta of a point of the unit cube, (p,); outside of it the nearest point inside."""
+        """Return theta of a point of the unit cube, (p,); outside of it the nearest point inside."""
         inside = np.clip(shares, 0.0, 1.0)
         return np.array([u.draw(float(s)) for u, s in zip(self.problem.unknowns, inside, strict=True)])
 
     # --- values ---
 
     def at_cube(self, shares: Array) -> float:
-        """The cost at a point of the unit cube, simulated without sensitivities."""
+        """Return the cost at a point of the unit cube, simulated without sensitivities."""
         return self.value(self.from_cube(shares))
 
     def value(self, theta: Array) -> float:
-        """The cost at theta, or a number worse than any seen."""
+        """Return the cost at theta, or a number worse than any seen."""
         self._count()
         try:
             cost = self.problem.cost(theta)
@@ -107,26 +107,26 @@ class OptimiserRun:
         return cost
 
     def residual(self, x: Array) -> Array:
-        """The residual at scaled coordinates, (N,); not finite where the simulation fails. Raises it at the start."""
-        found = self._evaluated(x)
-        return np.full(self._rows, np.inf) if found is None else found[0]
+        """Return the residual at scaled coordinates, (N,); infinite where the simulation fails."""
+        evaluated = self._evaluated(x)
+        return np.full(self._rows, np.inf) if evaluated is None else evaluated[0]
 
     def jacobian(self, x: Array) -> Array:
-        """Its derivatives by scaled coordinates, (N, p)."""
-        found = self._evaluated(x)
-        assert found is not None
-        return found[1]
+        """Return the residual's derivatives by scaled coordinates, (N, p)."""
+        evaluated = self._evaluated(x)
+        assert evaluated is not None
+        return evaluated[1]
 
     def value_and_gradient(self, x: Array) -> tuple[float, Array]:
-        """The cost at scaled coordinates and its gradient, (p,); where the simulation fails a worse cost and 0."""
-        found = self._evaluated(x)
-        if found is None:
+        """Return the cost at scaled coordinates and its gradient, (p,); where the simulation fails a worse cost and 0."""
+        evaluated = self._evaluated(x)
+        if evaluated is None:
             return 2.0 * self._worst + 1.0, np.zeros_like(x)
-        r, jacobian = found
+        r, jacobian = evaluated
         return 0.5 * float(r @ r), jacobian.T @ r
 
     def _evaluated(self, x: Array) -> tuple[Array, Array] | None:
-        """Residual and derivatives, computed once for a point however often it is asked for."""
+        """Return residual and derivatives, computed once for a point however often it is asked for."""
         key = np.asarray(x, dtype=float).tobytes()
         if self._last is not None and self._last[0] == key:
             return self._last[1], self._last[2]
@@ -161,7 +161,7 @@ class OptimiserRun:
     # --- the end ---
 
     def ended(self, converged: bool, message: str) -> OptimiserResult:
-        """The result: the best point seen. Without any admissible point the run failed."""
+        """Return the best point seen. Without any admissible point the run failed."""
         if self.cost is None:
             return OptimiserResult(
                 self.start, None, "failed", f"no point could be simulated: {self.failure}", self.evaluations
@@ -171,22 +171,22 @@ class OptimiserRun:
         return OptimiserResult(self.best, self.cost, status, message + more, self.evaluations)
 
     def spent(self) -> OptimiserResult:
-        """The result where the evaluations were used up."""
+        """Return the result where the evaluations were used up."""
         end = self.ended(False, f"no optimum within {self.limit} evaluations")
         return end if end.status == "failed" else replace(end, status="max-evaluations")
 
     def refused(self, message: str) -> OptimiserResult:
-        """The result where the method gave up."""
+        """Return the result where the method gave up."""
         return replace(self.ended(False, message), status="failed")
 
 
 def generator(seed: int, start: Array) -> np.random.Generator:
-    """The random numbers of a run: a stream of its own for every start, the same at every repetition."""
+    """Return the random numbers of a run: a stream of its own for every start, the same at every repetition."""
     return np.random.default_rng([seed, *np.ascontiguousarray(start, dtype=float).view(np.uint32).tolist()])
 
 
 def missing(package: str, optimiser: str) -> InputError:
-    """The error where a package of the extra `optimisers` is not installed."""
+    """Return the error where a package of the extra `optimisers` is not installed."""
     return InputError(
         f"the optimiser '{optimiser}' needs the package {package}, which is not installed",
         where="fit.optimiser",

@@ -7,8 +7,9 @@ round: a step is a piece of work of its own, wherever it is done, and an executo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +26,6 @@ from hvdc_ident.fit.profile_path import (
     ProfileOptions,
     ProfilePath,
     Side,
-    Steps,
 )
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.immutable import FrozenMap
@@ -54,23 +54,23 @@ class Profile:
 
     @property
     def ci95(self) -> tuple[float | None, float | None]:
-        """The interval; an end that was not found is None."""
+        """95 % interval; an end that was not found is None."""
         return self.lower.limit, self.upper.limit
 
     @property
     def closed(self) -> bool:
-        """Whether both ends are known."""
+        """True where both ends are known."""
         return self.lower.status == "closed" and self.upper.status == "closed"
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the objective that both sides took."""
+        """Evaluations of the objective for both sides."""
         return self.lower.evaluations + self.upper.evaluations
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """Profiles around an optimum. restarts: what each better optimum found on the way was, in words."""
+    """Profiles around an optimum. restarts: each better optimum found on the way, in words."""
 
     theta: Array
     cost: float
@@ -89,7 +89,7 @@ def profiles(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Profiles:
-    """The profile of each named unknown (all) around the optimum theta, (p,), which is refined first.
+    """Return the profile of each named unknown (all) around the optimum theta, (p,), which is refined first.
 
     threshold: rise of the cost at the ends of a two-sided interval; at a bound 1.353/1.92 of it, one-sided.
     Where a profile falls below the optimum, everything begins again from there (up to three times), and `restarts`
@@ -104,11 +104,12 @@ def profiles(
         np.zeros(len(objective.unknowns), dtype=bool),
         0.1 * options.tolerance * min(rises.values(), default=TWO_SIDED),
     )
-    take = _Taken(objective, executor)
     restarts: list[str] = []
     while True:
-        best = _certain(next(take([start])))
-        walkers = {
+        [best] = _take(objective, executor, [start])
+        if isinstance(best, Failed):
+            raise SimulationError(best.what)
+        paths = {
             (name, direction): ProfilePath(
                 objective.unknowns, best, rises[name], physical or {}, options, name, direction, last=len(restarts) == 3
             )
@@ -116,12 +117,12 @@ def profiles(
             for direction in (-1.0, 1.0)
         }
         try:
-            sides = _walked(walkers, take, progress)
-        except _BetterAtError as found:
-            restarts.append(f"on the profile of {found.name} the cost fell by {found.fall:.3g} below the optimum")
-            start = replace(start, theta=found.theta)
+            sides = _follow(paths, partial(_take, objective, executor), progress)
+        except BetterFoundError as better:
+            restarts.append(f"on the profile of {better.name} the cost fell by {better.fall:.3g} below the optimum")
+            start = replace(start, theta=better.theta)
             continue
-        named = {n: _profile([(walkers[n, d], sides[n, d]) for d in (-1.0, 1.0)]) for n in wanted}
+        named = {n: _profile([(paths[n, d], sides[n, d]) for d in (-1.0, 1.0)]) for n in wanted}
         return Profiles(best.theta, best.at.cost, FrozenMap(named), tuple(restarts))
 
 
@@ -134,39 +135,42 @@ def trend_profiles(
     threshold: Mapping[str, float],
     physical: Physical,
 ) -> FrozenMap[Profile]:
-    """The profile of each named unknown as the curvature of a rough cost's trend has it, for no walk finds its crossing.
+    """Return the profile of each named unknown from the curvature of a nonsmooth cost's trend.
+
+    No path along such a cost finds the crossing of the trend.
 
     covariance: (p, p) of the estimates, before what correlated samples add, which is in the thresholds; of one on a bound
     the inverse of its curvature. gradient: (p,) of the cost, which pushes one that lies on a bound.
     """
-    found = {}
+    by_name = {}
     for name in names:
         i = [u.name for u in unknowns].index(name)
-        u, at = unknowns[i], float(optimum.theta[i])
-        bound = u.on_bound(at)
-        rise = threshold[name] * (ONE_SIDED / TWO_SIDED if bound else 1.0)
-        push = abs(float(gradient[i])) if bound else 0.0
+        unknown, value = unknowns[i], float(optimum.theta[i])
+        on_bound = unknown.on_bound(value)
+        rise = threshold[name] * (ONE_SIDED / TWO_SIDED if on_bound else 1.0)
+        push = abs(float(gradient[i])) if on_bound else 0.0
         half = covariance[i, i] * (math.sqrt(push**2 + 2.0 * rise / covariance[i, i]) - push)
-        ends = [_trend_side(u, at, side * half, physical.get(name, (False, False))) for side in (-1.0, 1.0)]
-        low, high = max(at - half, u.min), min(at + half, u.max)
-        values = np.unique(np.append(np.linspace(low, high, 9), at))
-        off = values - at
-        thetas = np.tile(optimum.theta, (values.size, 1)) + np.outer(off, covariance[:, i] / covariance[i, i])
-        rises = push * np.abs(off) + 0.5 * off**2 / covariance[i, i]
-        found[name] = Profile(name, at, ends[0], ends[1], values, rises, thetas, rise, bound)
-    return FrozenMap(found)
+        set_by_physics = physical.get(name, (False, False))
+        lower, upper = (_trend_side(unknown, value, sign * half, set_by_physics) for sign in (-1.0, 1.0))
+        low, high = max(value - half, unknown.min), min(value + half, unknown.max)
+        values = np.unique(np.append(np.linspace(low, high, 9), value))
+        distance = values - value
+        thetas = np.tile(optimum.theta, (values.size, 1)) + np.outer(distance, covariance[:, i] / covariance[i, i])
+        rises = push * np.abs(distance) + 0.5 * distance**2 / covariance[i, i]
+        by_name[name] = Profile(name, value, lower, upper, values, rises, thetas, rise, on_bound)
+    return FrozenMap(by_name)
 
 
-def _trend_side(u: FitParameter, at: float, off: float, physical: tuple[bool, bool]) -> Side:
-    """One end of the profile of a trend: off from the optimum, or the bound before it."""
-    end = u.max if off > 0 else u.min
-    if at == end:
+def _trend_side(u: FitParameter, optimum: float, distance: float, physical: tuple[bool, bool]) -> Side:
+    """Return one end of the profile of a trend: at a signed distance from the optimum, or the bound before it."""
+    bound = u.max if distance > 0 else u.min
+    if optimum == bound:
         return Side("open-at-bound", None, "the optimum lies on this bound")
-    if abs(off) < abs(end - at):
-        return Side("closed", at + off)
-    if physical[int(off > 0)]:
-        return Side("closed", end, f"ended by the physical bound {end:.4g}")
-    return Side("open-at-bound", None, f"the trend of the cost has not risen enough at the bound {end:.4g}")
+    if abs(distance) < abs(bound - optimum):
+        return Side("closed", optimum + distance)
+    if physical[int(distance > 0)]:
+        return Side("closed", bound, f"ended by the physical bound {bound:.4g}")
+    return Side("open-at-bound", None, f"the trend of the cost has not risen enough at the bound {bound:.4g}")
 
 
 @dataclass(frozen=True)
@@ -176,101 +180,65 @@ class Failed:
     what: str
 
 
-@dataclass(frozen=True, eq=False)
-class _Descend:
-    """Takes one step."""
-
-    objective: Objective
-
-    def __call__(self, step: DescentStep) -> DescentResult | Failed:
-        try:
-            return descend(self.objective, step.theta, step.fixed, enough=step.enough)
-        except SimulationError as error:
-            return Failed(error.what)
+def _descend(objective: Objective, step: DescentStep) -> DescentResult | Failed:
+    try:
+        return descend(objective, step.theta, step.fixed, enough=step.enough)
+    except SimulationError as error:
+        return Failed(error.what)
 
 
-@dataclass(frozen=True, eq=False)
-class _Taken:
-    """Takes steps in the executor, or here: what became of each, in order, as it is asked for."""
-
-    objective: Objective
-    executor: Executor | None
-
-    def __call__(self, steps: list[DescentStep]) -> Iterator[DescentResult | Failed]:
-        return mapped(self.executor, _Descend(self.objective), steps)
+def _take(
+    objective: Objective, executor: Executor | None, steps: Sequence[DescentStep]
+) -> Iterator[DescentResult | Failed]:
+    """Return the end of each step, in order, as it is asked for."""
+    return mapped(executor, partial(_descend, objective), steps)
 
 
-def _certain(end: DescentResult | Failed) -> DescentResult:
-    if isinstance(end, Failed):
-        raise SimulationError(end.what)
-    return end
-
-
-class _BetterAtError(Exception):
-    """A point on the profile of that unknown lies below the optimum. theta: (p,); fall: by how much."""
-
-    def __init__(self, name: str, found: BetterFoundError) -> None:
-        super().__init__(name)
-        self.name, self.theta, self.fall = name, found.theta, found.fall
-
-
-def _walked(walkers: Mapping[Asked, ProfilePath], take: _Taken, progress: Progress | None) -> dict[Asked, Side]:
-    """How each side ended. Raises _BetterAtError for the first side, in their order, that fell below the optimum."""
-    walks = {asked: walker.steps() for asked, walker in walkers.items()}
+def _follow(
+    paths: Mapping[Asked, ProfilePath],
+    take: Callable[[Sequence[DescentStep]], Iterator[DescentResult | Failed]],
+    progress: Progress | None,
+) -> dict[Asked, Side]:
+    """Return the end of each side. Raises BetterFoundError for the first side, in their order, below the optimum."""
+    steps = {asked: path.steps() for asked, path in paths.items()}
     sides: dict[Asked, Side] = {}
     waiting: dict[Asked, DescentStep] = {}
 
-    def go_on(asked: Asked, end: DescentResult | Failed | None) -> None:
-        """The walk goes on to its next question, or to its end."""
+    def advance(asked: Asked, end: DescentResult | Failed | None) -> None:
+        """Advance a path to its next question, or to its end. end: that of its last step; None: it has not begun."""
+        path = steps[asked]
         try:
-            waiting[asked] = _next(walks[asked], end)
+            if isinstance(end, Failed):
+                waiting[asked] = path.throw(SimulationError(end.what))
+            else:
+                waiting[asked] = next(path) if end is None else path.send(end)
         except StopIteration as ended:
             sides[asked] = ended.value
-        except BetterFoundError as better:
-            raise _BetterAtError(asked[0], better) from None
 
-    for asked in walks:
-        go_on(asked, None)
-    taken = 0
+    for asked in steps:
+        advance(asked, None)
+    count = 0
     while waiting:
-        steps, waiting = waiting, {}
-        ends = take(list(steps.values()))
-        for asked in steps:
+        asked_steps, waiting = waiting, {}
+        ends = take(list(asked_steps.values()))
+        for asked in asked_steps:
             if progress:
-                taken += 1
-                progress(len(sides), len(walks), f"profile of {asked[0]}, step {taken} of all profiles together")
-            go_on(asked, next(ends))
+                count += 1
+                progress(len(sides), len(steps), f"profile of {asked[0]}, step {count} of all profiles together")
+            advance(asked, next(ends))
     return sides
 
 
-def _next(walk: Steps[Side], end: DescentResult | Failed | None) -> DescentStep:
-    """What a walk asks for when it is told how the last step ended (None: it has not begun)."""
-    if end is None:
-        return next(walk)
-    if isinstance(end, Failed):
-        return walk.throw(SimulationError(end.what))
-    return walk.send(end)
-
-
 def _profile(sides: Sequence[tuple[ProfilePath, Side]]) -> Profile:
-    """The profile put together from its two sides and the optimum between them."""
-    (walker, below), (_, above) = sides
-    best = walker.best
-    points = [(float(walker.x0[walker.i]), best), *(point for side, _ in sides for point in side.points)]
+    """Return the profile of two sides and the optimum between them."""
+    (path, lower), (_, upper) = sides
+    best = path.best
+    points = [(float(path.x0[path.i]), best), *(point for side, _ in sides for point in side.points)]
     order = np.argsort([x for x, _ in points], kind="stable")
-    thetas = np.array([reached.theta for _, reached in points])[order]
-    costs = np.array([reached.at.cost for _, reached in points])[order]
-    return Profile(
-        walker.name,
-        float(best.theta[walker.i]),
-        below,
-        above,
-        thetas[:, walker.i],
-        costs - best.at.cost,
-        thetas,
-        walker.rise,
-        walker.on_bound,
-    )
+    thetas = np.array([end.theta for _, end in points])[order]
+    rises = np.array([end.at.cost for _, end in points])[order] - best.at.cost
+    value = float(best.theta[path.i])
+    return Profile(path.name, value, lower, upper, thetas[:, path.i], rises, thetas, path.rise, path.on_bound)
 
 
 JOINT = 2.996
@@ -290,7 +258,7 @@ class PairProfile:
 def profile_pair(
     objective: Objective, theta: Array, names: tuple[str, str], first: Array, second: Array, *, enough: float = 1e-3
 ) -> PairProfile:
-    """The cost above the optimum theta at each pair of values, the other unknowns re-fitted from the nearest point.
+    """Return the rise of the cost above the optimum theta at each pair of values, the other unknowns re-fitted from the nearest point.
 
     A value outside the bounds of the search is evaluated all the same; a point that cannot be simulated is nan.
     """
@@ -299,16 +267,16 @@ def profile_pair(
     fixed = np.isin(np.arange(len(known)), rows)
     best = descend(objective, theta, np.zeros(len(known), dtype=bool), enough=enough)
     rises = np.full((first.size, second.size), np.nan)
-    done: dict[tuple[int, int], DescentResult] = {}
+    ends: dict[tuple[int, int], DescentResult] = {}
     centre = (int(np.abs(first - best.theta[rows[0]]).argmin()), int(np.abs(second - best.theta[rows[1]]).argmin()))
     order = sorted(np.ndindex(rises.shape), key=lambda k: (max(abs(k[0] - centre[0]), abs(k[1] - centre[1])), k))
     for k in order:
-        near = min(done, key=lambda d: (d[0] - k[0]) ** 2 + (d[1] - k[1]) ** 2, default=None)
-        begin = (done[near].theta if near is not None else best.theta).copy()
-        begin[rows] = first[k[0]], second[k[1]]
+        near = min(ends, key=lambda d: (d[0] - k[0]) ** 2 + (d[1] - k[1]) ** 2, default=None)
+        start = (ends[near].theta if near is not None else best.theta).copy()
+        start[rows] = first[k[0]], second[k[1]]
         try:
-            done[k] = descend(objective, begin, fixed, enough=enough)
+            ends[k] = descend(objective, start, fixed, enough=enough)
         except SimulationError:
             continue
-        rises[k] = done[k].at.cost - best.at.cost
+        rises[k] = ends[k].at.cost - best.at.cost
     return PairProfile(names, first, second, rises)

@@ -23,7 +23,7 @@ from hvdc_ident.fit.objective import LONGEST, DescentResult
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 
 BEYOND = 10.0
-"""Without bounds a walk goes on to so many times where a parabola would cross: the typical size is often a guess."""
+"""Without bounds a path goes on to so many times where a parabola would cross: the typical size is often a guess."""
 
 SideStatus = Literal["closed", "open-at-bound", "not-found"]
 Physical = Mapping[str, tuple[bool, bool]]
@@ -51,7 +51,7 @@ class Side:
 
 @dataclass(frozen=True)
 class ProfileOptions:
-    """How profiles are walked.
+    """Options of profiles.
 
     tolerance: of the rise at a crossing, as a share of the threshold. points: at most so many a side. steps: of the
     range between the bounds a step takes at most 1/steps. reach: without bounds, at most so many typical sizes (of a
@@ -66,7 +66,7 @@ class ProfileOptions:
 
 @dataclass(frozen=True, eq=False)
 class DescentStep:
-    """A step to take: down from theta, (p,), with some unknowns fixed, (p,), to where less than `enough` is to be had."""
+    """A descent to make: from theta, (p,), with some unknowns fixed, (p,), until a predicted fall below `enough`."""
 
     theta: Array
     fixed: NDArray[np.bool_]
@@ -75,20 +75,20 @@ class DescentStep:
 
 T = TypeVar("T")
 Steps = Generator[DescentStep, DescentResult, T]
-"""Asks for descents, is sent where each ended, and comes to a T."""
+"""Asks for descents, is sent the end of each, and returns a T."""
 
 
 class BetterFoundError(Exception):
-    """A point on a profile lies below the optimum. theta: (p,); fall: by how much."""
+    """A point on the profile of `name` lies below the optimum. theta: (p,); fall: of the cost."""
 
-    def __init__(self, theta: Array, fall: float) -> None:
-        super().__init__(fall)
-        self.theta, self.fall = theta, fall
+    def __init__(self, name: str, theta: Array, fall: float) -> None:
+        super().__init__(name)
+        self.name, self.theta, self.fall = name, theta, fall
 
 
 @dataclass
 class ProfilePath:
-    """The walk of one side of one unknown's profile from one optimum. direction: -1.0 or 1.0."""
+    """One side of one unknown's profile, from one optimum. direction: -1.0 or 1.0."""
 
     unknowns: tuple[FitParameter, ...]
     best: DescentResult
@@ -114,49 +114,62 @@ class ProfilePath:
             self.reach = max(self.reach, BEYOND * self._parabola)
 
     def steps(self) -> Steps[Side]:
-        """How the side ended, once every descent asked for was answered; `points` is then what was walked, in order.
+        """Return the end of the side, once every descent asked for was answered; `points` then holds the path, in order.
 
         A SimulationError is to be thrown in where a descent failed. Raises BetterFoundError.
         """
-        direction, points = self.direction, self.points
-        end = self.high[self.i] if direction > 0 else self.low[self.i]
-        x, at, z = float(self.x0[self.i]), self.best, 0.0
+        end = self.high[self.i] if self.direction > 0 else self.low[self.i]
+        x, current, z = float(self.x0[self.i]), self.best, 0.0
         if x == end:
             return Side("open-at-bound", None, "the optimum lies on this bound")
-        step, failures = self._first_step(), 0
+        # Half the way to where a parabola would cross, in scaled coordinates.
+        step, failures = float(min(0.5 * self._parabola, self._largest(), 10.0)), 0
         goal = np.sqrt(2.0 * self.rise)
-        while len(points) < self.options.points and abs(x - self.x0[self.i]) < self.reach:
-            ahead = x + direction * min(step, self._largest())
+        while len(self.points) < self.options.points and abs(x - self.x0[self.i]) < self.reach:
+            ahead = x + self.direction * min(step, self._largest())
             ahead = float(np.clip(ahead, self.low[self.i], self.high[self.i]))
             try:
-                there = yield from self._point(at, ahead)
+                point = yield from self._point(current, ahead)
             except SimulationError as error:
                 failures += 1
                 step = abs(ahead - x) / 4.0
                 if failures > 6:
                     return self._ended("not-found", f"beyond {self._value(x):.4g} the simulation fails: {error.what}")
                 continue
-            points.append((ahead, there))
-            rise = there.at.cost - self.best.at.cost
+            self.points.append((ahead, point))
+            rise = point.at.cost - self.best.at.cost
             if rise >= self.rise:
-                crossing = yield from self._refine(x, at, ahead, there)
-                points.append(crossing)
+                crossing = yield from self._refine(x, current, ahead, point)
+                self.points.append(crossing)
                 return self._crossed(crossing[1])
             if ahead == end:
-                return self._at_end(end)
+                value = self._value(end)
+                if self.physical.get(self.name, (False, False))[int(self.direction > 0)]:
+                    return self._ended("closed", f"ended by the physical bound {value:.4g}", value)
+                return self._ended("open-at-bound", f"the cost has not risen enough at the bound {value:.4g}")
             root = np.sqrt(2.0 * max(rise, 0.0))
-            if root < z - 0.1 * goal:
-                yield from self._look_for_another(there)
+            if root < z - 0.1 * goal and not self.last:
+                # The profile falls away from the optimum: this is another basin, whose own optimum may be the better.
+                basin = yield DescentStep(point.theta, np.zeros_like(self.fixed), self._enough)
+                self._accept(basin)
             per_step = (root - z) / abs(ahead - x)
             wish = 1.02 * (goal - root) / per_step if per_step > 0 else np.inf
             growth = 4.0 if root < 0.1 * goal else 1.0 if root < z else 2.0  # downhill again: there may be a well
             step = float(np.clip(wish, 0.3 * step, growth * step))
-            x, at, z = ahead, there, root
+            x, current, z = ahead, point, root
         return self._ended("not-found", f"no crossing found up to {self._value(x):.4g}")
 
-    def _first_step(self) -> float:
-        """Half the way to where a parabola would cross, in scaled coordinates."""
-        return float(min(0.5 * self._parabola, self._largest(), 10.0))
+    @property
+    def _enough(self) -> float:
+        """Predicted fall of the cost at which a descent ends."""
+        return 0.1 * self.options.tolerance * self.rise
+
+    def _accept(self, end: DescentResult) -> None:
+        """Count the evaluations of a descent. Raises BetterFoundError where it ended below the optimum."""
+        self.evaluations += end.evaluations
+        fall = self.best.at.cost - end.at.cost
+        if fall > max(0.02, self.options.tolerance) * self.rise and not self.last:
+            raise BetterFoundError(self.name, end.theta, fall)
 
     @cached_property
     def _parabola(self) -> float:
@@ -173,7 +186,7 @@ class ProfilePath:
         return float(width / self.options.steps) if np.isfinite(width) else self.reach
 
     def _point(self, near: DescentResult, value: float) -> Steps[DescentResult]:
-        """The minimum over the others with this one at `value` (scaled), begun on the tangent from a point nearby."""
+        """Return the minimum over the others with this one at `value` (scaled), begun on the tangent from a point nearby."""
         x = self.space.scaled(near.theta)
         slope = self.space.slope(near.theta)
         h = near.at.curvature * np.outer(slope, slope)
@@ -185,61 +198,46 @@ class ProfilePath:
             longest = np.where(self.space.log[others], LONGEST, np.inf)
             moved = np.clip(-bend * (value - x[self.i]), -longest, longest)
             ahead[others] = np.clip(x[others] + moved, self.low[others], self.high[others])
-        enough = 0.1 * self.options.tolerance * self.rise
         try:
-            found = yield DescentStep(self.space.unscaled(ahead), self.fixed, enough)
+            end = yield DescentStep(self.space.unscaled(ahead), self.fixed, self._enough)
         except SimulationError:
             x[self.i] = value
-            found = yield DescentStep(self.space.unscaled(x), self.fixed, enough)
-        self.evaluations += found.evaluations
-        fall = self.best.at.cost - found.at.cost
-        if fall > max(0.02, self.options.tolerance) * self.rise and not self.last:
-            raise BetterFoundError(found.theta, fall)
-        return found
-
-    def _look_for_another(self, point: DescentResult) -> Steps[None]:
-        """Where the profile falls away from the optimum there is another basin: its own optimum may be the better."""
-        if self.last:
-            return
-        end = yield DescentStep(point.theta, np.zeros_like(self.fixed), 0.1 * self.options.tolerance * self.rise)
-        self.evaluations += end.evaluations
-        fall = self.best.at.cost - end.at.cost
-        if fall > max(0.02, self.options.tolerance) * self.rise:
-            raise BetterFoundError(end.theta, fall)
+            end = yield DescentStep(self.space.unscaled(x), self.fixed, self._enough)
+        self._accept(end)
+        return end
 
     def _refine(
-        self, x: float, at: DescentResult, ahead: float, there: DescentResult
+        self, x: float, below: DescentResult, ahead: float, above: DescentResult
     ) -> Steps[tuple[float, DescentResult]]:
-        """The crossing between a point below the threshold and one above, by false position (Illinois)."""
+        """Return the crossing between a point below the threshold and one above, by false position (Illinois)."""
         goal = np.sqrt(2.0 * self.rise)
-        kept = [self._root(at) - goal, self._root(there) - goal]
+        values = [self._root(below) - goal, self._root(above) - goal]
         for _ in range(60):
-            lowest = min((x, at), (ahead, there), key=lambda p: abs(self._rise_off(p[1])))
-            if abs(self._rise_off(lowest[1])) <= self.options.tolerance * self.rise or abs(ahead - x) <= 1e-14 * (
-                1 + abs(x)
-            ):
-                return lowest
-            share = kept[0] / (kept[0] - kept[1])
+            nearest = min((x, below), (ahead, above), key=lambda point: self._off_threshold(point[1]))
+            narrow = abs(ahead - x) <= 1e-14 * (1 + abs(x))
+            if narrow or self._off_threshold(nearest[1]) <= self.options.tolerance * self.rise:
+                return nearest
+            share = values[0] / (values[0] - values[1])
             middle = x + float(np.clip(share, 0.02, 0.98)) * (ahead - x)
             try:
-                found = yield from self._point(at if share < 0.5 else there, middle)
+                point = yield from self._point(below if share < 0.5 else above, middle)
             except SimulationError:
-                return ahead, there
-            value = self._root(found) - goal
+                return ahead, above
+            value = self._root(point) - goal
             if value < 0:
-                x, at, kept = middle, found, [value, 0.5 * kept[1]]
+                x, below, values = middle, point, [value, 0.5 * values[1]]
             else:
-                ahead, there, kept = middle, found, [0.5 * kept[0], value]
-        return ahead, there
+                ahead, above, values = middle, point, [0.5 * values[0], value]
+        return ahead, above
 
     def _root(self, point: DescentResult) -> float:
         return float(np.sqrt(2.0 * max(point.at.cost - self.best.at.cost, 0.0)))
 
-    def _rise_off(self, point: DescentResult) -> float:
-        return point.at.cost - self.best.at.cost - self.rise
+    def _off_threshold(self, point: DescentResult) -> float:
+        return abs(point.at.cost - self.best.at.cost - self.rise)
 
     def _crossed(self, point: DescentResult) -> Side:
-        """Closed; or not found, where the crossing leans on another unknown's search bound."""
+        """Return the closed side; or not found, where the crossing leans on another unknown's search bound."""
         leaning = []
         x = self.space.scaled(point.theta)
         for k, u in enumerate(self.unknowns):
@@ -254,13 +252,6 @@ class ProfilePath:
                 "not-found", f"the cost rises only because {names} cannot leave the bounds of the search"
             )
         return self._ended("closed", "", float(point.theta[self.i]))
-
-    def _at_end(self, end: float) -> Side:
-        own = self.physical.get(self.name, (False, False))[int(self.direction > 0)]
-        value = self._value(end)
-        if own:
-            return self._ended("closed", f"ended by the physical bound {value:.4g}", value)
-        return self._ended("open-at-bound", f"the cost has not risen enough at the bound {value:.4g}")
 
     def _value(self, x: float) -> float:
         full = self.x0.copy()

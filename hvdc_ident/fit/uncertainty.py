@@ -27,6 +27,8 @@ TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
 ONE_SIDED = 1.353
 """The same for the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+WIDER = 2.0
+"""From this ratio of an interval to that of independent residuals on, the difference is said in words."""
 SINGULAR = 1e-7
 """Singular values of the normalised columns below this share of the largest are the sensitivities' own error."""
 UNSEEN = 1e-9
@@ -38,7 +40,7 @@ FEWEST_ROWS = 4
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What the curvature of the cost says about p unknowns, each in its unit.
+    """Covariance of p unknowns from the curvature of the cost, each in its unit.
 
     raw: (p, p) inverse of J'J, as if the residuals were independent; corrected: the same for AR(1) residuals.
     Rows of unknowns in `reasons` mean nothing. singular: whether only combinations of some are determined.
@@ -61,14 +63,14 @@ class Uncertainty:
     excess: float = 1.0
 
     def std(self, name: str, *, raw: bool = False) -> float | None:
-        """Standard deviation in the unknown's unit; None where there is a reason against it."""
+        """Return the standard deviation in the unknown's unit; None where there is a reason against it."""
         if name in self.reasons:
             return None
         i = self.names.index(name)
         return float(np.sqrt((self.raw if raw else self.corrected)[i, i]))
 
     def widened(self, factor: float) -> Uncertainty:
-        """The same with the corrected variances multiplied; what the noise was then comes from the residuals."""
+        """Return the uncertainty with the corrected variances multiplied; the noise is then known from the residuals alone."""
         if factor == 1.0:
             return self
         dof = max(1.0, sum(self.effective.values()) - len(self.names))
@@ -77,21 +79,21 @@ class Uncertainty:
         return replace(self, corrected=corrected, dof=min(self.dof, dof), dof_independent=alone, excess=factor)
 
     def on_trend(self, trend: Trend | None, names: Sequence[str]) -> Uncertainty:
-        """The same with what the roughness of the cost adds. trend: None where there is none; names: of its unknowns."""
+        """Return the uncertainty with the roughness of the cost added. trend: None where there is none; names: of its unknowns."""
         if trend is None:
             return self
         places = [list(names).index(n) for n in self.names]
         return replace(self, raw=trend.widened(self.raw, places), corrected=trend.widened(self.corrected, places))
 
     def correlation(self) -> dict[str, dict[str, float]]:
-        """Correlation of the estimates between those that have a standard deviation."""
+        """Return the correlation of the estimates between those that have a standard deviation."""
         known = [i for i, n in enumerate(self.names) if n not in self.reasons]
         d = np.sqrt(np.diag(self.corrected))
         return {self.names[i]: {self.names[j]: float(self.corrected[i, j] / d[i] / d[j]) for j in known} for i in known}
 
 
 def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
-    """The AR(1) coefficient of several records together, 0 where it is not significant (5 %, one-sided) or negative.
+    """Return the AR(1) coefficient of several records together, 0 where it is not significant (5 %, one-sided) or negative.
 
     unknowns: how many parameters were fitted to them; a fit lowers the coefficient by about (k + (k + 2) rho)/n
     (Marriott and Pope 1954, for k = 1 and 2), which is added back.
@@ -114,7 +116,7 @@ def uncertainty(
     prior: Array | None = None,
     noise_dof: float = np.inf,
 ) -> Uncertainty:
-    """What the blocks say about the unknowns whose columns they have, and the priors beside them.
+    """Return the uncertainty of the unknowns whose columns the blocks have, with the priors' information.
 
     prior: (k, p) derivatives of the priors' residuals, which are independent and of standard deviation 1.
     noise_dof: independent samples behind a given noise that was estimated: the intervals are then Student's (one
@@ -162,7 +164,7 @@ def uncertainty(
 
 
 def _inverse(normalised: Array, seen: Array) -> tuple[Array, Array]:
-    """The inverse of J'J, (p, p), over the directions that are determined, and a sparse basis (k, p) of the others."""
+    """Return the inverse of J'J, (p, p), over the directions that are determined, and a sparse basis (k, p) of the others."""
     p = seen.size
     inverse, null = np.zeros((p, p)), np.zeros((0, p))
     columns = np.flatnonzero(seen)
@@ -177,7 +179,7 @@ def _inverse(normalised: Array, seen: Array) -> tuple[Array, Array]:
 
 
 def _reduced(rows: Array) -> Array:
-    """The same row space in reduced echelon form, so that each row names as few unknowns as possible."""
+    """Return a basis of the row space in reduced echelon form, so that each row names as few unknowns as possible."""
     rows = rows.copy()
     for i in range(rows.shape[0]):
         pivot = int(np.argmax(np.abs(rows[i])))
@@ -188,7 +190,7 @@ def _reduced(rows: Array) -> Array:
 
 
 def _samples(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float], dict[str, float]]:
-    """AR(1) coefficient and effective number of samples by output."""
+    """Return the AR(1) coefficient and the effective number of samples by output."""
     total = sum(b.residual.size for b in blocks)
     rho, effective = {}, {}
     for output in dict.fromkeys(b.output for b in blocks):
@@ -200,7 +202,7 @@ def _samples(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float],
 
 
 def score_covariance(jacobian: Array, rho: float) -> Array:
-    """J'RJ with R_ij = rho^|i-j|, (p, p)."""
+    """Return J'RJ with R_ij = rho^|i-j|, (p, p)."""
     if rho == 0.0:
         return jacobian.T @ jacobian
     before = np.zeros_like(jacobian)
@@ -211,7 +213,7 @@ def score_covariance(jacobian: Array, rho: float) -> Array:
 
 
 def _reasons(names: Sequence[str], unseen: Array, null: Array, *, too_few: bool) -> FrozenMap[str]:
-    """Why an unknown has no standard deviation, by name."""
+    """Return by name the reason why an unknown has no standard deviation."""
     if too_few:
         return FrozenMap(dict.fromkeys(names, "not more rows than unknowns: the misfit says nothing about the noise"))
     reasons = {n: "no compared output depends on it here" for n, u in zip(names, unseen, strict=True) if u}
@@ -226,7 +228,7 @@ def _reasons(names: Sequence[str], unseen: Array, null: Array, *, too_few: bool)
 def estimates_of(
     problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], inner: Uncertainty, everything: Uncertainty
 ) -> dict[str, Estimate]:
-    """The estimate of every unknown by name.
+    """Return the estimate of every unknown by name.
 
     inner: about the unknowns inside their bounds, the others held there; everything: about all of them.
     An unknown inside gets value, std and the t interval, as far as the parameter may go by its nature; the only one on a
@@ -239,30 +241,22 @@ def estimates_of(
     bound = [u.name for u, v in zip(problem.unknowns, theta, strict=True) if not u.min < v < u.max]
     parameters = problem.simulator.parameters
     nuisances = {unknown_of(e.name, n): n for e in problem.fitted_experiments for n in e.nuisance}
-    found = {}
+    estimates = {}
     for unknown, value, slope in zip(problem.unknowns, theta, gradient, strict=True):
         name = unknown.name
         if name not in bound:
-            own = parameters.get(name)
-            limits = (own.min, own.max) if own is not None else (-math.inf, math.inf)
+            parameter = parameters.get(name)
+            limits = (-math.inf, math.inf) if parameter is None else (parameter.min, parameter.max)
             estimate = _inside(unknown, float(value), inner, limits)
         else:
-            estimate = _on_bound(unknown, float(value), float(slope), everything, alone=len(bound) == 1)
+            estimate = _at_bound(unknown, float(value), float(slope), everything, alone=len(bound) == 1)
         unit = unit_of(problem.simulator, nuisances[name]) if name in nuisances else parameters[name].unit
-        found[name] = _with(estimate, unit, problem.conditional_on.get(name, ()))
-    return found
-
-
-def _with(e: Estimate, unit: str, conditional_on: tuple[str, ...]) -> Estimate:
-    return replace(e, unit=unit, conditional_on=tuple(conditional_on))
-
-
-WIDER = 2.0
-"""From this ratio of an interval to that of independent residuals on, the difference is told in words."""
+        estimates[name] = replace(estimate, unit=unit, conditional_on=tuple(problem.conditional_on.get(name, ())))
+    return estimates
 
 
 def _inside(unknown: FitParameter, value: float, known: Uncertainty, limits: tuple[float, float]) -> Estimate:
-    """Value, std and t interval, which ends where the parameter does; a reason where it is wider than the bounds.
+    """Return value, std and t interval, which ends where the parameter does; a reason where it is wider than the bounds.
 
     limits: what the parameter may be by its nature, in its unit. A parameter whose bounds admit no negative value has none.
     """
@@ -279,9 +273,11 @@ def _inside(unknown: FitParameter, value: float, known: Uncertainty, limits: tup
     width = unknown.max - unknown.min
     reasons = ["the interval is wider than the bounds"] if math.isfinite(width) and 2.0 * half > width else []
     if half > WIDER * plain > 0:
+        worth = f"{sum(known.effective.values()):.3g}"
         reasons.append(
             f"the residuals are correlated, so that {known.rows} rows are worth no more than "
-            f"{_counted(sum(known.effective.values()))} and the interval is {half / plain:.2g} times as wide as if they were independent"
+            f"{worth} independent {'row' if worth == '1' else 'rows'} and the interval is {half / plain:.2g} times as wide "
+            "as if they were independent"
         )
     independent = within(plain) if any(known.rho.values()) else None
     return Estimate(
@@ -289,14 +285,8 @@ def _inside(unknown: FitParameter, value: float, known: Uncertainty, limits: tup
     )
 
 
-def _counted(samples: float) -> str:
-    """So many independent rows, in words."""
-    number = f"{samples:.3g}"
-    return f"{number} independent {'row' if number == '1' else 'rows'}"
-
-
-def _on_bound(unknown: FitParameter, value: float, slope: float, known: Uncertainty, *, alone: bool) -> Estimate:
-    """The bound with its one-sided 95 % limit, where the profile's cost, to second order, has risen by 1.353."""
+def _at_bound(unknown: FitParameter, value: float, slope: float, known: Uncertainty, *, alone: bool) -> Estimate:
+    """Return the bound with its one-sided 95 % limit, where the profile's cost, to second order, has risen by 1.353."""
     if not alone:
         return Estimate(value, reason="on a bound together with others: their limits are not independent")
     std, raw = known.std(unknown.name), known.std(unknown.name, raw=True)

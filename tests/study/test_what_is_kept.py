@@ -20,12 +20,14 @@ from hvdc_ident.discrepancy.refits.refit import Refit
 from hvdc_ident.fit.bootstrap import _refit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.partial_fits import _alone
+from hvdc_ident.fit.profile import _descend
 from hvdc_ident.immutable import FrozenMap
 
 BOUND = {
     "refit": _refit,  # partial(_refit, ...)
     "one": _alone,  # partial(_alone, ...)
     "partial(method.run, problem)": Optimiser.run,
+    "partial(_descend, objective)": _descend,
 }
 """Calls whose function is no name of its module: what is bound in them."""
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.integer, np.floating)

@@ -12,44 +12,41 @@ import pkgutil
 from dataclasses import fields
 from typing import Any
 
-from hvdc_ident.errors import unknown_name
+from hvdc_ident.errors import require_known
 from hvdc_ident.fit.optimiser import Optimiser, missing
 
 
 def catalogue() -> dict[str, Any]:
-    """The modules of this folder by the NAME each one gives itself."""
+    """Return the modules of this folder by the NAME each one gives itself."""
     names = sorted(m.name for m in pkgutil.iter_modules(__path__))
     modules = [importlib.import_module(f"{__name__}.{n}") for n in names]
     return {m.NAME: m for m in modules}
 
 
+def _module(name: str) -> Any:
+    known = catalogue()
+    require_known("optimiser", [name], known, "")
+    return known[name]
+
+
 def optimiser(name: str, seed: int = 0) -> Optimiser:
-    """The named optimiser with its default options; seed: of its random numbers, if it has any.
+    """Return the named optimiser with its default options; seed: of its random numbers, if it has any.
 
     Raises UnknownNameError.
     """
-    known = catalogue()
-    if name not in known:
-        raise unknown_name("optimiser", name, known)
-    options = known[name].OPTIMISER
+    options = _module(name).OPTIMISER
     seeded = any(f.name == "seed" for f in fields(options))
-    found: Optimiser = options(seed=seed) if seeded else options()
-    return found
+    named: Optimiser = options(seed=seed) if seeded else options()
+    return named
 
 
 def need(name: str) -> None:
-    """Nothing. Raises UnknownNameError for an unknown optimiser, InputError where its package is not installed."""
-    known = catalogue()
-    if name not in known:
-        raise unknown_name("optimiser", name, known)
-    package = getattr(known[name], "PACKAGE", None)
+    """Raise UnknownNameError for an unknown optimiser, InputError where its package is not installed."""
+    package = getattr(_module(name), "PACKAGE", None)
     if package is not None and importlib.util.find_spec(package) is None:
         raise missing(package, name)
 
 
 def is_global(name: str) -> bool:
-    """Whether the named optimiser searches the whole range by itself. Raises UnknownNameError."""
-    known = catalogue()
-    if name not in known:
-        raise unknown_name("optimiser", name, known)
-    return bool(getattr(known[name], "GLOBAL", False))
+    """Return whether the named optimiser searches the whole range by itself. Raises UnknownNameError."""
+    return bool(getattr(_module(name), "GLOBAL", False))

@@ -19,7 +19,7 @@ SUMMARY = "evolution strategy with covariance adaptation (package cma, an extra)
 GLOBAL = True
 PACKAGE = "cma"
 OPTIMA = ("tolfun", "tolx", "tolfunhist", "tolflatfitness", "ftarget")
-"""The package's words for an end that is an optimum; others (stagnation, a flat cost) are not."""
+"""Names the package gives an end that is an optimum; others (stagnation, a flat cost) are not."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +33,17 @@ class CmaEs:
     seed: int = 0
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run ended. Raises InputError where the package is not installed."""
+        """Return the end of the run. Raises InputError where the package is not installed."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of optional parts of the package that are not installed
                 import cma
         except ImportError:
             raise missing(PACKAGE, NAME) from None
-        search = OptimiserRun(problem, start, self.max_evaluations)
-        random = generator(self.seed, search.start)
-        p = search.start.size
-        middle = np.append(search.cube, 0.5) if p == 1 else search.cube  # one dimension is not supported there
+        run = OptimiserRun(problem, start, self.max_evaluations)
+        random = generator(self.seed, run.start)
+        p = run.start.size
+        middle = np.append(run.cube, 0.5) if p == 1 else run.cube  # one dimension is not supported there
         options = {
             "bounds": [0.0, 1.0],
             "seed": np.nan,
@@ -56,18 +56,18 @@ class CmaEs:
             "maxfevals": 10 * self.max_evaluations,
         }
         try:
-            search.value(search.start)
+            run.value(run.start)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a start on a bound is moved inside: that is what is wanted
                 strategy = cma.CMAEvolutionStrategy(np.clip(middle, 1e-6, 1 - 1e-6), self.size, options)
                 while not strategy.stop():
                     points = strategy.ask()
-                    strategy.tell(points, [search.at_cube(np.asarray(x)[:p]) for x in points])
+                    strategy.tell(points, [run.at_cube(np.asarray(x)[:p]) for x in points])
                 reasons = strategy.stop()
         except BudgetSpentError:
-            return search.spent()
-        words = ", ".join(f"{k} {v}" for k, v in reasons.items())
-        return search.ended(any(k in OPTIMA for k in reasons), f"ended by {words}")
+            return run.spent()
+        stopped_by = ", ".join(f"{k} {v}" for k, v in reasons.items())
+        return run.ended(any(k in OPTIMA for k in reasons), f"ended by {stopped_by}")
 
 
 OPTIMISER = CmaEs

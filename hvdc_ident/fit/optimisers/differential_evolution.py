@@ -27,25 +27,25 @@ class DifferentialEvolution:
     seed: int = 0
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run ended; the start is one member of the first population."""
+        """Return the end of the run; the start is one member of the first population."""
         from scipy.optimize import differential_evolution
 
-        search = OptimiserRun(problem, start, self.max_evaluations)
+        run = OptimiserRun(problem, start, self.max_evaluations)
         try:
             end = differential_evolution(
-                search.at_cube,
-                [(0.0, 1.0)] * search.start.size,
-                x0=search.cube,
+                run.at_cube,
+                [(0.0, 1.0)] * run.start.size,
+                x0=run.cube,
                 popsize=self.population,
                 atol=self.cost,
                 tol=self.spread,
                 maxiter=self.max_evaluations,
                 polish=False,
-                rng=generator(self.seed, search.start),
+                rng=generator(self.seed, run.start),
             )
         except BudgetSpentError:
-            return search.spent()
-        return search.ended(bool(end.success), f"the population has collapsed after {end.nit} generations")
+            return run.spent()
+        return run.ended(bool(end.success), f"the population has collapsed after {end.nit} generations")
 
 
 OPTIMISER = DifferentialEvolution

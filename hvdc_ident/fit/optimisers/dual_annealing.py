@@ -33,39 +33,39 @@ class DualAnnealing:
     seed: int = 0
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run ended."""
+        """Return the end of the run."""
         from scipy.optimize import dual_annealing
 
-        search = OptimiserRun(problem, start, self.max_evaluations)
+        run = OptimiserRun(problem, start, self.max_evaluations)
         space = problem.coordinates
         ends = np.array([u.drawn for u in problem.unknowns])
         box = list(zip(space.scaled(ends[:, 0]), space.scaled(ends[:, 1]), strict=True))
         local: dict[str, Any] = {
             "method": "L-BFGS-B",
-            "jac": lambda x: search.value_and_gradient(x)[1],
+            "jac": lambda x: run.value_and_gradient(x)[1],
             "bounds": box,
             "options": {"ftol": 1e-14, "gtol": 1e-10},
         }
         try:
             dual_annealing(
-                lambda x: search.value_and_gradient(x)[0],
+                lambda x: run.value_and_gradient(x)[0],
                 box,
-                x0=np.clip(search.x0, [b[0] for b in box], [b[1] for b in box]),
+                x0=np.clip(run.x0, [b[0] for b in box], [b[1] for b in box]),
                 maxiter=self.iterations,
                 maxfun=10 * self.max_evaluations,
                 minimizer_kwargs=local,
-                rng=generator(self.seed, search.start),
+                rng=generator(self.seed, run.start),
             )
         except BudgetSpentError:
-            return search.spent()
-        if search.cost is None:
-            return search.ended(False, "")
-        left = promised(problem, search.best)
-        good = left <= self.stationary * search.cost + 1e-9
-        stands = (
-            "the best point is an optimum" if good else f"the best point is no optimum: {left:.3g} is still to gain"
+            return run.spent()
+        if run.cost is None:
+            return run.ended(False, "")
+        promise = promised(problem, run.best)
+        good = promise <= self.stationary * run.cost + 1e-9
+        remark = (
+            "the best point is an optimum" if good else f"the best point is no optimum: {promise:.3g} is still to gain"
         )
-        return search.ended(good, f"{self.iterations} iterations done; {stands}")
+        return run.ended(good, f"{self.iterations} iterations done; {remark}")
 
 
 OPTIMISER = DualAnnealing

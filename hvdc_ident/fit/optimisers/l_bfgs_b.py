@@ -29,24 +29,24 @@ class LBfgsB:
     memory: int = 20
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run from `start` ended."""
+        """Return the end of the run from `start`."""
         from scipy.optimize import minimize
 
-        search = OptimiserRun(problem, start, self.max_evaluations)
+        run = OptimiserRun(problem, start, self.max_evaluations)
         low, high = problem.coordinates.bounds
         try:
-            first, _ = search.value_and_gradient(search.x0)
-            if search.cost is None:
-                return search.ended(False, "")
+            first, _ = run.value_and_gradient(run.x0)
+            if run.cost is None:
+                return run.ended(False, "")
             scale = 1.0 / max(first, 1e-300)  # the method's tolerances are absolute ones
 
             def scaled(x: Array) -> tuple[float, Array]:
-                value, gradient = search.value_and_gradient(x)
+                value, gradient = run.value_and_gradient(x)
                 return scale * value, scale * gradient
 
             end = minimize(
                 scaled,
-                search.x0,
+                run.x0,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=list(zip(low, high, strict=True)),
@@ -59,15 +59,12 @@ class LBfgsB:
                 },
             )
         except BudgetSpentError:
-            return search.spent()
-        if not end.success and not _flat(end.x, end.jac, low, high):
-            return search.refused(str(end.message))
-        return search.ended(True, str(end.message))
-
-
-def _flat(x: Array, gradient: Array, low: Array, high: Array) -> bool:
-    """Whether no way down is left inside the bounds but what rounding makes of one: the line search then ends as abnormal."""
-    return bool(np.abs(np.clip(x - gradient, low, high) - x).max() < FLAT)
+            return run.spent()
+        # A slope that is rounding inside the bounds: the line search then ends as abnormal, at an optimum.
+        flat = np.abs(np.clip(end.x - end.jac, low, high) - end.x).max() < FLAT
+        if not end.success and not flat:
+            return run.refused(str(end.message))
+        return run.ended(True, str(end.message))
 
 
 OPTIMISER = LBfgsB

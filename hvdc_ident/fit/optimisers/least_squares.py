@@ -27,20 +27,20 @@ class LeastSquaresTrf:
     gradient: float = 1e-10
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run from `start` ended."""
+        """Return the end of the run from `start`."""
         from scipy.optimize import least_squares
 
-        search = OptimiserRun(problem, start, self.max_evaluations)
+        run = OptimiserRun(problem, start, self.max_evaluations)
         low, high = problem.coordinates.bounds
-        inside = np.clip(search.x0, low + 1e-9 * (1.0 + np.abs(low)), high - 1e-9 * (1.0 + np.abs(high)))
+        inside = np.clip(run.x0, low + 1e-9 * (1.0 + np.abs(low)), high - 1e-9 * (1.0 + np.abs(high)))
         try:
-            search.value_and_gradient(inside)
-            if search.cost is None:
-                return search.ended(False, "")
+            run.value_and_gradient(inside)
+            if run.cost is None:
+                return run.ended(False, "")
             end = least_squares(
-                search.residual,
+                run.residual,
                 inside,
-                search.jacobian,
+                run.jacobian,
                 (low, high),
                 method="trf",
                 x_scale="jac",
@@ -49,8 +49,8 @@ class LeastSquaresTrf:
                 gtol=self.gradient,
             )
         except BudgetSpentError:
-            return search.spent()
-        return search.ended(end.status > 0, end.message.replace("`", "").rstrip("."))
+            return run.spent()
+        return run.ended(end.status > 0, end.message.replace("`", "").rstrip("."))
 
 
 OPTIMISER = LeastSquaresTrf

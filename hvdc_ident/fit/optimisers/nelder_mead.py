@@ -31,31 +31,31 @@ class NelderMead:
     restarts: int = 5
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run from `start` ended."""
-        search = OptimiserRun(problem, start, self.max_evaluations)
+        """Return the end of the run from `start`."""
+        run = OptimiserRun(problem, start, self.max_evaluations)
         try:
-            search.value(search.start)
-            if search.cost is None:
-                return search.ended(False, "")
-            x = search.cube
+            run.value(run.start)
+            if run.cost is None:
+                return run.ended(False, "")
+            x = run.cube
             for k in range(1 + self.restarts):
-                before = search.cost
-                x = self._descent(search, x, self.size * 0.5**k)
-                assert search.cost is not None
-                if k and before - search.cost <= 1e-9 * before + self.cost:
-                    return search.ended(True, f"the simplex collapsed, and so did a fresh one ({k + 1} in all)")
+                before = run.cost
+                x = self._descent(run, x, self.size * 0.5**k)
+                assert run.cost is not None
+                if k and before - run.cost <= 1e-9 * before + self.cost:
+                    return run.ended(True, f"the simplex collapsed, and so did a fresh one ({k + 1} in all)")
         except BudgetSpentError:
-            return search.spent()
-        return search.ended(False, f"fresh simplexes still improve after {self.restarts} restarts")
+            return run.spent()
+        return run.ended(False, f"fresh simplexes still improve after {self.restarts} restarts")
 
-    def _descent(self, search: OptimiserRun, x: Array, size: float) -> Array:
-        """Where a simplex from x ends, in the unit cube."""
+    def _descent(self, run: OptimiserRun, x: Array, size: float) -> Array:
+        """Return where a simplex from x ends, in the unit cube."""
         from scipy.optimize import minimize
 
         steps = np.where(x + size <= 1.0, size, -size)
         simplex = np.vstack([x, x + np.diag(steps)])
         end = minimize(
-            search.at_cube,
+            run.at_cube,
             x,
             method="Nelder-Mead",
             bounds=[(0.0, 1.0)] * x.size,

@@ -42,13 +42,13 @@ class ParticleSwarm:
     seed: int = 0
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run ended; one particle begins at the start. Raises InputError where the package is missing."""
-        search = OptimiserRun(problem, start, self.max_evaluations)
-        p = search.start.size
-        random = generator(self.seed, search.start)
-        first = np.vstack([search.cube, random.random((self.particles - 1, p))])
+        """Return the end of the run; one particle begins at the start. Raises InputError where the package is missing."""
+        run = OptimiserRun(problem, start, self.max_evaluations)
+        p = run.start.size
+        random = generator(self.seed, run.start)
+        first = np.vstack([run.cube, random.random((self.particles - 1, p))])
         iterations = self.max_evaluations // self.particles
-        with _apart(int(random.integers(2**31))):
+        with _isolated(int(random.integers(2**31))):
             try:
                 import pyswarms
             except ImportError:
@@ -64,18 +64,18 @@ class ParticleSwarm:
                 init_pos=first,
             )
             try:
-                swarm.optimize(lambda points: np.array([search.at_cube(x) for x in points]), iterations, verbose=False)
+                swarm.optimize(lambda points: np.array([run.at_cube(x) for x in points]), iterations, verbose=False)
             except BudgetSpentError:
-                return search.spent()
+                return run.spent()
         done = len(swarm.cost_history)
         if done >= iterations:
-            return search.spent()
-        return search.ended(True, f"the best cost stood still over {self.patience} of {done} iterations")
+            return run.spent()
+        return run.ended(True, f"the best cost stood still over {self.patience} of {done} iterations")
 
 
 @contextmanager
-def _apart(seed: int) -> Iterator[None]:
-    """The package kept to itself: it draws from NumPy's global generator and would write a log file where it stands."""
+def _isolated(seed: int) -> Iterator[None]:
+    """Keep the package to itself: it draws from NumPy's global generator and would write a log file where it stands."""
     state: Any = np.random.get_state()
     before = os.environ.get("LOG_CFG")
     with tempfile.TemporaryDirectory() as folder:

@@ -11,11 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.fit_parameter import Coordinates
 from hvdc_ident.fit.nonsmooth import RUNS, roughness
+from hvdc_ident.fit.objective import active_set
 from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserStatus
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.simulator import approximate
@@ -25,14 +27,14 @@ SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"
 
 
 PROBES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
-"""Tiny steps, in units of `probe`, from which the scatter of the cost is told."""
+"""Tiny steps, in units of `probe`, from which the scatter of the cost is estimated."""
 AS_PROMISED = 0.1
 """A reduction within this share of the promised one shows no error of the simulation."""
 SMALLEST = 1e-10
 """A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
 LUCK = 3.0
 """A promised reduction within so many standard deviations of the cost's scatter cannot be told from it: the point stood on
-is the luckiest of some twenty (1.9 below the mean, the expected minimum), and the next has to be lower still."""
+is the lowest of some twenty (1.9 below the mean, the expected minimum), and the next has to be lower still."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +56,18 @@ class TrustRegion:
     probe: float = 1e-9
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
-        """Where the run from `start` ended: converged, max-evaluations, stalled, flat, or failed with the reason."""
-        walk = _Walk(problem, self)
-        status, message = walk.go(start)
-        return OptimiserResult(walk.theta, walk.cost, status, message, walk.evaluations)
+        """Return the end of the run from `start`: converged, max-evaluations, stalled, flat, or failed with the reason."""
+        run = _Run(problem, self)
+        status, message = run.go(start)
+        return OptimiserResult(run.theta, run.cost, status, message, run.evaluations)
 
 
 OPTIMISER = TrustRegion
 
 
 @dataclass
-class _Walk:
-    """One run: the point it stands on and what it knows there."""
+class _Run:
+    """One run: its current point with the residual and its derivatives there."""
 
     problem: Problem
     options: TrustRegion
@@ -78,7 +80,7 @@ class _Walk:
     jacobian: Array = field(init=False)
 
     def go(self, start: Array) -> tuple[OptimiserStatus, str]:
-        """The status and the reason the walk ended for."""
+        """Return the status and the reason for which the run ended."""
         space = self.problem.coordinates
         low, high = space.bounds
         self.theta = np.asarray(start, dtype=float)
@@ -103,11 +105,11 @@ class _Walk:
             if predicted > 0 and not small:
                 before = self.cost
                 if self._move(self.x + p, space, better_than=before):
-                    gain = (before - self.cost) / predicted
-                    damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
+                    ratio = (before - self.cost) / predicted
+                    damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
                     damping = max(damping, 1e-14)
-                    reach *= 2.0 if gain > 0.5 else 1.0
-                    worth = self.options.reduction * (1e-3 if abs(gain - 1.0) < AS_PROMISED else 1.0)
+                    reach *= 2.0 if ratio > 0.5 else 1.0
+                    worth = self.options.reduction * (1e-3 if abs(ratio - 1.0) < AS_PROMISED else 1.0)
                     if max(before - self.cost, predicted) <= worth * before:
                         return "converged", "the cost does not fall any more"
                     continue
@@ -119,7 +121,7 @@ class _Walk:
         return "max-evaluations", f"no optimum within {self.options.max_evaluations} evaluations"
 
     def _move(self, x: Array, space: Coordinates, better_than: float = np.inf) -> bool:
-        """Whether the run at x succeeds and is better; only then the walk stands there."""
+        """Return whether the simulation at x succeeds and is better; only then x becomes the current point."""
         theta = space.unscaled(x)
         self.evaluations += 1
         try:
@@ -142,31 +144,33 @@ class _Walk:
         return bool((np.abs(g) <= self.options.gradient * scale).all())
 
     def _standstill(self, size: Array, low: Array, high: Array) -> tuple[OptimiserStatus, str]:
-        """The outcome where steps are too small to count: an optimum, a failing region or a gradient that does not fit."""
+        """Return the outcome where steps are too small to count: an optimum, a failing region or a gradient that does not fit."""
         if self.failure:
             return "failed", f"every step down leads to where the simulation fails: {self.failure}"
         p = _step(self.jacobian, self.r, 1e-10, size, low - self.x, high - self.x)
         assert self.cost is not None
-        left = self._predicted(p)
-        if left <= 1e-4 * self.cost + 1e-12 * self.r.size:
+        promise = self._predicted(p)
+        if promise <= 1e-4 * self.cost + 1e-12 * self.r.size:
             return "converged", "no smaller step lowers the cost"
         error = self._scatter(p, low, high)
-        if left > LUCK * error and approximate(self.problem.simulator):  # smooth on a tooth, and rough beyond it
+        if promise > LUCK * error and approximate(
+            self.problem.simulator
+        ):  # smooth near a local minimum, and nonsmooth beyond it
             self.evaluations += RUNS
             error = max(error, roughness(self.problem, self.theta))
-        if left <= LUCK * error:
+        if promise <= LUCK * error:
             return "converged", f"no step lowers the cost by more than its own scatter there ({error:.2g})"
         return "stalled", "the sensitivities promise a lower cost that no step reaches (a jump, or their error)"
 
     def _predicted(self, p: Array) -> float:
-        """The reduction of the cost that the linearised residuals promise for the step p."""
+        """Return the reduction of the cost that the linearised residuals promise for the step p."""
         assert self.cost is not None
         return self.cost - 0.5 * float(np.sum((self.r + self.jacobian @ p) ** 2))
 
     def _scatter(self, p: Array, low: Array, high: Array) -> float:
-        """The standard deviation of what is rough in the cost over tiny even steps along p; 0 where one of them fails.
+        """Return the standard deviation of the cost's noise over tiny even steps along p; 0 where one of them fails.
 
-        Third differences have nothing left of a smooth cost. Adaptive steps of an integrator make it jump from one parameter
+        Third differences remove a smooth cost. Adaptive steps of an integrator make it jump from one parameter
         value to the next, however close they are (Moré and Wild 2011, "Estimating computational noise",
         doi 10.1137/100786125).
         """
@@ -183,37 +187,25 @@ class _Walk:
             except SimulationError:
                 return 0.0
             costs.append(0.5 * float(r @ r))
-        rough = np.diff(costs, 3)
-        return float(np.sqrt(np.mean(rough**2) / 20.0))  # 20 = 1 + 9 + 9 + 1, of white noise of 1
+        differences = np.diff(costs, 3)
+        return float(np.sqrt(np.mean(differences**2) / 20.0))  # 20 = 1 + 9 + 9 + 1, of white noise of 1
 
 
 def _norms(jacobian: Array) -> Array:
-    """(p,): the columns' norms, 1 for a column of zeros."""
+    """Return the columns' norms, (p,), 1 for a column of zeros."""
     norms = np.linalg.norm(jacobian, axis=0)
     return np.where(norms > 0, norms, 1.0)
 
 
 def _step(jacobian: Array, r: Array, damping: float, size: Array, low: Array, high: Array) -> Array:
-    """The p in [low, high] that minimises |r + J p|^2 + damping |size p|^2, (p,).
-
-    Unknowns that would leave are put on their bound one after the other, the one that leaves first before the rest.
-    """
+    """Return the p in [low, high] that minimises |r + J p|^2 + damping |size p|^2, (p,)."""
     n = size.size
     q, triangle = np.linalg.qr(jacobian)
     matrix = np.vstack([triangle, np.sqrt(damping) * np.diag(size)])
     target = np.concatenate([-(q.T @ r), np.zeros(n)])
     g = jacobian.T @ r
-    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)))
-    p = np.zeros(n)
-    while free.any():
-        trial = p.copy()
-        trial[free] = np.linalg.lstsq(matrix[:, free], target - matrix[:, ~free] @ p[~free], rcond=None)[0]
-        outside = (trial < low) | (trial > high)
-        if not outside.any():
-            return trial
-        limit = np.where(trial < low, low, high)
-        share = np.where(outside, limit / np.where(outside, trial, 1.0), np.inf)
-        first = int(np.argmin(share))
-        p[first] = limit[first]
-        free[first] = False
-    return p
+
+    def solve(free: NDArray[np.bool_], p: Array) -> Array:
+        return np.asarray(np.linalg.lstsq(matrix[:, free], target - matrix[:, ~free] @ p[~free], rcond=None)[0])
+
+    return active_set(solve, ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0))), low, high)
