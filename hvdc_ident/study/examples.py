@@ -288,13 +288,13 @@ SIGNALS = {  # name of the recording: set-point of the dc voltage
 }
 
 TEXT = """\
-# A study: which model, which recordings, which questions. Check it with `hvdc-ident check study.toml`,
+# A study: a model, its recordings, and the stages to run. Check it with `hvdc-ident check study.toml`,
 # run it with `hvdc-ident run study.toml`; the report is then study-results/report.html.
 schema = 1
 name = "my-study"
 
 [model]
-source = "vsc-hvdc-link"          # a shipped model (`hvdc-ident models`), or the path of a model card: "model.toml"
+source = "vsc-hvdc-link"          # a shipped model (`hvdc-ident models`), or a path: "model.toml" (model card), "model.fmu"
 # parameterisation = "physical"   # the gains of the dc-voltage loop as J and Ts
 # [model.values]                  # values that differ from the model's
 # Zg = 0.02
@@ -303,7 +303,7 @@ source = "vsc-hvdc-link"          # a shipped model (`hvdc-ident models`), or th
 # at = ["Ir1", "Ir2"]
 # parameters = {T = 0.0016}
 
-# What may be estimated: where to begin and where to look. All other parameters stay at the model's values.
+# The parameters that may be estimated: start value and bounds of the search. All others keep the model's values.
 # given = ... states the vendor's value; if left out, the model's. Results are compared with it, never with start.
 [parameters]
 KPVDC = {start = 20, min = 10, max = 40}
@@ -313,27 +313,27 @@ KIVDC = {start = 650, min = 550, max = 950}
 [[experiment]]
 name = "step-up"
 data = "step-up.csv"
-inputs = ["Vdcref1"]              # or {Vdcref1 = "column name"}; inputs not named stay at the model's value
+inputs = ["Vdcref1"]              # or {Vdcref1 = "column name"}; inputs not listed keep the model's value
 outputs = ["Irorder1"]            # or {Irorder1 = "column name"}
 # noise = {Irorder1 = 1e-4}       # standard deviation; if left out, estimated before the event
 # event = 0.1                     # s; if left out, found from the inputs
-# window = [0.0, 0.8]             # s: what is compared; if left out, all of it
-# values = {Pref2 = 0.5}          # inputs held at another value than the model's
+# window = [0.0, 0.8]             # s: the rows that are compared; if left out, all of them
+# values = {Pref2 = 0.5}          # constant inputs that differ from the model's values
 # columns = {Irorder1 = {name = "I:REG:1", unit = "kA", scale = 5.54}}   # value in the model = scale x recorded
-# nuisance = ["time-shift", "Pref2"]   # unknown in this recording alone: its clock's offset, an input's offset
+# nuisance = ["time-shift", "Pref2"]   # unknowns of this recording: clock offset, offset of an input
 
 [[experiment]]
 name = "ramp"
 data = "ramp.csv"
-role = "holdout"                  # not used by the fit: it shows whether the estimates hold elsewhere
+role = "holdout"                  # not fitted: validates the estimates
 inputs = ["Vdcref1"]
 outputs = ["Irorder1"]
 
-# The questions. A stage runs where its table stands here.
+# The stages. A stage runs if its table is in this file.
 [fit]
-starts = 4                        # runs of the optimiser, from places spread over the bounds
+starts = 4                        # runs of the optimiser, from start values spread over the bounds
 # optimiser = "trust-region"      # or least-squares, l-bfgs-b, nelder-mead, differential-evolution, dual-annealing, ...
-# loss = "huber"                  # outliers count less; whiten = true where samples are not independent
+# loss = "huber"                  # reduces the weight of outliers; whiten = true for correlated noise
 """
 
 
