@@ -22,7 +22,7 @@ import usage
 
 from hvdc_ident.data import Experiment, InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.effects import EffectUse
+from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
@@ -72,7 +72,7 @@ class Watch:
 
 def recorded(count: int) -> tuple[Experiment, ...]:
     """The link with what is hidden, recorded."""
-    link = load_model("vsc-hvdc-link").with_effects([HIDDEN])
+    link = apply_effects(load_model("vsc-hvdc-link"), [HIDDEN])
     outputs, time_, random = OUTPUTS[:count], np.linspace(0.0, END, ROWS), np.random.default_rng(0)
     found = []
     for k, (name, before, after, span) in enumerate(MOVES):

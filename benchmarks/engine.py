@@ -22,6 +22,7 @@ import sympy as sp
 from numba import njit
 
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import NAMES, Tolerance, call, engine_of, simulate
 
@@ -79,7 +80,7 @@ def floor(model, sensitivities, statistics):
 def smooth(link):
     """The link with lags that take the fast modes out: 16 states, no unknowns."""
     lags = [(["Ir1", "Ii1", "Ir2", "Ii2"], 1.6e-3), (["Vdc1_m", "P2_m", "Q1_m", "Q2_m"], 1.5e-3), (["Idc"], 3e-3)]
-    return link.with_effects({"effect": "lag", "at": at, "parameters": {"T": T}} for at, T in lags)
+    return apply_effects(link, [{"effect": "lag", "at": at, "parameters": {"T": T}} for at, T in lags])
 
 
 def casadi_run(model, sensitivities, rtol):
@@ -187,11 +188,12 @@ def fresh_structure(slot):
     with tempfile.TemporaryDirectory() as empty:
         os.environ["NUMBA_CACHE_DIR"] = empty  # code from an earlier run of this file is on disk
         start = time.process_time(), time.perf_counter()
-        model = link.with_effects(
+        model = apply_effects(
+            link,
             [
                 {"effect": "lag", "at": [slot], "parameters": {"T": 2e-3}},
                 {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.9}},
-            ]
+            ],
         )
         simulate(model, CASE, sensitivities=GAINS)
         taken = time.process_time() - start[0], time.perf_counter() - start[1]

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import fsolve
 
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.errors import ModelError, SteadyStateError
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import equilibria
@@ -121,7 +121,7 @@ def one(random: np.random.Generator, model: Any, base: Any, sign: float) -> tupl
             size["k"] = random.uniform(0.85, 1.15)
         use = EffectUse(effect.name, (place,), size, source=source if effect.needs_source and source != place else "")
         try:
-            made = model.with_effects([use])
+            made = apply_effects(model, [use])
             break
         except ModelError:  # signals would run in a circle, or a size is out of question there
             continue

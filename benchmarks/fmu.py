@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.fmu import FmuModel, Limits, read_fmu
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.linearize import find_operating_point, linearize
@@ -80,15 +81,15 @@ def linear_models(path: Path, version: str) -> None:
 
 def main() -> None:
     folder = Path(tempfile.mkdtemp())
-    link = load_model("vsc-hvdc-link").with_effects(
-        [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}}]
+    link = apply_effects(
+        load_model("vsc-hvdc-link"), [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}}]
     )
     for version in ("2.0", "3.0"):
         plain = export_fmu(load_model("vsc-hvdc-link"), folder / f"link-{version}.fmu", version=version).path
         successive_runs(plain, version)
         linear_models(plain, version)
     lags = [{"effect": "lag", "at": n, "parameters": {"T": 0.001}} for n in ("P1", "P2", "Vdc1", "Vdc2", "Q1", "Q2")]
-    large = export_fmu(link.with_effects(lags), folder / "large.fmu").path
+    large = export_fmu(apply_effects(link, lags), folder / "large.fmu").path
     linear_models(large, "2.0")
 
 

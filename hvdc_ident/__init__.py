@@ -33,6 +33,7 @@ from hvdc_ident.lazy import offered
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, InputSignal, Trajectory, multisine, ramp, step
     from hvdc_ident.discrepancy import Diagnosis
+    from hvdc_ident.effects import apply_effects
     from hvdc_ident.fit.result import FitResult
     from hvdc_ident.formats import read_waveforms
     from hvdc_ident.identifiability import IdentifiabilityReport
@@ -92,6 +93,7 @@ __all__ = [
     "SweepResult",
     "Trajectory",
     "__version__",
+    "apply_effects",
     "balanced",
     "bode",
     "check",
@@ -142,6 +144,7 @@ _imported = offered(
     {
         "data": "Experiment InputSignal Trajectory multisine ramp step",
         "discrepancy": "Diagnosis",
+        "effects": "apply_effects",
         "fit.result": "FitResult",
         "formats": "read_waveforms",
         "identifiability": "IdentifiabilityReport",

@@ -374,7 +374,7 @@ def effects(*, console: Console) -> None:
     from hvdc_ident.effects import effects as known
 
     def line(e: Effect) -> str:
-        return f"{e.summary}; {e.shown}" + ("" if e.sought else " (diagnose: tried where it is named)")
+        return f"{e.summary}; {e.example_text}" + ("" if e.tried_by_default else " (diagnose: tried where it is named)")
 
     _catalogue("effects", {name: e.summary if console.json else line(e) for name, e in known().items()}, console)
 

@@ -21,7 +21,6 @@ INSIDE = {"discrepancy": "options noise signatures refits scores trials outside 
 ALLOWED = {
     # (from, to): why
     ("models", "fmu"): "load_model reads the model of any file; an FMU is looked up when one is named",
-    ("model", "effects"): "Model.with_effects is a method of the model; the catalogue is looked up when it is called",
 }
 
 

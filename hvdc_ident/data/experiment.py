@@ -39,7 +39,7 @@ class Experiment(Shown):
     values: inputs held constant at other than the model's start value.
     noise_profile: (n,) by output, the standard deviation of each row over `noise`, where rows differ; noise_dof: number of
     independent samples that `noise` was estimated from (left out: it is exact).
-    drive: names among the inputs that are slots of the model and follow their signal in place of their equation.
+    drive: names among the inputs that are insertion points of the model and follow their signal in place of their equation.
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
     offsets: constants added to inputs all along, in their units. starts: states that begin at a value and not at rest.
     nuisance: unknowns of this experiment alone, estimated with it: "time-shift", or the name of an input

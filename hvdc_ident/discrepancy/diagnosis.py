@@ -109,7 +109,7 @@ def _model_of(subject: AnyModel | Simulator) -> AnyModel:
     raise StudyError(
         "effects cannot be put on it",
         where="what is to be diagnosed",
-        expected="a model, or an FMU: something with slots and `with_effects`",
+        expected="a model, or an FMU: something with insertion points and `with_effects`",
         got=type(subject).__name__,
     )
 

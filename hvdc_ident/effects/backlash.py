@@ -1,22 +1,22 @@
-"""A play of full width: y follows when u leaves [y - width/2, y + width/2]."""
+"""Backlash of full width: y follows when u leaves [y - width/2, y + width/2]."""
 
 from collections.abc import Mapping
 
 import sympy as sp
 
-from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
+from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter
 from hvdc_ident.expression import clip
 from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The state that is pulled along by the part of u - y beyond the play, within 0.2 ms.
+    """Return a state that follows, within 0.2 ms, the part of u - y beyond the play.
 
-    An ideal play would need u', which jumps where u does; pulled so, the right-hand side has corners but no jumps. At
-    rest u is taken to lie in the middle of the play.
+    An ideal play would need u', which jumps where u does; so the right-hand side has corners but no jumps. In steady
+    state u is taken to lie in the middle of the play.
     """
     half = p["width"] / 2
-    return add.state("y", lambda y: (u - y - clip(u - y, -half, half)) / FOLLOW, rest=u)
+    return add.state("y", lambda y: (u - y - clip(u - y, -half, half)) / TRACKING_TIME, rest=u)
 
 
 EFFECT = Effect(
@@ -38,8 +38,8 @@ EFFECT = Effect(
     sentence="{at} follows with a play of {width}",
     excited_by="slow ramps both ways, with turns at several levels",
     example=FrozenMap({"width": 0.02}),
-    states="y, one a slot",
-    turns="width",
+    states="y, one per insertion point",
+    reversal="width",
     confusable=FrozenMap(
         {
             "deadband": "slow ramps both ways: the deadband is flat at 0 only",

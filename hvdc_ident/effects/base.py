@@ -1,7 +1,7 @@
-"""Base of the effects: each makes readers of a slot see something else than the slot's own signal.
+"""Entry of the catalogue of effects: each replaces the signal that readers of an insertion point see.
 
-An effect is data (`Effect`). Its use in a model is in `hvdc_ident.effects.placing`; the sizes worth trying when one is
-looked for are in `hvdc_ident.effects.probing`.
+An effect is data (`Effect`). `hvdc_ident.effects.placement` inserts it into a model, and `hvdc_ident.effects.probing`
+chooses the sizes at which a search begins.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Delay, Model, Sampled, Signal, State, fresh
 
-SLOT_KINDS = ("input", "signal", "algebraic", "state", "output")
-FOLLOW = 2e-4
-"""s: how fast an effect that follows its signal without a lag of its own does so (rate limit, play)."""
+INSERTION_POINT_KINDS = ("input", "signal", "algebraic", "state", "output")
+TRACKING_TIME = 2e-4
+"""Time constant, s, with which an effect that has no lag of its own follows its signal (rate limit, backlash)."""
 
 Measure = Literal[
     "one",
@@ -40,7 +40,7 @@ Measure = Literal[
 
 
 class Extent(Protocol):
-    """Largest magnitude (`peak`) and peak-to-peak range (`range`) of a slot's signal, in its unit."""
+    """Largest magnitude (`peak`) and peak-to-peak range (`range`) of a signal, in its unit."""
 
     @property
     def peak(self) -> float: ...
@@ -50,16 +50,16 @@ class Extent(Protocol):
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A parameter of an effect.
+    """A parameter of an effect: its default and bounds, and how a search scales it.
 
-    value: what it starts at where none is given. neutral: the value at which the effect is not there; a text: the
-    other parameter that it then equals; None: this parameter does not switch it off.
-    optional: at its neutral value only this parameter is left out; the effect is still there while another one acts.
-    measure: what a size is counted in when the effect is looked for; probes: the sizes worth trying, counted so;
-    search: the bounds of a refit, counted so (None: those of the measure). near: instead, a factor up and down from the
-    probe. held: a refit leaves it where it stands. companion: an optional one that is tried with the others only.
-    scan: from a slot's signal the sizes of a closer look, where neighbouring sizes have little in common and no slope
-    leads from one to the next; counted in scanned_in (None: the measure).
+    value: default. neutral: the value at which the effect is absent; a text names the other parameter that it then equals;
+    None: this parameter does not switch the effect off.
+    optional: at its neutral value only this parameter is left out; the effect stays while another one acts.
+    measure: the scale in which `probes`, the sizes to try, and `search`, the bounds of a refit (None: those of the measure),
+    are counted. search_factor: instead of `search`, a factor up and down from the probe. fixed: not refitted. companion: an
+    optional parameter that is tried only together with the others.
+    grid: the sizes of a grid refinement, from a signal's scales, where neighbouring sizes have little in common and no slope
+    leads from one to the next; counted in grid_measure (None: the measure).
     """
 
     value: float
@@ -70,19 +70,19 @@ class EffectParameter:
     description: str = ""
     measure: Measure = "one"
     probes: tuple[float, ...] = ()
-    scan: Callable[[Extent], Sequence[float]] | None = None
-    scanned_in: Measure | None = None
+    grid: Callable[[Extent], Sequence[float]] | None = None
+    grid_measure: Measure | None = None
     search: tuple[float, float] | None = None
-    near: float | None = None
+    search_factor: float | None = None
     optional: bool = False
-    held: bool = False
+    fixed: bool = False
     companion: bool = False
 
 
 class Additions:
-    """Variables that an effect adds to the model: states, delays, sampled values, signals, under names that are free.
+    """Builder of the states, delays, sampled values and signals that an effect adds to the model, under unused names.
 
-    kind: of the slot, one of SLOT_KINDS. circular: whether the slot lies on an algebraic loop.
+    kind: of the insertion point, one of INSERTION_POINT_KINDS. circular: True where it lies on an algebraic loop.
     """
 
     def __init__(self, model: Model, prefix: str, kind: str, circular: bool) -> None:
@@ -91,7 +91,7 @@ class Additions:
     def state(
         self, label: str, derivative: Callable[[sp.Symbol], sp.Expr], rest: sp.Expr | None = None, unit: str = ""
     ) -> sp.Symbol:
-        """The symbol of a new state; `derivative` gets it. rest: what the state equals at rest, where its search begins."""
+        """Return the symbol of a new state, which `derivative` is called with. rest: its value in steady state."""
         name = fresh(self.model, f"{self._prefix}_{label}")
         x = symbol(name)
         self.model = replace(self.model, states=self.model.states | {name: State(derivative(x), rest=rest, unit=unit)})
@@ -103,7 +103,7 @@ class Additions:
         derivatives: Callable[[tuple[sp.Symbol, ...]], Sequence[sp.Expr]],
         rests: Sequence[sp.Expr],
     ) -> tuple[sp.Symbol, ...]:
-        """The symbols of new states that depend on each other; `derivatives` gets them all. rests: as for `state`, by label."""
+        """Return the symbols of coupled new states, which `derivatives` is called with. rests: as for `state`, by label."""
         names = [fresh(self.model, f"{self._prefix}_{label}") for label in labels]
         symbols = tuple(symbol(n) for n in names)
         added = {n: State(d, rest=r) for n, d, r in zip(names, derivatives(symbols), rests, strict=True)}
@@ -111,19 +111,17 @@ class Additions:
         return symbols
 
     def start(self, of: sp.Expr) -> sp.Symbol:
-        """The symbol of the value that an expression has at the start: a state that never moves."""
+        """Return the symbol of an expression's value at the start: a state that never moves."""
         return self.state("start", lambda _: sp.S.Zero, rest=of)
 
     def signal(self, label: str, value: sp.Expr) -> sp.Symbol:
-        """The symbol of a new named signal: an expression used more than once stands in the model once."""
-        name = fresh(self.model, f"{self._prefix}_{label}")
-        self.model = replace(self.model, signals=self.model.signals | {name: Signal(value)})
-        return symbol(name)
+        """Return the symbol of a new named signal: an expression used more than once stands in the model once."""
+        return self.signals([label], lambda _: [value])[0]
 
     def signals(
         self, labels: Sequence[str], values: Callable[[tuple[sp.Symbol, ...]], Sequence[sp.Expr]]
     ) -> tuple[sp.Symbol, ...]:
-        """The symbols of new named signals that use each other; `values` gets them all. One model is made, not one a signal."""
+        """Return the symbols of new named signals that use each other; `values` is called with all of them."""
         names = [fresh(self.model, f"{self._prefix}_{label}") for label in labels]
         symbols = tuple(symbol(n) for n in names)
         added = {n: Signal(v) for n, v in zip(names, values(symbols), strict=True)}
@@ -131,23 +129,23 @@ class Additions:
         return symbols
 
     def delay(self, of: sp.Expr, time: sp.Expr) -> sp.Symbol:
-        """The symbol of u(t - time)."""
+        """Return the symbol of u(t - time)."""
         name = fresh(self.model, f"{self._prefix}_delayed")
         self.model = replace(self.model, delays=self.model.delays | {name: Delay(of, time)})
         return symbol(name)
 
     def sampled(self, value: sp.Expr, period: sp.Expr, compute: sp.Expr) -> sp.Symbol:
-        """The symbol of a value taken every period and published `compute` later."""
+        """Return the symbol of a value taken every period and published `compute` later."""
         name = fresh(self.model, f"{self._prefix}_held")
         self.model = replace(self.model, sampled=self.model.sampled | {name: Sampled(value, period, compute)})
         return symbol(name)
 
 
 class Rewrite(Protocol):
-    """y, what readers of the slot see: from u, the slot's own signal, the effect's parameters, and room for additions.
+    """Map u, the signal of the insertion point, to y, which its readers see instead.
 
     p: the parameters' symbols by name, without the optional ones that are left out; "from": the other signal, and
-    "expression": the term, where the effect has one.
+    "expression": the term, where the effect has one. add: makes the states and signals that y needs.
     """
 
     def __call__(self, u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr: ...
@@ -157,18 +155,19 @@ class Rewrite(Protocol):
 class Effect:
     """One entry of the catalogue.
 
-    places: kinds of slot where it may sit. states: those it adds, a sentence's part for people. sentence: for the
-    report, with {at}, {from}, {late} and the parameters by name. excited_by: the experiment that makes it visible.
-    example: values that show on a per-unit signal of some tenths, as the list of effects and the tests use them.
+    insertion_kinds: kinds of insertion point where it may sit. states: those it adds, as part of a sentence. sentence: for
+    the report, with {at}, {from}, {equivalent_delay} and the parameters by name. excited_by: the experiment that makes it
+    visible. example: values that show on a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
-    needs_source: whether it brings another signal in (`from`). needs_expression: whether its form is given with it,
-    with coefficients of the user's own names. sought: whether a search for every effect tries it; what stands for many others
-    is tried where none of them is enough. resistance: the parameter for which a resistance of the model stands in.
-    restless: whether it moves the model by itself, so that a record of it does not begin at rest. late: by how long, s, it
-    delays a slow signal, from its parameters' values: what effects that are hard to tell apart have in common. quick: the
-    same y of u as the equations, in numpy, where those are too many to be evaluated for thousands of sizes. widens: effects
-    that it turns into where one of its parameters ends: what they explain it explains as well, at the price of that. turns: the
-    parameter by more than which the slot's signal has to turn for the effect to be more than a shift of what has moved.
+    needs_source: True where it brings in another signal (`from`). needs_expression: True where its form is given with it,
+    with coefficients of the user's own names. tried_by_default: False for a general form that stands for many others and is
+    tried where none of them is enough. resistance: the parameter that a resistance of the model replaces.
+    self_exciting: True where it moves the model by itself, so that a record of it does not begin in steady state.
+    equivalent_delay: delay of a slow signal, s, from its parameters' values, which effects that are hard to tell apart
+    share; None for what is no delay of any kind. numpy_form: y of u in numpy, where the equations are too many to be
+    evaluated for thousands of sizes. generalises: effects that it becomes at the end of a parameter's range, and whose data
+    it therefore explains, at the price of that parameter. reversal: the parameter by more than which the signal has to
+    reverse for the effect to be more than a shift.
     """
 
     name: str
@@ -178,41 +177,42 @@ class Effect:
     sentence: str
     excited_by: str
     example: FrozenMap[float]
-    places: tuple[str, ...] = SLOT_KINDS
+    insertion_kinds: tuple[str, ...] = INSERTION_POINT_KINDS
     states: str = "none"
     confusable: FrozenMap[str] = field(default_factory=FrozenMap)
     needs_source: bool = False
     needs_expression: bool = False
-    sought: bool = True
+    tried_by_default: bool = True
     resistance: str = ""
-    restless: bool = False
-    late: Callable[[Mapping[str, float]], float] | None = None
-    quick: Callable[[Array, Mapping[str, Array]], Array] | None = None
-    widens: tuple[str, ...] = ()
-    turns: str = ""
+    self_exciting: bool = False
+    equivalent_delay: Callable[[Mapping[str, float]], float] | None = None
+    numpy_form: Callable[[Array, Mapping[str, Array]], Array] | None = None
+    generalises: tuple[str, ...] = ()
+    reversal: str = ""
 
-    def late_by(self, values: Mapping[str, float]) -> float | None:
-        """By how long it delays a slow signal with these values, s; None for what is no delay of any kind."""
-        return None if self.late is None else float(self.late(values))
+    def delay_with(self, values: Mapping[str, float]) -> float | None:
+        """Return the equivalent delay with these values, s; None for what is no delay of any kind."""
+        return None if self.equivalent_delay is None else float(self.equivalent_delay(values))
 
     @property
-    def scanned(self) -> bool:
+    def needs_grid(self) -> bool:
         """True where a parameter of the effect must be searched over many values."""
-        return any(q.scan is not None for q in self.parameters.values())
+        return any(q.grid is not None for q in self.parameters.values())
 
     @property
-    def shown(self) -> str:
+    def example_text(self) -> str:
         """The example in words, with units."""
         units = {n: q.unit for n, q in self.parameters.items()}
         return "e.g. " + ", ".join(f"{n} = {v:g} {units.get(n, '')}".rstrip() for n, v in self.example.items())
 
     def is_neutral(self, values: Mapping[str, float | str]) -> bool:
         """True where the effect is absent: a parameter switches it off, or none of the optional ones acts."""
-        switches = {n: q for n, q in self.parameters.items() if q.neutral is not None and not q.optional}
+
+        def at_neutral(name: str) -> bool:
+            neutral = self.parameters[name].neutral
+            return values[name] == (values[neutral] if isinstance(neutral, str) else neutral)
+
+        switches = [n for n, q in self.parameters.items() if q.neutral is not None and not q.optional]
         if switches:
-            return any(_at_neutral(q, values[n], values) for n, q in switches.items())
-        return all(_at_neutral(q, values[n], values) for n, q in self.parameters.items() if q.optional)
-
-
-def _at_neutral(q: EffectParameter, value: float | str, values: Mapping[str, float | str]) -> bool:
-    return value == (values[q.neutral] if isinstance(q.neutral, str) else q.neutral)
+            return any(at_neutral(n) for n in switches)
+        return all(at_neutral(n) for n, q in self.parameters.items() if q.optional)

@@ -1,4 +1,4 @@
-"""A leak to another signal's side: u - g from."""
+"""A leakage proportional to another signal: u - g from."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u less what leaks."""
+    """Return u minus the leakage."""
     return u - p["g"] * p["from"]
 
 

@@ -1,4 +1,4 @@
-"""Another signal leaks in: u + k (from - from0), from0 its value at the start."""
+"""Coupling of another signal: u + k (from - from0), from0 its value at the start."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u and the other signal's change."""
+    """Return u plus k times the change of the other signal."""
     return u + p["k"] * (p["from"] - add.start(p["from"]))
 
 
@@ -31,9 +31,9 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} takes {k} of the change of {from}",
-    excited_by="steps that move the other signal without the slot's own",
+    excited_by="steps that move the other signal and not this one",
     example=FrozenMap({"k": 0.2}),
-    states="the other signal's start value, one a slot",
+    states="the other signal's start value, one per insertion point",
     confusable=FrozenMap(
         {
             "droop": "nothing: a negative coupling is a droop without deadband",

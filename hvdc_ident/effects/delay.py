@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u as it was T ago."""
+    """Return u(t - T)."""
     return add.delay(u, p["T"])
 
 
@@ -24,9 +24,9 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    late=lambda p: p["T"],
+    equivalent_delay=lambda p: p["T"],
     sentence="{at} arrives {T} late",
-    excited_by="a step through the slot, recorded at several samples per delay",
+    excited_by="a step of the signal, recorded at several samples per delay",
     example=FrozenMap({"T": 0.002}),
     states="the signal's history over T",
     confusable=FrozenMap(

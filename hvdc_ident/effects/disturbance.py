@@ -11,7 +11,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u and the sine, t the experiment's own time."""
+    """Return u plus the sine, t being the time of the experiment."""
     return u + p["amplitude"] * sp.sin(2 * sp.pi * p["frequency"] * TIME + p["phase"])
 
 
@@ -35,7 +35,7 @@ EFFECT = Effect(
                 description="frequency",
                 measure="rate",
                 probes=(0.8, 0.6, 0.4, 0.2),
-                near=1.3,
+                search_factor=1.3,
             ),
             "phase": EffectParameter(
                 0.0,
@@ -51,5 +51,5 @@ EFFECT = Effect(
     sentence="{at} carries a sine of {amplitude} at {frequency}, phase {phase}",
     excited_by="a record without any step, longer than several periods",
     example=FrozenMap({"amplitude": 0.01, "frequency": 30.0, "phase": 0.3}),
-    restless=True,
+    self_exciting=True,
 )

@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u less the droop on what of the other signal's change lies beyond the deadband."""
+    """Return u minus k times the part of the other signal's change beyond the deadband."""
     change = p["from"] - add.start(p["from"])
     if "deadband" in p:
         change = change - clip(change, -p["deadband"], p["deadband"])
@@ -31,15 +31,15 @@ EFFECT = Effect(
                 search=(1e-3, 3.0),
             ),
             "deadband": EffectParameter(
-                0.0, neutral=0.0, description="change of the other signal that is left out", optional=True
+                0.0, neutral=0.0, description="change of the other signal without effect", optional=True
             ),
         }
     ),
     rewrite=rewrite,
     sentence="{at} droops by {k} per unit of {from}",
-    excited_by="several levels of the other signal, with the slot's own set-point at rest",
+    excited_by="several levels of the other signal, with this signal's set-point at rest",
     example=FrozenMap({"k": 0.2, "deadband": 0.0001}),
-    states="the other signal's start value, one a slot",
+    states="the other signal's start value, one per insertion point",
     confusable=FrozenMap(
         {
             "offset": "several levels of the other signal",

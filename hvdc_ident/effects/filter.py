@@ -1,4 +1,4 @@
-"""A linear filter of second order: u and k times what it passes around wn, and of that a part below and above."""
+"""A linear filter of second order: u plus k times a band around wn, with shares of that below and above the band."""
 
 import math
 from collections.abc import Mapping
@@ -10,9 +10,9 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """y = u + k (low x + 2 zeta v + high (u - x - 2 zeta v)) of x' = wn v, v' = wn (u - x - 2 zeta v).
+    """Return y = u + k (low x + 2 zeta v + high (u - x - 2 zeta v)) of x' = wn v, v' = wn (u - x - 2 zeta v).
 
-    x is what a low pass lets through, 2 zeta v a band pass with gain 1 at wn, the rest of u a high pass.
+    x is the low-pass part, 2 zeta v the band-pass part with gain 1 at wn, the rest of u the high-pass part.
     """
     wn, zeta = p["wn"], p["zeta"]
     x, v = add.states(("x", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])), rests=(u, sp.S.Zero))
@@ -29,12 +29,12 @@ EFFECT = Effect(
                 -0.5,
                 neutral=0.0,
                 min=-math.inf,
-                description="what is added at wn",
+                description="gain added at wn",
                 probes=(0.3,),
                 search=(-5.0, 5.0),
             ),
-            "low": EffectParameter(0.0, min=-math.inf, description="of that the part well below wn"),
-            "high": EffectParameter(0.0, min=-math.inf, description="of that the part well above wn"),
+            "low": EffectParameter(0.0, min=-math.inf, description="share of k well below wn"),
+            "high": EffectParameter(0.0, min=-math.inf, description="share of k well above wn"),
             "wn": EffectParameter(
                 100.0,
                 unit="rad/s",
@@ -50,10 +50,10 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} passes a filter of second order around {wn}, damping {zeta}: {k} more there, low = {low}, high = {high}",
-    excited_by="a multisine through the slot over the filter's band",
+    excited_by="a multisine of the signal over the filter's band",
     example=FrozenMap({"k": -0.5, "low": 0.1, "high": -0.1, "wn": 60.0, "zeta": 0.25}),
-    states="x and v = x'/wn, one pair a slot",
-    sought=False,
+    states="x and v = x'/wn, one pair per insertion point",
+    tried_by_default=False,
     confusable=FrozenMap(
         {
             "second-order": "a multisine from well below to well above wn: the second order lets nothing through above it",

@@ -1,4 +1,4 @@
-"""An inductance behind a resistance: L y' = R (u - y); an algebraic line current becomes a state."""
+"""An inductance in series with a resistance: L y' = R (u - y); an algebraic line current becomes a state."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The current: u is what the resistance alone would let through."""
+    """Return the current as a state; u is the current through the resistance alone."""
     return add.state("y", lambda y: p["R"] * (u - y) / p["L"], rest=u)
 
 
@@ -21,14 +21,14 @@ EFFECT = Effect(
             "L": EffectParameter(
                 1e-3, neutral=0.0, unit="s", description="inductance", measure="time*R", probes=(0.0, 0.25, 0.5, 0.75)
             ),
-            "R": EffectParameter(1.0, min=1e-12, description="resistance of the same path", held=True),
+            "R": EffectParameter(1.0, min=1e-12, description="resistance of the same path", fixed=True),
         }
     ),
     rewrite=rewrite,
     sentence="{at} has an inductance of {L} in its path",
     excited_by="a fast change of the voltage across the path, recorded at several samples per L/R",
     example=FrozenMap({"L": 0.002, "R": 0.7}),
-    states="the current, one a slot",
+    states="the current, one per insertion point",
     confusable=FrozenMap({"lag": "nothing from outside: the same with T = L/R"}),
     resistance="R",
 )

@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """y of the pair y' = wn (i + 2 zeta (u - y)), i' = wn (u - y): i, the integral's part, is in the unit of y."""
+    """Return y of the pair y' = wn (i + 2 zeta (u - y)), i' = wn (u - y), with i, the integral part, in the unit of y."""
     wn, zeta = p["wn"], p["zeta"]
     y, _ = add.states(
         ("y", "i"), lambda s: (wn * (s[1] + 2 * zeta * (u - s[0])), wn * (u - s[0])), rests=(u, sp.S.Zero)
@@ -38,9 +38,9 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} is reached through a loop with integral action of {wn} and damping {zeta}",
-    excited_by="a step through the slot, recorded at several samples per 1/wn",
+    excited_by="a step of the signal, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.7}),
-    states="y and the integral's part i, one pair a slot",
+    states="y and the integral's part i, one pair per insertion point",
     confusable=FrozenMap(
         {
             "second-order": "excitation up to wn: the loop answers at once, overshoots, and slow signals pass it undelayed",

@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The state that follows u."""
+    """Return a state that follows u."""
     return add.state("y", lambda y: (u - y) / p["T"], rest=u)
 
 
@@ -24,11 +24,11 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    late=lambda p: p["T"],
+    equivalent_delay=lambda p: p["T"],
     sentence="{at} follows its order with a first-order lag of {T}",
-    excited_by="a step or fast ramp through the slot, recorded at several samples per time constant",
+    excited_by="a step or fast ramp of the signal, recorded at several samples per time constant",
     example=FrozenMap({"T": 0.002}),
-    states="y, one a slot",
+    states="y, one per insertion point",
     confusable=FrozenMap(
         {
             "delay": "excitation up to 1/T: the delay keeps the shape, the lag rounds it",

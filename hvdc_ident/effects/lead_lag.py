@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """y = x + T1/T2 (u - x) with T2 x' = u - x, which needs no derivative of u."""
+    """Return y = x + T1/T2 (u - x) with T2 x' = u - x, which needs no derivative of u."""
     x = add.state("x", lambda x: (u - x) / p["T2"], rest=u)
     return x + p["T1"] / p["T2"] * (u - x)
 
@@ -28,12 +28,12 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    late=lambda p: p["T2"] - p["T1"],
-    widens=("lag",),
+    equivalent_delay=lambda p: p["T2"] - p["T1"],
+    generalises=("lag",),
     sentence="{at} passes a lead-lag with T1 = {T1} and T2 = {T2}",
-    excited_by="a step through the slot, recorded at several samples per time constant",
+    excited_by="a step of the signal, recorded at several samples per time constant",
     example=FrozenMap({"T1": 0.003, "T2": 0.001}),
-    states="x, one a slot",
+    states="x, one per insertion point",
     confusable=FrozenMap(
         {
             "lag": "a step: the lead jumps at once",

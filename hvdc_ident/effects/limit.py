@@ -11,7 +11,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u cut at both levels."""
+    """Return u limited to +-level."""
     return clip(u, -p["level"], p["level"])
 
 

@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u less the loss that the other signal causes."""
+    """Return u minus the loss caused by the other signal."""
     terms = {"a": sp.S.One, "b": sp.Abs(p["from"]), "c": p["from"] ** 2}
     return u - sp.Add(*(p[n] * t for n, t in terms.items() if n in p))
 

@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u and the offset."""
+    """Return u + c."""
     return u + p["c"]
 
 

@@ -1,19 +1,13 @@
-"""Looking for an effect at a slot: which sizes to try there, and where a refit may move its parameters.
+"""Sizes at which the search for an effect begins, and the bounds within which a refit may move its parameters.
 
-For whoever searches (the discrepancy room):
-
-    signal = SlotSignal.of(times, values)                 # the slot's signal in each experiment, from any simulation
+    signal = SignalScales.of(times, values)               # the signal at the insertion point, in each experiment
     for probe in probes(effect, signal, source):          # a few finite sizes
-        use = probe.use(at=("Ir1",), source="Vdc2")       # goes into Model.with_effects; its values are the refit's start
+        use = probe.use(at=("Ir1",), source="Vdc2")       # for `apply_effects`; its values are the refit's start
         probe.free                                        # {parameter: (min, max)} of the refit, finite, min < start < max
         probe.model_names(use)                            # the same under the names that the model then has
 
-`probe.free` names the parameters to estimate, the others keep the probe's value. A range that spans more than a decade
-above 0 is one for a logarithmic scale, as `hvdc_ident.fit.fit_parameter.FitParameter` takes it. `clearance(effect, values)` measures
-how far a set of values is from neutral, as something whose interval can be compared with 0. `sources(model, place)`
-lists the signals that an effect with `needs_source` may bring in at this place without closing a circle;
-`resistances(model, place)` the parameters that may stand for R in an effect with a `resistance` (none: do not try it
-there). `alone(use)` is the effect as a model of its own, to turn a recorded signal u into y without the plant.
+`probe.free` names the parameters to estimate; the others keep the probe's value. Bounds more than a decade apart and above
+0 suit a logarithmic scale.
 """
 
 from __future__ import annotations
@@ -28,19 +22,19 @@ import sympy as sp
 
 from hvdc_ident.data import Array
 from hvdc_ident.effects.base import Effect, EffectParameter, Measure
-from hvdc_ident.effects.placing import EffectUse
+from hvdc_ident.effects.placement import EffectUse, apply_effects
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output, insertion_point
-from hvdc_ident.parameters import Input
+from hvdc_ident.parameters import Input, Parameter
 
 
 @dataclass(frozen=True)
-class SlotSignal:
-    """Range and time scales of a slot's signal over all experiments, from which the sizes of an effect are chosen.
+class SignalScales:
+    """Range and time scales of a signal over all experiments, from which the sizes of an effect are chosen.
 
-    low, high: its extremes; rest: the largest magnitude it has at a start; all in its unit. fast, slow: the shortest
-    and the longest time worth a thought, s. tones: frequencies, Hz, that stand out in what is unexplained.
+    low, high: its extremes; rest: its largest magnitude at the start of an experiment; all in its unit. fast, slow: the
+    shortest and the longest time scale considered, s. tones: frequencies, Hz, that stand out in the residual.
     """
 
     low: float
@@ -51,8 +45,8 @@ class SlotSignal:
     tones: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, times: Sequence[Array], values: Sequence[Array], tones: Iterable[float] = ()) -> SlotSignal:
-        """From the signal in each experiment: times in s, values in the slot's unit, one array an experiment each.
+    def of(cls, times: Sequence[Array], values: Sequence[Array], tones: Iterable[float] = ()) -> SignalScales:
+        """Return the scales of a signal: times in s and values in its unit, one array an experiment each.
 
         fast is a twentieth of the time in which the signal, at its quickest, crosses its range, and at least half a
         sampling interval; slow is a fifth of the longest experiment.
@@ -68,8 +62,8 @@ class SlotSignal:
         return cls(low, high, max(abs(float(v[0])) for v in values), fast, slow, tuple(tones))
 
     @classmethod
-    def joined(cls, signals: Sequence[SlotSignal]) -> SlotSignal:
-        """One for several slots that share an effect."""
+    def joined(cls, signals: Sequence[SignalScales]) -> SignalScales:
+        """Return the scales that cover several signals whose insertion points share an effect."""
         return cls(
             min(s.low for s in signals),
             max(s.high for s in signals),
@@ -81,7 +75,7 @@ class SlotSignal:
 
     @property
     def peak(self) -> float:
-        """Its largest magnitude; 1 where it is always 0."""
+        """Largest magnitude; 1 where the signal is always 0."""
         return max(abs(self.low), abs(self.high)) or 1.0
 
     @property
@@ -95,11 +89,11 @@ class SlotSignal:
         return max(self.peak - self.rest, 1e-3 * self.peak)
 
     def time(self, share: float) -> float:
-        """The time at a share of the way from fast to slow, evenly in the logarithm, s."""
+        """Return the time, s, at a share of the way from fast to slow on a logarithmic scale."""
         return self.fast * (self.slow / self.fast) ** share
 
 
-Size = Callable[[float, SlotSignal, SlotSignal, Mapping[str, float]], float]
+Size = Callable[[float, SignalScales, SignalScales, Mapping[str, float]], float]
 _SIZES: dict[Measure, Size] = {
     "one": lambda x, u, source, p: x,
     "time": lambda x, u, source, p: u.time(x),
@@ -131,7 +125,7 @@ _SEARCH: dict[Measure, tuple[float, float]] = {
     "of T2": (0.02, 50.0),
 }
 SMALLEST = 1e-3
-"""Of the largest size: where a search over a parameter that cannot be negative begins."""
+"""Share of the largest size at which a search over a parameter that cannot be negative begins."""
 
 
 @dataclass(frozen=True)
@@ -143,89 +137,86 @@ class Probe:
     free: FrozenMap[tuple[float, float]] = field(default_factory=FrozenMap)
 
     def use(self, at: Sequence[str], source: str = "", named: Mapping[str, str] | None = None) -> EffectUse:
-        """The effect at the slots with these values. named: parameters of the model that stand in for some of its own."""
+        """Return the effect at the places with these values. named: parameters of the model that replace some of its own."""
         parameters: dict[str, float | str] = {**self.values, **(named or {})}
         return EffectUse(self.effect, tuple(at), FrozenMap(parameters), source=source)
 
     def model_names(self, use: EffectUse) -> dict[str, tuple[float, float]]:
-        """The bounds by the names that the parameters have in a model with this effect on it."""
-        own = {n: b for n, b in self.free.items() if not isinstance(use.parameters.get(n), str)}
-        return {use.parameter_name(n): b for n, b in own.items()}
+        """Return the bounds by the names that the parameters have in a model with this effect."""
+        return {use.parameter_name(n): b for n, b in self.free.items() if not isinstance(use.parameters.get(n), str)}
 
 
 def probes(
     effect: Effect,
-    signal: SlotSignal,
-    source: SlotSignal | None = None,
+    signal: SignalScales,
+    source: SignalScales | None = None,
     given: Mapping[str, float] | None = None,
 ) -> tuple[Probe, ...]:
-    """Sizes worth trying at a slot with this signal; none for a term, whose form has to be found first.
+    """Return the sizes to try where the signal has these scales; none for a term, whose form has to be found first.
 
-    source: the signal that the effect brings in, where it does. given: values that are settled, such as a resistance
-    of the model. An effect made of optional parts only is tried with each of them and with all.
+    source: scales of the signal that the effect brings in. given: known values, such as a resistance of the model. An
+    effect made of optional parts only is tried with each of them and with all.
     """
     if effect.needs_expression:
         return ()
     other = source or signal
-    settled = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
-    effect = replace(effect, parameters=effect.parameters | settled)
+    known = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
+    effect = replace(effect, parameters=effect.parameters | known)
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}
     absent = {n: 0.0 for n, q in effect.parameters.items() if q.optional}
     groups: list[list[str]] = [[]]
     if not switched:
         parts = [n for n in absent if effect.parameters[n].probes]
         groups = [*([n] for n in parts if not effect.parameters[n].companion), parts]
-    found = []
+    combinations = []
     for group in groups:
         tried = switched | {n: effect.parameters[n] for n in group}
-        found += [{n: values.get(n, 0.0) for n in effect.parameters} for values in _combinations(tried, signal, other)]
-    return tuple(_probe(effect, values, signal, other) for values in found)
+        combinations += [{n: v.get(n, 0.0) for n in effect.parameters} for v in _combinations(tried, signal, other)]
+    return tuple(_probe(effect, values, signal, other) for values in combinations)
 
 
-def scanned(effect: Effect, signal: SlotSignal) -> tuple[Probe, Array]:
-    """One probe of a closer look at a slot with this signal, and (C,) all its sizes, in the unit of the parameter that asks
-    for them.
-    """
-    name, q = next((n, q) for n, q in effect.parameters.items() if q.scan is not None)
-    assert q.scan is not None
-    many = replace(q, probes=tuple(q.scan(signal)), measure=q.scanned_in or q.measure)
+def size_grid(effect: Effect, signal: SignalScales) -> tuple[Probe, Array]:
+    """Return one probe of a grid refinement where the signal has these scales, and its (C,) sizes in the parameter's unit."""
+    name, q = next((n, q) for n, q in effect.parameters.items() if q.grid is not None)
+    assert q.grid is not None
+    many = replace(q, probes=tuple(q.grid(signal)), measure=q.grid_measure or q.measure)
     sizes = np.array([_SIZES[many.measure](x, signal, signal, {}) for x in many.probes])
     one = replace(effect, parameters=effect.parameters | {name: replace(many, probes=many.probes[:1])})
     return probes(one, signal)[0], np.clip(sizes, q.min, q.max)
 
 
 def _combinations(
-    parameters: Mapping[str, EffectParameter], signal: SlotSignal, source: SlotSignal
+    parameters: Mapping[str, EffectParameter], signal: SignalScales, source: SignalScales
 ) -> list[dict[str, float]]:
-    """Every combination of the parameters' sizes; those measured by another one come after it."""
+    """Return every combination of the parameters' sizes; those measured by another one come after it."""
     order = sorted(parameters, key=lambda n: parameters[n].measure in ("of T2", "time*R"))
-    found: list[dict[str, float]] = []
+    combinations: list[dict[str, float]] = []
     for sizes in itertools.product(*(_tried(parameters[n], signal) for n in order)):
         values: dict[str, float] = {}
         for name, x in zip(order, sizes, strict=True):
             q = parameters[name]
             value = x if x is None else _SIZES[q.measure](x, signal, source, values)
             values[name] = q.value if value is None else min(max(value, q.min), q.max)
-        found.append({n: values[n] for n in parameters})
-    return found
+        combinations.append({n: values[n] for n in parameters})
+    return combinations
 
 
-def _tried(q: EffectParameter, signal: SlotSignal) -> tuple[float | None, ...]:
-    """The sizes of one parameter, counted in its measure; None: its own value."""
+def _tried(q: EffectParameter, signal: SignalScales) -> tuple[float | None, ...]:
+    """Return the sizes of one parameter, counted in its measure; None stands for its default."""
     if q.unit == "Hz" and signal.tones:
         span = math.log(signal.slow / signal.fast)
         return tuple(-math.log(f * signal.fast) / span for f in signal.tones)
     return q.probes or (None,)
 
 
-def _probe(effect: Effect, values: Mapping[str, float], signal: SlotSignal, source: SlotSignal) -> Probe:
+def _probe(effect: Effect, values: Mapping[str, float], signal: SignalScales, source: SignalScales) -> Probe:
     free: dict[str, tuple[float, float]] = {}
     for name, q in effect.parameters.items():
-        if q.held or (q.optional and values[name] == q.neutral):
+        if q.fixed or (q.optional and values[name] == q.neutral):
             continue
         low, high = (_SIZES[q.measure](x, signal, source, values) for x in (q.search or _SEARCH[q.measure]))
-        if q.near is not None:
-            low, high = values[name] / q.near, values[name] * q.near
+        if q.search_factor is not None:
+            low, high = values[name] / q.search_factor, values[name] * q.search_factor
         elif q.min == 0.0 and low <= 0.0:
             low = SMALLEST * high
         if not low < values[name] < high:
@@ -235,41 +226,38 @@ def _probe(effect: Effect, values: Mapping[str, float], signal: SlotSignal, sour
     return Probe(effect.name, FrozenMap(values), FrozenMap(free))
 
 
-def clearance(effect: Effect, values: Mapping[str, float]) -> dict[str, float]:
-    """Distance from neutral of each parameter that switches the effect off: 0 at neutral.
+def distance_from_neutral(effect: Effect, values: Mapping[str, float]) -> dict[str, float]:
+    """Return the distance from neutral of each parameter that switches the effect off: 0 at neutral.
 
-    The difference from the neutral value; 1/value where that is infinite; T1 - T2 where it is another parameter. An
-    optional parameter that is left out (0) counts as not there.
+    It is the difference from the neutral value; 1/value where that is infinite; T1 - T2 where it is another parameter. An
+    optional parameter that is left out (0) has none.
     """
-    found: dict[str, float] = {}
+    distances: dict[str, float] = {}
     for name, q in effect.parameters.items():
         if q.neutral is None or name not in values or (q.optional and values[name] == q.neutral):
             continue
         neutral = values[q.neutral] if isinstance(q.neutral, str) else q.neutral
-        found[name] = 1.0 / values[name] if math.isinf(neutral) else values[name] - neutral
-    return found
+        distances[name] = 1.0 / values[name] if math.isinf(neutral) else values[name] - neutral
+    return distances
 
 
-def sources(model: Model, place: str) -> tuple[str, ...]:
-    """Inputs, signals, unknowns and states that an effect at this place may bring in without closing a circle."""
+def admissible_sources(model: Model, place: str) -> tuple[str, ...]:
+    """Return the inputs, signals, unknowns and states that an effect at this place may bring in without closing a circle."""
     kind, name = insertion_point(model, place)
-    every = [*model.inputs, *model.signals, *model.algebraic, *model.states]
+    names = [*model.inputs, *model.signals, *model.algebraic, *model.states]
     if kind == "output":
-        return tuple(every)
+        return tuple(names)
     if kind == "algebraic":
-        return tuple(n for n in every if n != name)
+        return tuple(n for n in names if n != name)
     uses = {n: {s.name for s in v.value.free_symbols} for n, v in model.signals.items()}
-    reaching = {name}
-    growing = True
-    while growing:
-        more = {n for n, used in uses.items() if n not in reaching and used & reaching}
-        reaching |= more
-        growing = bool(more)
-    return tuple(n for n in every if n not in reaching)
+    dependent = {name}
+    while more := {n for n, used in uses.items() if n not in dependent and used & dependent}:
+        dependent |= more
+    return tuple(n for n in names if n not in dependent)
 
 
-def resistances(model: Model, place: str) -> tuple[str, ...]:
-    """Parameters by which the slot's own equation divides: where a current is a voltage over one, its resistance."""
+def resistance_parameters(model: Model, place: str) -> tuple[str, ...]:
+    """Return the parameters by which the equation of the place divides: the resistance, where a current is a voltage over one."""
     kind, name = insertion_point(model, place)
     if kind not in ("signal", "algebraic"):
         return ()
@@ -278,15 +266,9 @@ def resistances(model: Model, place: str) -> tuple[str, ...]:
     return tuple(n for n in model.parameters if symbol(n) in below)
 
 
-def alone(use: EffectUse, source: bool = False) -> Model:
-    """The effect as a model of its own: input `u` (and `source`), output `y`."""
-    from hvdc_ident.effects import apply_effects
-
+def effect_model(use: EffectUse, source: bool = False) -> Model:
+    """Return the effect as a model of its own: input `u` (and `source`), output `y`."""
     inputs = {"u": Input()} | ({"source": Input()} if source else {})
-    bench = Model("alone", inputs=FrozenMap(inputs), outputs=FrozenMap({"y": Output(symbol("u"))}))
-    named = {n: v for n, v in use.parameters.items() if isinstance(v, str)}
-    if named:
-        from hvdc_ident.parameters import Parameter
-
-        bench = replace(bench, parameters=FrozenMap({v: Parameter(1.0) for v in named.values()}))
-    return apply_effects(bench, [replace(use, at=("u",), source="source" if source else "")])
+    named = {v: Parameter(1.0) for v in use.parameters.values() if isinstance(v, str)}
+    through = Model("effect", FrozenMap(named), inputs=FrozenMap(inputs), outputs=FrozenMap({"y": Output(symbol("u"))}))
+    return apply_effects(through, [replace(use, at=("u",), source="source" if source else "")])

@@ -5,34 +5,33 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter, Extent
+from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter, Extent
 from hvdc_ident.expression import clip, where
 from hvdc_ident.immutable import FrozenMap
 
 BITS = 24
 """Levels from -2^(BITS - 1) to 2^(BITS - 1) steps; beyond, the last one holds, as in a converter."""
 EDGE = 2e-3
-"""Of a step: over how much of u a level changes into the next inside the model (a recorded output jumps)."""
+"""Width of the edge between two levels inside the model, in steps (a recorded output jumps)."""
 BORDER = 0.3
-"""Of a step: where, between two edges, the count of levels moves on. No value that a signal is likely to rest at."""
+"""Position between two edges, in steps, where the count of levels changes: no value that a signal is likely to rest at."""
 
 APART = 10
-"""Steps of a closer look that lie a level apart at the peak; and, in number, between which one step more or less passes
-another tenth of a level over the signal's range."""
+"""Sizes of the grid per level at the peak, and so per level over the range of a signal that passes few levels."""
 PASSED = 40.0
-"""Levels over the signal's range up to which a closer look goes."""
+"""Levels over the signal's range at which the grid ends."""
 COUNTED = 400.0
-"""Levels up to the signal's peak that are gone through where these are fewer."""
+"""Levels up to the signal's peak at which the grid ends, where that is later."""
 FINEST = 150.0
-"""Levels over the signal's range at most: more look like noise."""
+"""Levels over the signal's range at most: finer ones look like noise."""
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The level that u is nearest to.
+    """Return the level nearest to u.
 
     In a loop that comes to rest between two levels, an ideal quantiser never rests: the loop slides along the edge. An
     edge of finite width has that sliding rest as its steady state (Filippov's solution, up to the width). Within an
-    algebraic loop a jump may leave no solution at all: there the level is taken on within 0.2 ms.
+    algebraic loop a jump may leave no solution at all: there the level is reached within 0.2 ms.
     """
     step = p["step"]
     if add.kind == "output":
@@ -43,15 +42,15 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     if not add.circular:
         return rounded
     rounded = add.signal("rounded", rounded)
-    return add.state("y", lambda y: (rounded - y) / FOLLOW, rest=rounded)
+    return add.state("y", lambda y: (rounded - y) / TRACKING_TIME, rest=rounded)
 
 
 def _levels(signal: Extent) -> Sequence[float]:
-    """Levels up to the signal's peak, from one that it hardly reaches to hundreds that it passes.
+    """Return the grid of levels up to the signal's peak, from one that it hardly reaches to hundreds that it passes.
 
-    What a step leaves hangs on where the marks lie, which is told at the peak to a tenth of a level, and on how many are
-    passed. A signal that moves a little about a high level meets every place of the marks anew with each level more up
-    to its peak, and by then hardly passes more of them: such levels are gone through here and there.
+    The quantisation error depends on where the levels lie, to a tenth of a level at the peak, and on how many are passed. A
+    signal that moves a little about a high value meets the same positions again with each further level up to its peak, and
+    hardly passes more levels: such levels are sampled sparsely.
     """
     share = signal.peak / signal.range
     between = max(1.0, share / APART)
@@ -61,24 +60,24 @@ def _levels(signal: Extent) -> Sequence[float]:
 
 
 def _floor(x: sp.Expr, add: Additions) -> sp.Expr:
-    """The largest integer not above x.
+    """Return the largest integer not above x, by folding as in a Gray-code converter.
 
-    Found by folding, as a Gray-code converter does it: |x|, less half of the range, its magnitude, and so on. One switch
-    a bit finds any of 2^BITS levels, and at each border exactly one of them turns, with nothing else jumping for a moment.
+    It takes |x|, minus half of the range, its magnitude, and so on. One switch a bit resolves 2^BITS levels, and at each
+    border exactly one of them changes, so that nothing jumps in between.
     """
     bits = range(BITS - 2, -1, -1)
 
-    def values(own: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-        folds = (x, *own[: BITS - 1])
-        levels = (sp.Float(0.5), *own[BITS - 1 :])
-        found = [sp.Abs(fold) - 2**bit for fold, bit in zip(folds, bits, strict=False)]
+    def folded(symbols: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+        folds = (x, *symbols[: BITS - 1])
+        levels = (sp.Float(0.5), *symbols[BITS - 1 :])
+        values = [sp.Abs(fold) - 2**bit for fold, bit in zip(folds, bits, strict=False)]
         for bit, fold in enumerate(reversed(folds)):
             half = 2 ** (bit - 1) if bit else 0
-            found.append(where(fold >= 0, 1, -1) * (levels[bit] + half))
-        return found
+            values.append(where(fold >= 0, 1, -1) * (levels[bit] + half))
+        return values
 
     labels = [*(f"fold{bit}" for bit in bits), *(f"level{bit}" for bit in range(BITS))]
-    return add.signals(labels, values)[-1] - sp.Float(0.5)
+    return add.signals(labels, folded)[-1] - sp.Float(0.5)
 
 
 EFFECT = Effect(
@@ -92,12 +91,12 @@ EFFECT = Effect(
                 description="distance of two levels",
                 measure="peak/n",
                 probes=(3.0, 10.0, 30.0, 100.0, 300.0),
-                scan=lambda signal: _levels(signal),
+                grid=_levels,
             )
         }
     ),
     rewrite=rewrite,
-    quick=lambda u, p: p["step"] * np.floor(u / p["step"] + 0.5),
+    numpy_form=lambda u, p: p["step"] * np.floor(u / p["step"] + 0.5),
     sentence="{at} is rounded to multiples of {step}",
     excited_by="slow ramps both ways over several levels",
     example=FrozenMap({"step": 0.03}),

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 
 import sympy as sp
 
-from hvdc_ident.effects.base import FOLLOW, Additions, Effect, EffectParameter
+from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter
 from hvdc_ident.expression import clip
 from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The state that follows u no faster than the rate; at rest it is u, which a clipped derivative hides from far off."""
-    return add.state("y", lambda y: clip((u - y) / FOLLOW, -p["rate"], p["rate"]), rest=u)
+    """Return a state that follows u no faster than the rate; its value at rest, u, does not follow from a clipped derivative."""
+    return add.state("y", lambda y: clip((u - y) / TRACKING_TIME, -p["rate"], p["rate"]), rest=u)
 
 
 EFFECT = Effect(
@@ -27,7 +27,7 @@ EFFECT = Effect(
                 min=1e-12,
                 description="largest rate",
                 measure="range/time",
-                # The slowest hardly let a step through at all: a set-point that is slewed over minutes.
+                # At the slowest a step hardly passes, as with a set-point that is ramped over minutes.
                 probes=(1.3, 0.9, 0.7, 0.5, 0.3),
                 search=(1.8, -0.5),
             )
@@ -35,9 +35,9 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} cannot change faster than {rate}",
-    excited_by="steps of two sizes through the slot, so that two slopes would be asked for",
+    excited_by="steps of two sizes of the signal, so that two slopes would be asked for",
     example=FrozenMap({"rate": 1.0}),
-    states="y, one a slot",
+    states="y, one per insertion point",
     confusable=FrozenMap(
         {
             "lag": "two steps of different size: the lag scales with them, the rate does not",

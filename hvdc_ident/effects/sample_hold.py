@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The held sample."""
+    """Return the held sample."""
     return add.sampled(u, p["Ts"], p["compute"])
 
 
@@ -25,20 +25,20 @@ EFFECT = Effect(
                 description="sampling period",
                 measure="time",
                 probes=(0.1, 0.4, 0.7),
-                # Samples of a record: as many are told from a third more of one, until a sample is but a few rows.
-                scan=lambda signal: (*(4.0 + 0.3 * k for k in range(390)), *(121.0 * 1.004**k for k in range(440))),
-                scanned_in="record/n",
+                # Samples in a record: told apart to a third of one, until a sample is only a few rows long.
+                grid=lambda signal: (*(4.0 + 0.3 * k for k in range(390)), *(121.0 * 1.004**k for k in range(440))),
+                grid_measure="record/n",
             ),
             # At most one period: a bound that moves with Ts, so a refit leaves it.
-            "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period", held=True),
+            "compute": EffectParameter(0.0, unit="s", description="computation time, at most one period", fixed=True),
         }
     ),
     rewrite=rewrite,
-    late=lambda p: p["Ts"] / 2 + p["compute"],
+    equivalent_delay=lambda p: p["Ts"] / 2 + p["compute"],
     sentence="{at} is sampled every {Ts} and published {compute} later",
-    excited_by="a step or ramp through the slot, recorded several times per sampling period",
+    excited_by="a step or ramp of the signal, recorded several times per sampling period",
     example=FrozenMap({"Ts": 0.0013, "compute": 0.0003}),
-    states="one held value a slot",
+    states="one held value per insertion point",
     confusable=FrozenMap(
         {
             "delay": "recordings finer than the sampling period: the held signal moves in steps (mean delay Ts/2 + compute)",

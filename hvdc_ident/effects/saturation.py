@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u bent towards the level."""
+    """Return level tanh(u/level)."""
     return p["level"] * sp.tanh(u / p["level"])
 
 
@@ -26,7 +26,7 @@ EFFECT = Effect(
                 description="magnitude it tends to",
                 measure="peak",
                 probes=(0.8, 1.5, 3.0, 6.0),
-                # Of a signal that hardly moves a bend by a few parts in a million shows, as an offset does.
+                # On a signal that hardly moves a curvature of a few parts in a million shows, as an offset does.
                 search=(0.1, 100.0),
             )
         }

@@ -10,7 +10,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """y of the pair y' = wn v, v' = wn (u - y - 2 zeta v): v is in the unit of y, so that the states compare."""
+    """Return y of the pair y' = wn v, v' = wn (u - y - 2 zeta v); v is in the unit of y, so that the states are comparable."""
     wn, zeta = p["wn"], p["zeta"]
     y, _ = add.states(("y", "v"), lambda s: (wn * s[1], wn * (u - s[0] - 2 * zeta * s[1])), rests=(u, sp.S.Zero))
     return y
@@ -34,12 +34,12 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    late=lambda p: 2 * p["zeta"] / p["wn"],
-    widens=("lag",),
-    sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}, {late} late",
-    excited_by="a step through the slot, recorded at several samples per 1/wn",
+    equivalent_delay=lambda p: 2 * p["zeta"] / p["wn"],
+    generalises=("lag",),
+    sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}, {equivalent_delay} late",
+    excited_by="a step of the signal, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.5}),
-    states="y and its rate v = y'/wn, one pair a slot",
+    states="y and its rate v = y'/wn, one pair per insertion point",
     confusable=FrozenMap(
         {
             "lag": "excitation up to wn: the second order begins with no slope and may ring",

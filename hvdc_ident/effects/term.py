@@ -1,4 +1,4 @@
-"""A term found from data: u + f(signals), f given with its coefficients; what no other effect of the catalogue is."""
+"""A further term found from data: u + f(signals), f given as an expression with its coefficients."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """u and the term; in it the slot's own name is u."""
+    """Return u plus the term, in which the name of the insertion point stands for u."""
     return u + p["expression"]
 
 

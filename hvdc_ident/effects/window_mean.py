@@ -9,7 +9,7 @@ from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """The state y' = (u - u(t - T)) / T; at rest it is u, which the derivative alone would leave open."""
+    """Return the state y' = (u - u(t - T)) / T; its value at rest, u, does not follow from the derivative."""
     before = add.delay(u, p["T"])
     return add.state("y", lambda y: (u - before) / p["T"], rest=u)
 
@@ -25,11 +25,11 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    late=lambda p: p["T"] / 2,
+    equivalent_delay=lambda p: p["T"] / 2,
     sentence="{at} is the mean over the last {T}",
-    excited_by="a step through the slot, recorded at several samples per window",
+    excited_by="a step of the signal, recorded at several samples per window",
     example=FrozenMap({"T": 0.01}),
-    states="y, one a slot, and the signal's history over T",
+    states="y, one per insertion point, and the signal's history over T",
     confusable=FrozenMap(
         {
             "lag": "excitation up to 1/T: the mean is a straight line after a step and ends after T",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.effects.placing import EffectUse
+from hvdc_ident.effects import EffectUse
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.files import digest
 from hvdc_ident.fmu.description import Description, Interface, Variable, read_description
@@ -77,7 +77,7 @@ class FmuModel:
         return self.fmu.interface == "model-exchange"
 
     @cached_property
-    def slots(self) -> tuple[str, ...]:
+    def insertion_points(self) -> tuple[str, ...]:
         """Names at which an effect may sit: inputs, and outputs as "outputs.NAME" where an input has the name."""
         return (*self.inputs, *(o if o not in self.inputs else f"outputs.{o}" for o in self.outputs))
 
@@ -172,9 +172,9 @@ class FmuModel:
 
         return with_effects(self, effects)
 
-    def driven(self, slots: Iterable[str]) -> FmuModel:
-        """The model itself where only inputs are driven. Raises ModelError for any other slot."""
-        for name in slots:
+    def driven(self, points: Iterable[str]) -> FmuModel:
+        """The model itself where only inputs are driven. Raises ModelError for any other insertion point."""
+        for name in points:
             if name not in self.inputs:
                 raise ModelError(
                     f"'{name}' cannot be driven", where=f"model '{self.name}'", expected="an input: an FMU is closed"

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.effects import EffectUse, effects, joined
-from hvdc_ident.effects.placing import apply
+from hvdc_ident.effects import EffectUse, apply_effects, effects, joined_sources
 from hvdc_ident.errors import InputError, ModelError, unknown_name
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.fmu.evaluate import Direction, bare, changed, inputs_of
@@ -315,7 +314,7 @@ NAME = re.compile(r"[A-Za-z_]\w*")
 
 
 def end_of(model: FmuModel, place: str) -> tuple[End, int] | None:
-    """On which side a slot lies and its number there; None for what is no slot."""
+    """Return the side of an insertion point and its number there; None for what is none."""
     name = place.removeprefix("outputs.")
     if place in model.inputs:
         return "input", list(model.inputs).index(place)
@@ -354,7 +353,9 @@ def _check(model: FmuModel, use: EffectUse) -> None:
     where = f"effect '{use.effect}' at {', '.join(use.at)}"
     for place in use.at:
         if end_of(model, place) is None:
-            raise unknown_name("slot", place, model.slots, where=f"model '{model.name}', which is closed inside")
+            raise unknown_name(
+                "insertion point", place, model.insertion_points, where=f"model '{model.name}', which is closed inside"
+            )
     for name, value in use.parameters.items():
         if isinstance(value, str):
             raise ModelError(
@@ -378,7 +379,7 @@ def _check_reading(model: FmuModel, place: str, name: str, where: str) -> None:
     here, there = end_of(model, place), end_of(model, name)
     assert here is not None
     if there is None:
-        known = model.inputs if here[0] == "input" else [s for s in model.slots if s not in model.inputs]
+        known = model.inputs if here[0] == "input" else [s for s in model.insertion_points if s not in model.inputs]
         raise unknown_name("signal", name, known, where=f"{where} (the model is closed inside)")
     if here[0] == there[0]:
         return
@@ -409,7 +410,7 @@ def _at(model: FmuModel, end: End) -> tuple[EffectUse, ...]:
                 replace(
                     use,
                     at=tuple(f"{letter}{k}" for _, k in places),
-                    source=joined(f"{letter}{k}" for _, k in read),
+                    source=joined_sources(f"{letter}{k}" for _, k in read),
                     expression=_renamed(model, use),
                 )
             )
@@ -440,9 +441,7 @@ def _passage(count: int, uses: tuple[EffectUse, ...], values: Sequence[float], a
         inputs=FrozenMap(inputs),
         outputs=FrozenMap({n: Output(e) for n, e in passing.items()}),
     )
-    for use in uses:
-        model = apply(model, use, effects()[use.effect])
-    return model
+    return apply_effects(model, uses)
 
 
 def _in_own_names(model: FmuModel, use: EffectUse, error: InputError) -> InputError:

@@ -76,7 +76,7 @@ def structure(model: Model | None, problem: Problem, seed: int = 0) -> Structure
     if not recordings:
         return _by_numbers(numbers, "there are frequency responses only")
     if any(e.drive or e.instrument for e in recordings):
-        return _by_numbers(numbers, "slots are driven by recordings, or outputs seen through instruments")
+        return _by_numbers(numbers, "insertion points are driven by recordings, or outputs seen through instruments")
     moved = moves(recordings)
     result = structural_identifiability(model, names, outputs, inputs=moved, seed=seed, time_limit=SECONDS)
     if result.out_of_reach:

@@ -39,7 +39,7 @@ class State:
 
 @dataclass(frozen=True)
 class Signal:
-    """A named intermediate signal: a slot where an effect can be put."""
+    """A named intermediate signal: a point where an effect can be inserted."""
 
     value: sp.Expr
     unit: str = ""
@@ -112,7 +112,7 @@ class Model(Shown):
     Plain values are accepted where an object with more detail is stored: a number for a Parameter or an Input, an
     expression for a State, Signal, Algebraic or Output.
 
-    origin: what it was made from by `with_values` and `with_effects`; no part of its definition.
+    origin: what it was made from by `with_values` and `hvdc_ident.effects.apply_effects`; no part of its definition.
 
     Raises ModelError where names clash, are unknown, or signals run in a circle.
     """
@@ -138,7 +138,7 @@ class Model(Shown):
         check(self)
 
     @cached_property
-    def slots(self) -> tuple[str, ...]:
+    def insertion_points(self) -> tuple[str, ...]:
         """Names at which an effect may sit: inputs, named signals, unknowns, states; outputs as "outputs.NAME" where the name is taken."""
         inner = [*self.inputs, *self.signals, *self.algebraic, *self.states]
         return (*inner, *(o if o not in inner else f"outputs.{o}" for o in self.outputs))
@@ -165,20 +165,11 @@ class Model(Shown):
             self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs), origin=self.origin or ModelOrigin(self)
         )
 
-    def with_effects(self, effects: Iterable[Any]) -> Model:
-        """The model with effects put on its slots, one after the other; an effect at its neutral value changes nothing.
-
-        effects: `EffectUse` objects or dicts {"effect": name, "at": slot or slots, "parameters": {NAME: value}}.
-        """
-        from hvdc_ident.effects import apply_effects
-
-        return apply_effects(self, effects)
-
-    def driven(self, slots: Iterable[str]) -> Model:
-        """The model in which the slots are inputs: they follow a recorded column instead of their equation."""
+    def driven(self, points: Iterable[str]) -> Model:
+        """Return the model in which these insertion points are inputs that follow a recorded column, not their equation."""
         from hvdc_ident.model.transform import driven
 
-        return driven(self, tuple(slots))
+        return driven(self, tuple(points))
 
     def parameterised(self, name: str) -> Model:
         """The model in another of its own parameterisations; the values follow from the new parameters' start values."""
@@ -262,7 +253,7 @@ class Model(Shown):
 
 
 class External(Protocol):
-    """An FMU, or anything else with a model's names that can be run. Slots are its inputs and outputs."""
+    """An FMU, or anything else with a model's names that can be run. Its insertion points are its inputs and outputs."""
 
     @property
     def name(self) -> str:
@@ -293,7 +284,7 @@ class External(Protocol):
         """None: it is closed."""
 
     @property
-    def slots(self) -> tuple[str, ...]:
+    def insertion_points(self) -> tuple[str, ...]:
         """Names at which an effect may sit."""
 
     @property
@@ -318,10 +309,10 @@ class External(Protocol):
         """Return whether `recording` takes the name."""
 
     def with_effects(self, effects: Iterable[Any]) -> External:
-        """The model with effects at its slots."""
+        """Return the model with effects at its insertion points, for `hvdc_ident.effects.apply_effects`."""
 
-    def driven(self, slots: Iterable[str]) -> External:
-        """The model in which the slots follow a recorded column."""
+    def driven(self, points: Iterable[str]) -> External:
+        """Return the model in which these insertion points follow a recorded column."""
 
     def parameterised(self, name: str) -> External:
         """The model in another parameterisation."""

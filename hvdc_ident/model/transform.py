@@ -1,4 +1,4 @@
-"""Models made from models: slots rewritten, driven by recordings, or written in other parameters."""
+"""Models made from models: insertion points rewritten, driven by recordings, or written in other parameters."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def substituted(model: Model, renaming: Renaming) -> dict[str, Any]:
 
 
 def insertion_point(model: Model, name: str) -> tuple[str, str]:
-    """(kind, name) of a slot: input, signal, algebraic, state or output; "outputs.NAME" asks for the output."""
+    """Return (kind, name) of an insertion point: input, signal, algebraic, state or output; "outputs.NAME" asks for the output."""
     if name.startswith("outputs."):
         if name[8:] in model.outputs:
             return "output", name[8:]
@@ -58,11 +58,11 @@ def insertion_point(model: Model, name: str) -> tuple[str, str]:
         ):
             if name in names:
                 return kind, name
-    raise unknown_name("slot", name, model.slots, where=f"model '{model.name}'")
+    raise unknown_name("insertion point", name, model.insertion_points, where=f"model '{model.name}'")
 
 
 def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.Expr], tuple[Model, sp.Expr]]) -> Model:
-    """The model in which all readers of a slot see another expression of it.
+    """Return the model in which all readers of an insertion point see another expression of it.
 
     rewrite(model, u) returns the model with what it needs added, and the expression y of u that readers see. Before the
     rewrite u is a name of its own: `NAME_before_LABEL` for signals and unknowns (readers keep the name), else readers
@@ -108,17 +108,17 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
 
 
 def blended(model: Model) -> tuple[Model, str]:
-    """The model with a parameter that puts its effects in by and by, and the parameter's name ("" without effects).
+    """Return the model with a parameter that scales its effects from 0 to 1, and its name ("" without effects).
 
-    Readers of a slot see u + blend (y - u): at 0 they see what they see in the model of origin, at 1 the model is itself.
+    Readers of an insertion point see u + blend (y - u): at 0 they see what they see in the model of origin, at 1 the model is itself.
     """
     if model.origin is None or not model.origin.neutral:
         return model, ""
     neutral, name = model.origin.neutral, fresh(model, "blend")
     share = symbol(name)
 
-    def seen(slot: str, value: sp.Expr) -> sp.Expr:
-        return neutral[slot] + share * (value - neutral[slot]) if slot in neutral else value
+    def seen(point: str, value: sp.Expr) -> sp.Expr:
+        return neutral[point] + share * (value - neutral[point]) if point in neutral else value
 
     signals = {n: replace(s, value=seen(n, s.value)) for n, s in model.signals.items()}
     algebraic = {n: replace(a, equation=seen(n, a.equation)) for n, a in model.algebraic.items()}
@@ -132,10 +132,10 @@ def blended(model: Model) -> tuple[Model, str]:
     return made, name
 
 
-def insertion_point_of(slots: Collection[str], name: str) -> str:
-    """The slot among these that a name of `rewritten` was made at, where the name itself is none of them; else the name."""
+def insertion_point_of(points: Collection[str], name: str) -> str:
+    """Return the insertion point among these that `rewritten` made the name at; the name itself where it is one of them."""
     found = name
-    while found not in slots:
+    while found not in points:
         base = max(found.rpartition("_before_")[0], found.rpartition("_after_")[0], key=len)
         if not base:
             return name
@@ -160,10 +160,10 @@ def _derived(model: Model) -> Model:
     return model if model.origin else replace(model, origin=ModelOrigin(model))
 
 
-def driven(model: Model, slots: tuple[str, ...]) -> Model:
-    """The model in which the slots are inputs of the same name, to follow a recorded column."""
-    model = _derived(model) if slots else model
-    for given in slots:
+def driven(model: Model, points: tuple[str, ...]) -> Model:
+    """Return the model in which the insertion points are inputs of the same name, to follow a recorded column."""
+    model = _derived(model) if points else model
+    for given in points:
         kind, name = insertion_point(model, given)
         if kind == "output":
             raise ModelError(

@@ -126,7 +126,7 @@ def model(
 
     filters: measurements that pass a critically damped second-order low-pass, -3 dB at FM (140 Hz); P and Q unfiltered
     make a circle through their proportional gains, so that they are unknowns then. priority: the axis whose order is
-    limited first. Sampling, computation delay and noise of the controller: effects on the slots Vdc1_m, P2_m, Q1_m,
+    limited first. Sampling, computation delay and noise of the controller: effects at Vdc1_m, P2_m, Q1_m,
     Q2_m, Irorder1 and so on.
     """
     chosen = frozenset(filters)

@@ -1,5 +1,5 @@
-"""Runs of experiments: with what an experiment changes of the model, which are slots driven by recorded columns, outputs seen through
-instruments, inputs with an unknown offset and states with a start of their own."""
+"""Runs of experiments on the model that an experiment describes: insertion points driven by recorded columns, outputs seen
+through instruments, inputs with an unknown offset, and states with a start of their own."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def with_recording(model: Model, experiment: Experiment) -> Model:
-    """The model with the experiment's driven slots as inputs and its recording chains on the outputs."""
+    """The model with the experiment's driven insertion points as inputs and its recording chains on the outputs."""
     if not experiment.drive and not experiment.instrument:
         return model
     return _with_recording(model, experiment.drive, experiment.instrument)
@@ -33,7 +34,7 @@ def with_recording(model: Model, experiment: Experiment) -> Model:
 
 @lru_cache(maxsize=32)
 def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[FrozenMap[float]]) -> Model:
-    return model.driven(drive).with_effects(chains_of(instrument))
+    return apply_effects(model.driven(drive), chains_of(instrument))
 
 
 def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:

@@ -164,7 +164,7 @@ def _check_port(port: schema.PortTable, study: Study, where: str) -> None:
 
     model = study.model
     assert isinstance(model, Model)
-    require_known("signal", port.source, model.slots, f"{where}, source")
+    require_known("signal", port.source, model.insertion_points, f"{where}, source")
     known = [*model.inputs, *model.states, *model.signals, *model.algebraic, *model.parameters]
     for key, texts in (("voltage", port.voltage), ("current", port.current), ("angle", [port.angle])):
         for text in texts:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError
 from hvdc_ident.executor import Progress, silent
 from hvdc_ident.files import csv_text, write_text
@@ -122,7 +123,7 @@ class Campaign:
     @property
     def model(self) -> AnyModel:
         """What makes the waveforms."""
-        return load_model(self.source).with_effects(self.effects)
+        return apply_effects(load_model(self.source), self.effects)
 
 
 def experiments(campaign: Campaign) -> tuple[Experiment, ...]:

@@ -156,7 +156,7 @@ def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> 
     signals = [*table.inputs, *table.outputs, *table.drive]
     require_known("input", table.inputs, model.inputs, f"{place}.inputs")
     require_known("output", table.outputs, model.outputs, f"{place}.outputs")
-    require_known("slot", table.drive, model.slots, f"{place}.drive")
+    require_known("insertion point", table.drive, model.insertion_points, f"{place}.drive")
     require_known("measured output", table.noise, table.outputs, f"{place}.noise")
     require_known("measured output", table.instrument, table.outputs, f"{place}.instrument")
     require_known("signal of the experiment", table.columns, ["time", *signals], f"{place}.columns")
@@ -179,7 +179,7 @@ def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> 
 
 
 def _channels(table: schema.ExperimentTable) -> list[tuple[str, str]]:
-    """Signal of the model and recorded column, for inputs, driven slots and outputs; a column may serve twice."""
+    """Signal of the model and recorded column, for inputs, driven insertion points and outputs; a column may serve twice."""
     pairs = []
     for signal, column in (*table.inputs.items(), *table.drive.items(), *table.outputs.items()):
         line = table.columns.get(signal)

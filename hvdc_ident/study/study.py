@@ -11,6 +11,7 @@ import numpy as np
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
@@ -200,7 +201,7 @@ def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyMode
             model = recording(model, names)
         if table.effect:
             place = "model.effect"
-            model = model.with_effects([e.model_dump(by_alias=True, exclude_none=True) for e in table.effect])
+            model = apply_effects(model, [e.model_dump(by_alias=True, exclude_none=True) for e in table.effect])
         place = "model.values"
         model = model.with_values(table.values) if table.values else model
     except InputError as e:

@@ -26,6 +26,7 @@ from common.work import processes  # noqa: E402
 from hvdc_ident import load_study, simulate  # noqa: E402
 from hvdc_ident.data import Experiment, Trajectory  # noqa: E402
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
+from hvdc_ident.effects import apply_effects  # noqa: E402
 from hvdc_ident.fit import FitParameter, Problem, fit  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
 from hvdc_ident.simulate import ModelSimulator  # noqa: E402
@@ -74,7 +75,7 @@ def refits() -> dict[str, Any]:
     }
     for effect, places in TRIED.items():
         for place, at in places.items():
-            more = model.with_effects([{"effect": effect, "at": at, "parameters": {"T": 1e-3}}])
+            more = apply_effects(model, [{"effect": effect, "at": at, "parameters": {"T": 1e-3}}])
             (name,) = (n for n in more.parameters if n not in model.parameters)
             result = fit(
                 Problem(ModelSimulator(more), (e,), (*free, FitParameter(name, 1e-3, 1e-4, 1e-2))), starts=4, seed=0

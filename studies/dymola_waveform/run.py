@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hvdc_ident import load_study, simulate
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.simulate import ModelSimulator
 
@@ -36,7 +37,7 @@ def main() -> dict:
     free = tuple(study.candidates.values())
     plain = fit(Problem(ModelSimulator(study.model), study.experiments, free), starts=8, seed=0)
     lag = {"effect": "lag", "at": ["Ir1", "Ii1", "Ir2", "Ii2"], "parameters": {"T": 1e-3}}
-    lagged_model = study.model.with_effects([lag])
+    lagged_model = apply_effects(study.model, [lag])
     more = (*free, FitParameter("lag_Ir1_T", 1e-3, 1e-4, 1e-2))
     lagged = fit(Problem(ModelSimulator(lagged_model), study.experiments, more), starts=4, seed=0)
     start = {n: f.start for n, f in study.candidates.items()}

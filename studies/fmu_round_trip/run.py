@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hvdc_ident.data import Experiment, InputSignal, experiment
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.files import csv_text, json_text, write_text
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.linearize import linearize
@@ -57,7 +57,7 @@ def models(quick: bool) -> Iterator[tuple[str, Model]]:
             source=SOURCE if effect.needs_source else "",
             expression=f"k*{SOURCE}**2" if effect.needs_expression else "",
         )
-        yield f"link, {name}", link.with_effects([use])
+        yield f"link, {name}", apply_effects(link, [use])
 
 
 def case(model: Model) -> Experiment:
@@ -109,8 +109,8 @@ CASES = {
         lambda: load_model("vsc-hvdc-link"), {"KPVDC": (20.0, 10.0, 40.0), "KIVDC": (650.0, 550.0, 950.0)}, "Irorder1"
     ),
     "link with a lag": Case(
-        lambda: load_model("vsc-hvdc-link").with_effects(
-            [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}}]
+        lambda: apply_effects(
+            load_model("vsc-hvdc-link"), [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}}]
         ),
         {"KPVDC": (20.0, 10.0, 40.0), "KIVDC": (650.0, 550.0, 950.0), "lag_Ir1_T": (0.001, 1e-4, 0.01)},
         "Irorder1",

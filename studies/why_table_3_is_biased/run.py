@@ -23,6 +23,7 @@ from common.ending import markdown, number  # noqa: E402
 from common.work import processes  # noqa: E402
 
 from hvdc_ident.data import Experiment, InputSignal, experiment  # noqa: E402
+from hvdc_ident.effects import apply_effects  # noqa: E402
 from hvdc_ident.fit import FitParameter, Problem, fit  # noqa: E402
 from hvdc_ident.immutable import FrozenMap  # noqa: E402
 from hvdc_ident.model import Model  # noqa: E402
@@ -107,7 +108,7 @@ def after(found: Mapping[str, Any]) -> dict[str, Any]:
 
 def planted() -> dict[str, Any]:
     """Return the gains of the plain link, and of the link with a lag, fitted to the link with a lag of 1.6 ms on all currents."""
-    lagged = load_model(paper.LINK).with_effects([LAGGED])
+    lagged = apply_effects(load_model(paper.LINK), [LAGGED])
     experiments = [recorded(lagged, name) for name in PLANTED]
     plain = fit(Problem(paper.link(), tuple(experiments), paper.free(MOVED)), starts=4)
     begun = (*paper.free(MOVED), FitParameter(LAG_NAME, 5e-4, 1e-5, 1e-2))

@@ -20,6 +20,7 @@ from hvdc_ident.discrepancy.trials.context import Round
 from hvdc_ident.discrepancy.trials.formula import formula_job
 from hvdc_ident.discrepancy.trials.library import Term
 from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -95,10 +96,10 @@ def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> N
     clipped = {"effect": "limit", "at": "load", "parameters": {"level": 0.25}}
     bends = ("gain", "limit", "saturation", "deadband")
     found = diagnose(
-        model(), shown(model().with_effects([clipped]), still="load"), FREE, effects=bends, places=["load"]
+        model(), shown(apply_effects(model(), [clipped]), still="load"), FREE, effects=bends, places=["load"]
     )
     assert found.verdict == "ambiguous"
     assert {r.effect for r in found.ambiguity[0]} == set(bends)
     more = {"effect": "gain", "at": "load", "parameters": {"k": 1.2}}
-    found = diagnose(model(), shown(model().with_effects([more]), still="load"), FREE, effects=bends, places=["load"])
+    found = diagnose(model(), shown(apply_effects(model(), [more]), still="load"), FREE, effects=bends, places=["load"])
     assert found.verdict == "named" and not found.ambiguity, "none of them adds"

@@ -192,7 +192,7 @@ def test_the_verb_is_public_and_wrong_questions_are_refused() -> None:
     assert hvdc_ident.Diagnosis is Diagnosis
     with pytest.raises(UnknownNameError, match="no effect 'lagg'"):
         diagnose(model(), experiments(), FREE, effects=["lagg"])
-    with pytest.raises(UnknownNameError, match="no slot 'wx'"):
+    with pytest.raises(UnknownNameError, match="no insertion point 'wx'"):
         diagnose(model(), experiments(), FREE, effects=["lag"], places=["wx"])
     with pytest.raises(StudyError, match="nothing to diagnose"):
         diagnose(model(), [e.with_(role="holdout") for e in experiments()], FREE)

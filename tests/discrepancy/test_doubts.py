@@ -20,6 +20,7 @@ from hvdc_ident.discrepancy.search.rounds import one_round
 from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick
 from hvdc_ident.discrepancy.verdict.doubts import Doubt, _turned, doubt
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -40,7 +41,7 @@ def lossy() -> Refit:
 
 
 def test_of_what_is_there_every_chance_is_as_likely() -> None:
-    there = model().with_effects([{"effect": "lag", "at": ["wm"], "parameters": {"T": 0.03}}])
+    there = apply_effects(model(), [{"effect": "lag", "at": ["wm"], "parameters": {"T": 0.03}}])
     records = experiments()
     found = [chance(lagged(plain(answered(there, records, seed)))) for seed in range(25)]
     assert kstest(found, "uniform").pvalue > 1e-3, np.sort(found)
@@ -76,7 +77,7 @@ def test_a_name_is_in_doubt_where_experiments_ask_for_different_sizes() -> None:
 
 
 def test_a_name_is_in_doubt_where_something_quicker_shows_after_breaks() -> None:
-    there = model().with_effects([{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
+    there = apply_effects(model(), [{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
     quick = plain(answered(there, experiments(), seed=0))
     against = doubted(run(beside(quick, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})))
     assert against is not None and "first rows after" in against.why and "as densely" in against.advice
@@ -116,7 +117,7 @@ def test_a_play_that_is_passed_in_one_direction_is_doubted() -> None:
         for e in experiments():
             steps = [(0.2 + 0.5 * k, move) for k, move in enumerate(moves)]
             held.append(replace(e, inputs=FrozenMap({"ref": InputSignal.corners(corners(1.0, steps))})))
-        there = model().with_effects([{"effect": "backlash", "at": ["ref"], "parameters": {"width": 0.2}}])
+        there = apply_effects(model(), [{"effect": "backlash", "at": ["ref"], "parameters": {"width": 0.2}}])
         first = plain(answered(there, held, seed=0))
         refits[name] = run(beside(first, "backlash", "ref", {"width": 0.18}, {"width": (1e-3, 1.0)}))
     against = doubted(refits["up"])

@@ -42,7 +42,7 @@ def test_what_passes_a_band_differently_is_told_as_a_filter(
     assert found.parameters_after["Ki"] == pytest.approx(TRUE["Ki"], rel=0.05)
     assert not [text for text in looks if text.startswith(("round 2", "round 1: a closer look"))]
     assert isinstance(found.augmented, Model)
-    assert parse_card(write_card(found.augmented)).slots == found.augmented.slots
+    assert parse_card(write_card(found.augmented)).insertion_points == found.augmented.insertion_points
 
 
 def test_a_lag_is_named_though_a_wide_filter_comes_near_it() -> None:

@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.scores.inversion import Inversion
 from hvdc_ident.discrepancy.scores.scan import _looked
 from hvdc_ident.discrepancy.scores.scored import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.effects import SlotSignal, effects
+from hvdc_ident.effects import SignalScales, effects
 from hvdc_ident.immutable import FrozenMap
 
 STEP = 0.11
@@ -141,8 +141,8 @@ def test_a_step_is_met_among_hundreds(levels: tuple[tuple[Experiment, ...], dict
 @pytest.mark.parametrize("middle", [0.0, 1.0, 10.0])
 def test_of_the_levels_of_a_closer_look_one_puts_its_marks_where_any_step_does(middle: float) -> None:
     time = np.linspace(0.0, 1.0, 101)
-    signal = SlotSignal.of([time], [middle + 0.5 * np.sin(7 * time)])
-    scan = effects()["quantisation"].parameters["step"].scan
+    signal = SignalScales.of([time], [middle + 0.5 * np.sin(7 * time)])
+    scan = effects()["quantisation"].parameters["step"].grid
     assert scan is not None
     steps = signal.peak / np.array(scan(signal))
     assert 0.5 * signal.range < steps.max() < 2.0 * signal.range and steps.min() < signal.range / 35

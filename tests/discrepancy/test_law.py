@@ -127,7 +127,7 @@ def test_what_hangs_on_one_signal_and_is_no_formula_is_told_as_a_curve_and_put_i
     assert np.abs(value - error(at))[known].max() < 0.01
     assert isinstance(found.augmented, Model) and found.parameters_after["Ki"] == pytest.approx(TRUE["Ki"], rel=0.05)
     assert (found.gap.shrink_holdout or 0.0) > 0.5
-    assert parse_card(write_card(found.augmented)).slots == found.augmented.slots
+    assert parse_card(write_card(found.augmented)).insertion_points == found.augmented.insertion_points
 
 
 @pytest.mark.parametrize("peak", range(4))

@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.scores.inversion import Inversion
 from hvdc_ident.discrepancy.scores.reach import SHARE, reach
 from hvdc_ident.discrepancy.scores.scored import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.effects import SlotSignal, effects, scanned
+from hvdc_ident.effects import SignalScales, effects, size_grid
 
 
 @pytest.mark.parametrize("place", ["torque", "outputs.w"])
@@ -54,7 +54,7 @@ def clipped(level: float) -> tuple[Experiment, ...]:
 
 def test_what_sits_at_a_slot_is_within_its_reach_and_not_within_that_of_others() -> None:
     nominal = plain(clipped(0.6)).nominal()
-    found = reach(nominal, runs(model(), nominal), model().slots, None)
+    found = reach(nominal, runs(model(), nominal), model().insertion_points, None)
     assert found is not None
     assert next(iter(found.shares)) == "outputs.torque"
     assert found.shares["outputs.torque"] == pytest.approx(1.0, abs=0.1)
@@ -65,13 +65,13 @@ def test_what_sits_at_a_slot_is_within_its_reach_and_not_within_that_of_others()
 def test_nothing_is_told_where_it_cannot_be() -> None:
     nominal = plain(experiments(lag=0.03)).nominal()
     paths = runs(model(), nominal)
-    assert reach(nominal, paths, model().slots, None) is not None
+    assert reach(nominal, paths, model().insertion_points, None) is not None
     long = {n: replace(p, count=500) for n, p in paths.items() if isinstance(p, Along)}
-    assert reach(nominal, long, model().slots, None) is None
+    assert reach(nominal, long, model().insertion_points, None) is None
     closed = {**paths, "closed": object()}
-    assert reach(nominal, closed, model().slots, None) is None  # type: ignore[arg-type]
+    assert reach(nominal, closed, model().insertion_points, None) is None  # type: ignore[arg-type]
     quiet = plain(experiments()).nominal()
-    assert reach(quiet, runs(model(), quiet), model().slots, None) is None
+    assert reach(quiet, runs(model(), quiet), model().insertion_points, None) is None
 
 
 def test_what_is_refitted_first_sits_within_reach_and_the_diagnosis_tells_of_it() -> None:
@@ -89,9 +89,9 @@ def test_what_is_refitted_first_sits_within_reach_and_the_diagnosis_tells_of_it(
 @pytest.mark.parametrize("effect", ["quantisation", "sample-hold"])
 def test_every_size_of_a_closer_look_lies_within_the_bounds_of_its_probe(effect: str) -> None:
     time = np.linspace(0.0, 1.0, 301)
-    signal = SlotSignal.of([time], [1.0 + 0.5 * np.sin(7 * time)])
-    probe, sizes = scanned(effects()[effect], signal)
-    name = next(n for n, q in effects()[effect].parameters.items() if q.scan is not None)
+    signal = SignalScales.of([time], [1.0 + 0.5 * np.sin(7 * time)])
+    probe, sizes = size_grid(effects()[effect], signal)
+    name = next(n for n, q in effects()[effect].parameters.items() if q.grid is not None)
     low, high = probe.free[name]
     assert sizes.size > 500 and low <= sizes.min() and sizes.max() <= high
     assert probe.values[name] == sizes[0]

@@ -10,6 +10,7 @@ from scipy.signal import StateSpace, lsim
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.discrepancy.signatures.block import block
 from hvdc_ident.discrepancy.signatures.response import along, instants
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -47,7 +48,7 @@ def test_a_small_gain_error_answers_as_the_model_with_it(place: str) -> None:
     path = along(model(), e, {})
     u = path.signal(place)
     _, y = path.answer([place], (1e-4 * u)[None, :, None])
-    with_it = model().with_effects([{"effect": "gain", "at": place, "parameters": {"k": 1.0001}}])
+    with_it = apply_effects(model(), [{"effect": "gain", "at": place, "parameters": {"k": 1.0001}}])
     exact = simulate(with_it, e).trajectory.values - simulate(model(), e).trajectory.values
     assert np.abs(y[:, :, 0].T - exact).max() < 0.01 * np.abs(exact).max()
 
@@ -80,7 +81,7 @@ def test_an_input_known_at_every_row_needs_few_instants_more(place: str) -> None
     u = path.signal(place)[:, None]
     d = block("lag", ("T",), False).run({"own_T": np.array([short])}, path.time, u, None) - u
     _, y = path.answer([place], d[None])
-    with_it = model().with_effects([{"effect": "lag", "at": place, "parameters": {"T": short}}])
+    with_it = apply_effects(model(), [{"effect": "lag", "at": place, "parameters": {"T": short}}])
     exact = simulate(with_it, e).trajectory.values - simulate(model(), e).trajectory.values
     assert np.abs(y[:, :, 0].T - exact).max() < 0.05 * np.abs(exact).max()
 

@@ -23,7 +23,7 @@ from hvdc_ident.discrepancy.trials.objections import as_recorded, objections
 from hvdc_ident.discrepancy.trials.refitted import excess, like_noise, misses
 from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, behinds, shortlist
 from hvdc_ident.discrepancy.verdict.judge import _half_told, _named
-from hvdc_ident.effects import Probe
+from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -181,7 +181,9 @@ def test_a_form_with_a_parameter_more_is_no_less_likely_where_the_evidence_is_we
 
 def test_another_kind_of_delay_is_not_refuted_by_the_price_of_a_parameter() -> None:
     """A window is no special case of two lags: where both explain as much, fewer parameters are no evidence."""
-    there = model().with_effects([{"effect": "second-order", "at": ["wm"], "parameters": {"wn": 700.0, "zeta": 0.82}}])
+    there = apply_effects(
+        model(), [{"effect": "second-order", "at": ["wm"], "parameters": {"wn": 700.0, "zeta": 0.82}}]
+    )
     recorded = answered(there, experiments(), seed=0)
     found = diagnose(model(), recorded, FREE, effects=["window-mean", "second-order"], places=["wm"])
     (group,) = found.ambiguity

@@ -11,7 +11,7 @@ from cases import FREE, SIGMA, experiments, model
 from hvdc_ident import Experiment, Trajectory
 from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.refits.refit import METHOD
-from hvdc_ident.effects import EffectUse
+from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -37,7 +37,7 @@ def _chi2(problem: Problem, uses: dict[str, tuple[EffectUse, str, tuple[float, f
     subject, free, theta = model(), [*problem.free], [f.start for f in problem.free]
     for use, name, (start, low, high) in uses.values():
         before = set(subject.parameters)
-        subject = subject.with_effects([use])
+        subject = apply_effects(subject, [use])
         own = next(n for n in subject.parameters if n not in before and n.endswith(name))
         free.append(FitParameter(own, start, low, high))
         theta.append(start)

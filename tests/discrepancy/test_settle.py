@@ -113,7 +113,7 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
     """The velocity of a second-order lag, or a bit of a quantiser, is no place of the plant."""
     one = run(beside(first, "second-order", "wm", {"wn": 60.0, "zeta": 1.0}, {"wn": (5.0, 500.0), "zeta": (0.1, 2.0)}))
     two = run(beside(one, "quantisation", "outputs.w", {"step": 0.05}, {"step": (0.02, 0.1)}))
-    inner = [s for s in two.model.slots if any(p.use.made(s) for p in two.placed)]
+    inner = [s for s in two.model.insertion_points if any(p.use.made(s) for p in two.placed)]
     assert {"second_order_wm_y", "second_order_wm_v"} <= set(inner) and len(inner) > 40
     assert "wm" not in inner and "wm_before_second_order" not in inner
     search = SearchContext(("gain", "coupling"), None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)

@@ -27,7 +27,7 @@ from hvdc_ident.discrepancy.trials.hops import _polished, hopped
 from hvdc_ident.discrepancy.trials.refit_jobs import as_given, job
 from hvdc_ident.discrepancy.trials.refitted import on_bound, once_more, refitted
 from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, clear
-from hvdc_ident.effects import Probe
+from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 
@@ -104,7 +104,7 @@ def test_sizes_of_one_form_share_a_model() -> None:
 def test_what_answers_within_a_few_rows_is_louder_after_breaks() -> None:
     still = [plain(experiments(seed=seed)).nominal() for seed in range(5)]
     assert not any(loud_after_breaks(n) for n in still)
-    there = model().with_effects([{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
+    there = apply_effects(model(), [{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
     quick = plain(answered(there, experiments(), seed=0)).nominal()
     assert loud_after_breaks(quick)
     # However loud everything is: only where it is loud counts.
@@ -193,7 +193,8 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
 
 def test_what_looks_like_a_refit_that_ended_on_a_bound_is_refitted_too() -> None:
     """A controller that hardly sees its set-point: small, it leaves the trace of feedback times k; large, gains would be off bounds."""
-    deaf = model().with_effects(
+    deaf = apply_effects(
+        model(),
         [{"effect": "coupling", "at": ["err"], "parameters": {"k": -0.9}, "from": "ref"}],
     )
     recorded = answered(deaf, experiments(), seed=0)
@@ -230,7 +231,7 @@ def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> No
 def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
     """A sampler of the speed, found at the error: there it samples the set-point too, which its scores hardly tell."""
     period = PERIOD * 1.0001  # no sample falls on a break of the inputs
-    there = model().with_effects([{"effect": "sample-hold", "at": ["wm"], "parameters": {"Ts": period}}])
+    there = apply_effects(model(), [{"effect": "sample-hold", "at": ["wm"], "parameters": {"Ts": period}}])
     first = plain(answered(there, experiments(), seed=0))
     search = SearchContext(
         ("sample-hold",), ("wm", "err", "ref"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
@@ -271,7 +272,7 @@ def test_of_one_effect_the_best_is_looked_for_again_first(least: float, places: 
 
 def test_a_refit_of_levels_is_polished_without_slopes() -> None:
     """Where a gain moves rows go over an edge, and no slope tells of it: begun a little off, a refit is stuck at once."""
-    there = model().with_effects([{"effect": "quantisation", "at": ["wm"], "parameters": {"step": 0.03}}])
+    there = apply_effects(model(), [{"effect": "quantisation", "at": ["wm"], "parameters": {"step": 0.03}}])
     first = plain(answered(there, experiments(), seed=0))
     stuck = run(beside(first, "quantisation", "wm", {"step": 0.0302}, {"step": (1e-3, 0.3)}))
     assert stuck.chi2 > 5.0 * stuck.rows

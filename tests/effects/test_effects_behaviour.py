@@ -10,7 +10,7 @@ from scipy import integrate, signal
 
 from hvdc_ident import load_study
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.effects import EffectUse, alone, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effect_model, effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.model import Model
@@ -29,7 +29,7 @@ def passed(name, values, source=False, expression="", time=T, **options):
     """y of the effect on its own, driven by U (and SOURCE)."""
     use = EffectUse(name, ("u",), FrozenMap(values), source="source" if source else "", expression=expression)
     inputs = {"u": U} | ({"source": SOURCE} if source else {})
-    run = simulate(alone(use, source), experiment("bench", time, inputs), rtol=1e-10, **options)
+    run = simulate(effect_model(use, source), experiment("bench", time, inputs), rtol=1e-10, **options)
     return run["y"]
 
 
@@ -148,8 +148,9 @@ def test_quantisation_rounds():
     mine = passed("quantisation", {"step": step})
     np.testing.assert_allclose(mine[~edge], expected[~edge], atol=1e-12)
     assert np.abs(mine - expected).max() <= step * (1 + 1e-9)
-    recorded = Model("r", inputs={"u": 0.0}, outputs={"y": "u"}).with_effects(
-        [{"effect": "quantisation", "at": "outputs.y", "parameters": {"step": step}}]
+    recorded = apply_effects(
+        Model("r", inputs={"u": 0.0}, outputs={"y": "u"}),
+        [{"effect": "quantisation", "at": "outputs.y", "parameters": {"step": step}}],
     )
     y = simulate(recorded, experiment("bench", T, {"u": U}))["y"]
     tie = np.abs(u / step - np.floor(u / step) - 0.5) < 1e-9
@@ -178,7 +179,7 @@ def test_term_is_what_it_says():
 def test_a_delay_in_a_loop_is_the_method_of_steps():
     """x' = -x(t - 1) from x = 1: polynomials, interval by interval."""
     model = Model("m", states={"x": {"derivative": "-x", "start": 1.0}}, outputs={"seen": "x"})
-    late = model.with_effects([{"effect": "delay", "at": "x", "parameters": {"T": 1.0}}])
+    late = apply_effects(model, [{"effect": "delay", "at": "x", "parameters": {"T": 1.0}}])
     t = np.linspace(0.0, 3.0, 61)
     expected = np.select(
         [t <= 1, t <= 2, t <= 3],
@@ -223,7 +224,7 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
 )
 def test_it_linearises(name, values, expected):
     use = EffectUse(name, ("u",), FrozenMap(values), expression="k*u**3" if name == "term" else "")
-    model = alone(use)
+    model = effect_model(use)
     found = linearize(model, find_operating_point(model, {"u": 0.5}))
     omega = np.array([3.0, 40.0, 200.0])
     np.testing.assert_allclose(found.response(omega).ravel(), expected(1j * omega), atol=1e-7)
@@ -240,7 +241,7 @@ def test_it_linearises(name, values, expected):
     ],
 )
 def test_those_with_another_signal_linearise(name, values, gain):
-    model = alone(EffectUse(name, ("u",), FrozenMap(values), source="source"), source=True)
+    model = effect_model(EffectUse(name, ("u",), FrozenMap(values), source="source"), source=True)
     found = linearize(model, find_operating_point(model, {"u": 0.5, "source": 2.0}))
     np.testing.assert_allclose(found.response(np.array([40.0])).ravel(), [1.0, gain], atol=1e-12)
 
@@ -293,8 +294,8 @@ def test_study_files_put_effects_on(tmp_path):
 
 def test_a_disturbance_is_at_rest_in_the_value_it_has_at_the_start():
     model = Model("m", inputs={"u": 0.5}, states={"x": "u - x"}, outputs={"x": "x"})
-    shaken = model.with_effects(
-        [{"effect": "disturbance", "at": "u", "parameters": {"amplitude": 0.1, "frequency": 0.2, "phase": 0.3}}]
+    shaken = apply_effects(
+        model, [{"effect": "disturbance", "at": "u", "parameters": {"amplitude": 0.1, "frequency": 0.2, "phase": 0.3}}]
     )
     run = simulate(shaken, experiment("e", np.linspace(2.0, 3.0, 5)), sensitivities=["disturbance_u_amplitude"])
     sine = np.sin(2 * np.pi * 0.2 * 2.0 + 0.3)
@@ -313,15 +314,15 @@ LATE = {
 }
 
 
-@pytest.mark.parametrize("name", [n for n, e in effects().items() if e.late is not None])
+@pytest.mark.parametrize("name", [n for n, e in effects().items() if e.equivalent_delay is not None])
 def test_how_late_a_slow_signal_comes(name: str) -> None:
     """Behind a ramp of slope 1 the effect's output lags by as much, on average over a sampling period."""
-    late = effects()[name].late
+    late = effects()[name].equivalent_delay
     assert late is not None
     values = LATE[name]
     time = np.linspace(0.0, 1.0, 2001)
     ramp = experiment("ramp", time, {"u": InputSignal.ramp(0.0, 0.0, 1.0, 1.0)})
-    y = simulate(alone(EffectUse(name, ("u",), FrozenMap(values))), ramp)["y"]
+    y = simulate(effect_model(EffectUse(name, ("u",), FrozenMap(values))), ramp)["y"]
     settled = (time > 0.6) & (time <= 0.8)  # ten sampling periods
     assert np.mean((time - y)[settled]) == pytest.approx(late(values), abs=3e-4)
 
@@ -330,8 +331,8 @@ def test_what_sat_behind_an_effect_sits_where_that_one_did_without_it():
     link = load_model("vsc-hvdc-link")
     first = EffectUse("inner-loop", ("Irorder1",), FrozenMap({"wn": 500.0, "zeta": 0.7}))
     behind = EffectUse("coupling", ("Irorder1_before_inner_loop",), FrozenMap({"k": 0.1}), source="P1")
-    both = link.with_effects([first, behind])
+    both = apply_effects(link, [first, behind])
     assert behind.within(both) == behind
     alone = behind.within(link)
     assert alone.at == ("Irorder1",) and alone.source == "P1"
-    assert "Irorder1_before_coupling" in link.with_effects([alone]).signals
+    assert "Irorder1_before_coupling" in apply_effects(link, [alone]).signals

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, parse_card, write_card
@@ -104,16 +104,16 @@ def test_the_example_acts_and_its_values_are_the_effects_own(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_neutral_gives_the_base_model_back(name):
     for values in NEUTRAL.get(name, (declared(name),)):
-        assert LINK.with_effects([use(name, "P2_m", values)]) is LINK
+        assert apply_effects(LINK, [use(name, "P2_m", values)]) is LINK
     if not effects()[name].needs_expression:
         without_source = replace(use(name, "P2_m", declared(name)), source="")
-        assert LINK.with_effects([without_source]) is LINK
+        assert apply_effects(LINK, [without_source]) is LINK
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_near_neutral_it_is_near_the_base_model(name):
     small = {"k": 1e-9} if effects()[name].needs_expression else declared(name, near=True)
-    model = LINK.with_effects([use(name, "P2_m", NEARLY.get(name, small))])
+    model = apply_effects(LINK, [use(name, "P2_m", NEARLY.get(name, small))])
     assert model != LINK
     plain, with_it = (simulate(m, CASE, outputs=("P2",), rtol=1e-9)["P2"] for m in (LINK, model))
     np.testing.assert_allclose(with_it, plain, atol=SMALL.get(name, 3e-6))
@@ -122,7 +122,7 @@ def test_near_neutral_it_is_near_the_base_model(name):
 @pytest.mark.parametrize("at", ("Pref2", "xp"))
 @pytest.mark.parametrize("name", NAMES)
 def test_it_runs_at_inputs_and_states(name, at):
-    model = LINK.with_effects([use(name, at)])
+    model = apply_effects(LINK, [use(name, at)])
     change = np.abs(np.subtract(*(simulate(m, CASE, outputs=("P2",))["P2"] for m in (LINK, model)))).max()
     if at == "xp" and name in ("offset", "deadband"):
         assert change < 1e-8, "an integrator makes up for what is added to it"
@@ -133,7 +133,7 @@ def test_it_runs_at_inputs_and_states(name, at):
 @pytest.mark.parametrize("at", ("P2_m", "Ir2", "outputs.P2"))
 @pytest.mark.parametrize("name", NAMES)
 def test_it_runs_with_exact_sensitivities_at_signals_unknowns_and_outputs(name, at):
-    model = LINK.with_effects([use(name, at)])
+    model = apply_effects(LINK, [use(name, at)])
     assert model != LINK
     added = tuple(n for n in model.parameters if n not in LINK.parameters)
     assert len(added) == len(SIZES[name])
@@ -156,7 +156,7 @@ def test_it_runs_with_exact_sensitivities_at_signals_unknowns_and_outputs(name, 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_it_changes_what_it_sits_on_and_survives_a_card(name):
-    model = LINK.with_effects([use(name, ("P2_m", "Q2_m"))])
+    model = apply_effects(LINK, [use(name, ("P2_m", "Q2_m"))])
     again = parse_card(write_card(model))
     assert again == model
     added = [n for n in model.parameters if n not in LINK.parameters]
@@ -175,13 +175,13 @@ WIDER = {
 
 
 def test_an_effect_turns_into_those_that_it_widens():
-    assert {(n, other) for n, e in effects().items() for other in e.widens} == set(WIDER)
+    assert {(n, other) for n, e in effects().items() for other in e.generalises} == set(WIDER)
     plant = load_model("vsc-hvdc-link")
     moved = experiment("step", np.linspace(0.0, 0.4, 201), {"Vdcref1": InputSignal.step(0.05, 1.0, 1.01)})
     plain = simulate(plant, moved)["Irorder1"]
     for (wide, narrow), values in WIDER.items():
         runs = [
-            simulate(plant.with_effects([{"effect": e, "at": ["Vdc1_m"], "parameters": v}]), moved)["Irorder1"]
+            simulate(apply_effects(plant, [{"effect": e, "at": ["Vdc1_m"], "parameters": v}]), moved)["Irorder1"]
             for e, v in zip((wide, narrow), values, strict=True)
         ]
         assert np.abs(runs[0] - runs[1]).max() < 0.05 * np.abs(runs[1] - plain).max()
@@ -194,7 +194,7 @@ def test_it_describes_itself(name):
     words = (
         dict.fromkeys(effect.parameters, "1")
         | {"from": "Vdc2", "expression": "w**2"}
-        | ({"late": "1 s"} if effect.late else {})
+        | ({"equivalent_delay": "1 s"} if effect.equivalent_delay else {})
     )
     text = effect.sentence.format(at="P2_m", **words)
     assert "P2_m" in text and "{" not in text
@@ -206,20 +206,21 @@ def test_it_describes_itself(name):
 
 
 def test_one_effect_on_several_slots_shares_its_parameter():
-    model = LINK.with_effects([{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.002}}])
+    model = apply_effects(LINK, [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.002}}])
     assert [n for n in model.parameters if n not in LINK.parameters] == ["lag_Ir1_T"]
     assert len(model.states) == len(LINK.states) + 2
 
 
 def test_one_effect_on_several_slots_may_bring_in_a_signal_of_each():
     shared = {"effect": "droop", "at": ["Pref2", "Qref1"], "from": ["Vdc2", "Vdc1"], "parameters": {"k": 2.0}}
-    model = LINK.with_effects([shared])
+    model = apply_effects(LINK, [shared])
     assert [n for n in model.parameters if n not in LINK.parameters] == ["droop_Pref2_k"]
-    one_by_one = LINK.with_effects(
+    one_by_one = apply_effects(
+        LINK,
         [
             {"effect": "droop", "at": at, "from": seen, "parameters": {"k": 2.0}}
             for at, seen in zip(shared["at"], shared["from"], strict=True)
-        ]
+        ],
     )
     mine, theirs = (simulate(m, CASE).trajectory.values for m in (model, one_by_one))
     np.testing.assert_array_equal(mine, theirs)
@@ -227,19 +228,19 @@ def test_one_effect_on_several_slots_may_bring_in_a_signal_of_each():
     assert parse_card(write_card(model)) == model
     assert EffectUse.of(shared).to_dict() == shared
     with pytest.raises(ModelError, match=r"one for each of its places.*1 or 2 names, got Vdc2, Vdc1, Vdc1"):
-        LINK.with_effects([{**shared, "from": ["Vdc2", "Vdc1", "Vdc1"]}])
+        apply_effects(LINK, [{**shared, "from": ["Vdc2", "Vdc1", "Vdc1"]}])
 
 
 def test_a_resistance_of_the_model_stands_in():
-    model = LINK.with_effects([{"effect": "inductance", "at": "Idc", "parameters": {"L": 1e-6, "R": "Rdc"}}])
+    model = apply_effects(LINK, [{"effect": "inductance", "at": "Idc", "parameters": {"L": 1e-6, "R": "Rdc"}}])
     assert [n for n in model.parameters if n not in LINK.parameters] == ["inductance_Idc_L"]
-    lag = LINK.with_effects([{"effect": "lag", "at": "Idc", "parameters": {"T": 1e-6 * 4096}}])
+    lag = apply_effects(LINK, [{"effect": "lag", "at": "Idc", "parameters": {"T": 1e-6 * 4096}}])
     mine, theirs = (simulate(m, CASE, outputs=("Idc",))["Idc"] for m in (model, lag))
     np.testing.assert_allclose(mine, theirs, atol=1e-7)
 
 
 def test_effects_can_stand_on_each_other_and_on_one_slot():
-    model = LINK.with_effects([use("lag", "P2_m"), use("gain", "P2_m"), use("lag", "P2_m"), use("droop", "Pref2")])
+    model = apply_effects(LINK, [use("lag", "P2_m"), use("gain", "P2_m"), use("lag", "P2_m"), use("droop", "Pref2")])
     assert {"lag_P2_m_T", "lag_P2_m_T_2", "gain_P2_m_k", "droop_Pref2_k"} <= set(model.parameters)
     assert parse_card(write_card(model)) == model
     steady = simulate(model, CASE, outputs=("P2_m", "P2")).trajectory.values[0]
@@ -254,38 +255,40 @@ def test_a_use_and_its_mapping_are_the_same():
 
 def test_mistakes_are_named():
     with pytest.raises(UnknownNameError, match="did you mean 'lag'"):
-        LINK.with_effects([{"effect": "lagg", "at": "Ir1"}])
+        apply_effects(LINK, [{"effect": "lagg", "at": "Ir1"}])
     with pytest.raises(UnknownNameError, match="did you mean"):
-        LINK.with_effects([{"effect": "lag", "at": "Ir3"}])
+        apply_effects(LINK, [{"effect": "lag", "at": "Ir3"}])
     with pytest.raises(UnknownNameError, match="no parameter 'tau'"):
-        LINK.with_effects([{"effect": "lag", "at": "Ir1", "parameters": {"tau": 1.0}}])
+        apply_effects(LINK, [{"effect": "lag", "at": "Ir1", "parameters": {"tau": 1.0}}])
     with pytest.raises(ModelError, match="outside its own bounds"):
-        LINK.with_effects([{"effect": "lag", "at": "Ir1", "parameters": {"T": -1.0}}])
+        apply_effects(LINK, [{"effect": "lag", "at": "Ir1", "parameters": {"T": -1.0}}])
     with pytest.raises(UnknownNameError, match=r"effect 'inductance' at Idc, parameter 'R'.*did you mean 'Rdc'"):
-        LINK.with_effects([{"effect": "inductance", "at": "Idc", "parameters": {"R": "Rd"}}])
-    with pytest.raises(ModelError, match=r"needs another signal.*from = SLOT"):
-        LINK.with_effects([{"effect": "droop", "at": "Pref2", "parameters": {"k": 0.1}}])
+        apply_effects(LINK, [{"effect": "inductance", "at": "Idc", "parameters": {"R": "Rd"}}])
+    with pytest.raises(ModelError, match=r"needs another signal.*from = NAME"):
+        apply_effects(LINK, [{"effect": "droop", "at": "Pref2", "parameters": {"k": 0.1}}])
     with pytest.raises(UnknownNameError, match=r"effect 'droop' at Pref2, from: no signal 'Vdc'.*did you mean.*'Vdc1'"):
-        LINK.with_effects([{"effect": "droop", "at": "Pref2", "from": "Vdc", "parameters": {"k": 0.1}}])
+        apply_effects(LINK, [{"effect": "droop", "at": "Pref2", "from": "Vdc", "parameters": {"k": 0.1}}])
     with pytest.raises(ModelError, match="brings no other signal in"):
-        LINK.with_effects([{"effect": "lag", "at": "Pref2", "from": "Vdc1"}])
+        apply_effects(LINK, [{"effect": "lag", "at": "Pref2", "from": "Vdc1"}])
     with pytest.raises(ModelError, match="signals run in a circle"):
-        LINK.with_effects([{"effect": "loss", "at": "P2_m", "from": "ep", "parameters": {"b": 0.1}}])
+        apply_effects(LINK, [{"effect": "loss", "at": "P2_m", "from": "ep", "parameters": {"b": 0.1}}])
     with pytest.raises(ModelError, match="at least one coefficient"):
-        LINK.with_effects([{"effect": "term", "at": "Pref2", "expression": "Vdc1**2"}])
+        apply_effects(LINK, [{"effect": "term", "at": "Pref2", "expression": "Vdc1**2"}])
     with pytest.raises(ModelError, match="does not use its coefficient 'k'"):
-        LINK.with_effects([{"effect": "term", "at": "Pref2", "expression": "Vdc1**2", "parameters": {"k": 1.0}}])
+        apply_effects(LINK, [{"effect": "term", "at": "Pref2", "expression": "Vdc1**2", "parameters": {"k": 1.0}}])
     with pytest.raises(UnknownNameError, match=r"effect 'term' at Pref2.*no variable 'Vdx'"):
-        LINK.with_effects([{"effect": "term", "at": "Pref2", "expression": "k*Vdx", "parameters": {"k": 1.0}}])
+        apply_effects(LINK, [{"effect": "term", "at": "Pref2", "expression": "k*Vdx", "parameters": {"k": 1.0}}])
     with pytest.raises(ModelError, match="only a term has an expression"):
-        LINK.with_effects([{"effect": "lag", "at": "Pref2", "expression": "Vdc1"}])
+        apply_effects(LINK, [{"effect": "lag", "at": "Pref2", "expression": "Vdc1"}])
     with pytest.raises(UnknownNameError, match=r"an effect.*did you mean 'from'"):
-        LINK.with_effects([{"effect": "droop", "at": "Pref2", "form": "Vdc1"}])
+        apply_effects(LINK, [{"effect": "droop", "at": "Pref2", "form": "Vdc1"}])
 
 
 def test_in_a_term_the_slots_own_name_is_what_it_was_before():
     model = Model("m", inputs={"v": 0.5}, signals={"a": "2*v"}, outputs={"a": "a"})
-    bent = model.with_effects([EffectUse("term", ("a",), FrozenMap({"k": 0.25, "c": 0.0}), expression="k*a**3 + c*v")])
+    bent = apply_effects(
+        model, [EffectUse("term", ("a",), FrozenMap({"k": 0.25, "c": 0.0}), expression="k*a**3 + c*v")]
+    )
     assert set(bent.parameters) == {"term_a_k"}, "a coefficient at 0 is left out"
     run = simulate(bent, experiment("e", [0.0, 1.0], {"v": 0.5}))
     np.testing.assert_allclose(run["a"], 1.0 + 0.25)

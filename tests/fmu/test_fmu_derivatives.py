@@ -9,6 +9,7 @@ from c_models import BALL, COUNTER, FAULTY, response, spring
 
 from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
 from hvdc_ident.fmu.derivatives import ENOUGH, derivative, first, noise_of
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
@@ -61,7 +62,7 @@ def test_points_that_are_sought_and_points_that_are_not(fmu):
     with pytest.raises(ModelError, match="expected model exchange"):
         linearize(fmu(FAULTY, 2, "co-simulation"))
     with pytest.raises(ModelError, match="effects at its ends"):
-        linearize(model.with_effects([{"effect": "lag", "at": "u", "parameters": {"T": 0.1}}]))
+        linearize(apply_effects(model, [{"effect": "lag", "at": "u", "parameters": {"T": 0.1}}]))
     assert linearize(fmu(COUNTER)).A.shape == (0, 0)
     assert issubclass(LinearizationError, InputError)
 

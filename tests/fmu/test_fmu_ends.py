@@ -10,6 +10,7 @@ from c_models import FAULTY, TWIN, spring
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.discrepancy.signatures.candidates import candidates
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.fmu import Limits
 from hvdc_ident.immutable import FrozenMap
@@ -58,7 +59,7 @@ EDGES = {"sample_hold_u_Ts": {"twice"}}
     ("uses", "names"), CASES, ids=lambda c: "+".join(x["effect"] for x in c) if isinstance(c[0], dict) else ""
 )
 def test_runs_and_derivatives_agree_with_the_twin(fmu, uses, names):
-    model, twin = fmu(spring()).with_effects(uses), TWIN.with_effects(uses)
+    model, twin = apply_effects(fmu(spring()), uses), apply_effects(TWIN, uses)
     assert [n for n in model.parameters if n not in TWIN.parameters] == names[:1] + [
         n for n in twin.parameters if n not in TWIN.parameters
     ][1:]
@@ -81,9 +82,9 @@ def test_a_delay_that_moves_a_jump_over_a_row_has_no_jump_in_its_derivative(fmu,
         {"effect": "delay", "at": "u", "parameters": {"T": 0.1205}}
     ]  # at 1.12 s and 2.12 s, within a hundredth, rows
     stairs = RUN.with_(inputs={"u": InputSignal.corners([(0, 0.0), (1, 0.0), (1, 1.0), (2, 1.0), (2, -0.5)])})
-    model = fmu(spring(), 2, interface).with_effects(delay)
+    model = apply_effects(fmu(spring(), 2, interface), delay)
     found = simulate(model, stairs, {}, ["delay_u_T"], outputs=["der(v)"]).gradient("der(v)")[:, 0]
-    wanted = simulate(TWIN.with_effects(delay), stairs, {}, ["delay_u_T"], rtol=1e-10)
+    wanted = simulate(apply_effects(TWIN, delay), stairs, {}, ["delay_u_T"], rtol=1e-10)
     y, twice = (wanted.gradient(o)[:, 0] for o in ("y", "twice"))
     exact = (-0.5 * twice / 2 - 8.0 * y) / 2.0  # of m v' = k u - d v - k x where u stands
     assert np.ptp(exact) > 10.0
@@ -95,7 +96,7 @@ def test_effects_cost_one_run_a_parameter_once_the_steps_are_known_and_none_wher
         {"effect": "lag", "at": "u", "parameters": {"T": 0.1}},
         {"effect": "gain", "at": "y", "parameters": {"k": 1.1}},
     ]
-    model = fmu(spring(own=False), limits=Limits(workers=1)).with_effects(uses)  # two would both run the FMU itself
+    model = apply_effects(fmu(spring(own=False), limits=Limits(workers=1)), uses)  # two would both run the FMU itself
 
     def runs(**values: float) -> int:
         before = model.pool.runs
@@ -112,11 +113,11 @@ def test_a_term_and_a_droop_read_the_outputs_under_the_names_of_the_fmu(fmu):
     plain = simulate(fmu(spring()), RUN)
     y, twice = plain["y"], plain["twice"]
     term = {"effect": "term", "at": "twice", "expression": "c*y*abs(twice)", "parameters": {"c": 0.3}}
-    assert simulate(fmu(spring()).with_effects([term]), RUN)["twice"] == pytest.approx(
+    assert simulate(apply_effects(fmu(spring()), [term]), RUN)["twice"] == pytest.approx(
         twice + 0.3 * y * np.abs(twice), abs=1e-5
     )
     droop = {"effect": "droop", "at": "outputs.y", "from": "outputs.twice", "parameters": {"k": 0.2}}
-    found = simulate(fmu(spring()).with_effects([droop]), RUN)["y"]
+    found = simulate(apply_effects(fmu(spring()), [droop]), RUN)["y"]
     assert found == pytest.approx(y - 0.2 * (twice - twice[0]), abs=1e-5)
 
 
@@ -127,7 +128,7 @@ def test_what_is_looked_for_at_the_ends_can_sit_there(fmu):
     found = [c for c in candidates(model, signals, [TIME], "all", None) if c.source]
     assert {(c.at, c.source) for c in found} == {(("y",), "twice"), (("twice",), "y")}
     for c in found:
-        model.with_effects([c.use(c.probes[0])])
+        apply_effects(model, [c.use(c.probes[0])])
 
 
 REFUSED = [
@@ -146,7 +147,7 @@ REFUSED = [
 @pytest.mark.parametrize(("use", "message"), REFUSED)
 def test_what_an_effect_at_an_end_cannot_see_is_refused_in_the_names_of_the_fmu(fmu, use, message):
     with pytest.raises((ModelError, UnknownNameError), match=message):
-        fmu(spring()).with_effects([{"effect": "coupling", "parameters": {"k": 0.3}, **use}])
+        apply_effects(fmu(spring()), [{"effect": "coupling", "parameters": {"k": 0.3}, **use}])
 
 
 def test_a_recording_chain_is_an_effect_at_the_output(fmu):
@@ -166,21 +167,21 @@ def test_an_offset_of_an_input_and_its_derivative(fmu):
 
 def test_neutral_effects_leave_the_model_as_it_is(fmu):
     model = fmu(spring())
-    assert model.with_effects([{"effect": "lag", "at": "u", "parameters": {"T": 0.0}}]) is model
+    assert apply_effects(model, [{"effect": "lag", "at": "u", "parameters": {"T": 0.0}}]) is model
 
 
 def test_two_of_a_kind_have_names_of_their_own(fmu):
     twice = [{"effect": "gain", "at": "y", "parameters": {"k": 1.1}}] * 2
-    model = fmu(spring()).with_effects(twice)
+    model = apply_effects(fmu(spring()), twice)
     assert [n for n in model.parameters if n.startswith("gain")] == ["gain_y_k", "gain_y_2_k"]
     plain = simulate(fmu(spring()), RUN)["y"]
     assert simulate(model, RUN)["y"] == pytest.approx(1.21 * plain, abs=1e-5)
 
 
 def test_places_that_are_none(fmu):
-    with pytest.raises(UnknownNameError, match="closed inside: no slot 'x'"):
-        fmu(FAULTY).with_effects([{"effect": "lag", "at": "x"}])
+    with pytest.raises(UnknownNameError, match="closed inside: no insertion point 'x'"):
+        apply_effects(fmu(FAULTY), [{"effect": "lag", "at": "x"}])
     with pytest.raises(UnknownNameError, match="no effect 'lagg'"):
-        fmu(spring()).with_effects([{"effect": "lagg", "at": "y"}])
+        apply_effects(fmu(spring()), [{"effect": "lagg", "at": "y"}])
     with pytest.raises((ModelError, UnknownNameError)):
-        fmu(spring()).with_effects([{"effect": "lag", "at": "y", "parameters": {"TT": 1.0}}])
+        apply_effects(fmu(spring()), [{"effect": "lag", "at": "y", "parameters": {"TT": 1.0}}])

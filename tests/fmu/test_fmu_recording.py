@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from hvdc_ident import find_operating_point, linearize, load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ModelError, UnknownNameError
 
 pytestmark = needs_compiler
@@ -90,8 +91,8 @@ def test_an_effect_sits_at_what_is_recorded(fmu, step, twin):
     model = fmu(closed())
     lag = {"effect": "gain", "at": ["a[1]"], "parameters": {"k": 3.0}}
     with pytest.raises(UnknownNameError, match=r"a\[1\]"):
-        model.with_effects([lag])
-    effective = model.recording(["a[1]"]).with_effects([lag])
+        apply_effects(model, [lag])
+    effective = apply_effects(model.recording(["a[1]"]), [lag])
     assert "gain_a_1_k" in effective.parameters
     assert np.allclose(simulate(effective, step)["a[1]"], 3.0 * twin["twice"], atol=1e-3)
     delayed = step.with_(instrument={"a[1]": {"delay": 0.5}})

@@ -39,7 +39,7 @@ def test_what_is_taken_over(fmu, version):
     assert model.parameters["m"].min == 0.1 and model.parameters["m"].unit == "kg"
     assert model.parameters["k"].description == "(also stiffness)"
     assert list(model.states) == ["x", "v"] and model.states["x"].nominal == 1.0  # 0 as it is given
-    assert model.slots == ("u", "y", "twice")
+    assert model.insertion_points == ("u", "y", "twice")
     with pytest.raises(Exception, match="'stiffness' is another name of 'k'"):
         model.with_values({"stiffness": 1.0})
 

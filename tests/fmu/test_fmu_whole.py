@@ -14,6 +14,7 @@ from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.model import parse_card
@@ -80,7 +81,7 @@ def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", "-O0")
         export_fmu(model, folder / "pi.fmu")
-    lagging = model.with_effects([{"effect": "lag", "at": "outputs.y", "parameters": {"T": LAG}}])
+    lagging = apply_effects(model, [{"effect": "lag", "at": "outputs.y", "parameters": {"T": LAG}}])
     for name, level in (("up", 1.0), ("down", -0.6)):
         r = InputSignal.corners([(0, 0), (0.5, 0), (0.5, level), (1.7, level), (1.7, -level / 2)])
         run = simulate(lagging, experiment(name, time, {"r": r}))
@@ -138,7 +139,7 @@ def test_the_page_has_every_stage_and_its_figures(whole):
 def test_what_is_missing_at_an_input_is_found_there(whole):
     """The signal of that place is the experiment's own input, which no FMU gives as an output."""
     model, random, time = parse_card(CARD), np.random.default_rng(4), np.linspace(0.0, 3.0, 121)
-    lagging = model.with_effects([{"effect": "lag", "at": "r", "parameters": {"T": LAG}}])
+    lagging = apply_effects(model, [{"effect": "lag", "at": "r", "parameters": {"T": LAG}}])
     records = []
     for name, level in (("up", 1.0), ("down", -0.6)):
         r = InputSignal.corners([(0, 0), (0.5, 0), (0.5, level), (1.7, level), (1.7, -level / 2)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.model import Model, parse_card
 from hvdc_ident.models import load_model
 
@@ -52,25 +53,27 @@ def link() -> Model:
 
 def augmented() -> Model:
     """The link with effects that add states and limits: one that linearises exactly."""
-    return link().with_effects(
+    return apply_effects(
+        link(),
         [
             {"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}},
             {"effect": "limit", "at": "yv_u", "parameters": {"level": 0.6}},
             {"effect": "second-order", "at": "Vdc1_m", "parameters": {"wn": 900.0, "zeta": 0.6}},
             {"effect": "saturation", "at": "outputs.P2", "parameters": {"level": 1.5}},
-        ]
+        ],
     )
 
 
 def remembering() -> Model:
     """The link with effects that remember: a delay, a sampled order, a one-cycle mean and a delayed record."""
-    return link().with_effects(
+    return apply_effects(
+        link(),
         [
             {"effect": "delay", "at": "P2_m", "parameters": {"T": 0.0023}},
             {"effect": "sample-hold", "at": "Irorder1", "parameters": {"Ts": 0.0011, "compute": 0.0004}},
             {"effect": "window-mean", "at": "outputs.Q1", "parameters": {"T": 0.02}},
             {"effect": "delay", "at": "outputs.Vdc1", "parameters": {"T": 0.0031}},
-        ]
+        ],
     )
 
 

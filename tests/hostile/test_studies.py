@@ -105,7 +105,7 @@ CASES = {
     "unknown nuisance": Case(("nuisance", "time-shift"), _append('nuisance = ["time-shft"]\n')),
     "parameter among input values": Case(("values", "[model.values]"), _append("values = {KIP = 3}\n")),
     "input held and recorded": Case(("'Pref2'", "inputs and in values"), _append("values = {Pref2 = 0.4}\n")),
-    "unknown driven slot": Case(("no slot 'Vacc1'",), _append('drive = {Vacc1 = "Pref2"}\n')),
+    "unknown driven slot": Case(("no insertion point 'Vacc1'",), _append('drive = {Vacc1 = "Pref2"}\n')),
     "unknown interpolation": Case(("interpolation", "'hold', 'linear'"), _append('interpolation = "spline"\n')),
     "wrong unit": Case(("kA", "'pu'", "scale"), _append('columns = {Irorder2 = {unit = "kA"}}\n')),
     "scale of nothing": Case(("scale of 0",), _append("columns = {Irorder2 = {scale = 0}}\n")),

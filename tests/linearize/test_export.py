@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from helpers import linear
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, UnknownNameError
 from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, root_locus
 from hvdc_ident.linearize.export import formats, read, write
@@ -19,7 +20,7 @@ def models():
     link = load_model("vsc-hvdc-link")
     rng = np.random.default_rng(2)
     odd = linear(rng.normal(size=(3, 3)) * 1e-17, rng.normal(size=(3, 1)), rng.normal(size=(2, 3)) * 1e200)
-    return {"link": linearize(link), "delayed": linearize(link.with_effects(DELAY)), "odd": odd}
+    return {"link": linearize(link), "delayed": linearize(apply_effects(link, DELAY)), "odd": odd}
 
 
 @pytest.fixture(scope="module")

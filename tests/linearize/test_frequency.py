@@ -7,6 +7,7 @@ from helpers import linear, stable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError, UnknownNameError, WaveformError
 from hvdc_ident.linearize import (
     Port,
@@ -118,7 +119,7 @@ def test_pade_order_is_checked():
 
 
 def test_delays_are_exact_in_frequency_and_pade_in_the_state_space(link):
-    found = linearize(link.with_effects(DELAY), inputs=["Vdcref1"], outputs=["Vdc1"])
+    found = linearize(apply_effects(link, DELAY), inputs=["Vdcref1"], outputs=["Vdc1"])
     plain = linearize(link, inputs=["Vdcref1"], outputs=["Vdc1"])
     assert len(found.state_names) == 6 + 5
     # Close the loop around the delay by hand: open the plain link at Ir1 and put exp(-sT) in.
@@ -146,7 +147,7 @@ def test_a_sampled_block_is_a_hold_and_its_compute_time():
 
 @pytest.mark.parametrize("effects", [[], DELAY], ids=["plain", "delayed"])
 def test_sensitivity_of_the_response_against_differences(link, effects):
-    plant = link.with_effects(effects)
+    plant = apply_effects(link, effects)
     names = ["KPVDC", "KIVDC", "C1", *([n for n in plant.parameters if n.endswith("_T")])]
     found = linearize(plant, inputs=["Vdcref1"], outputs=["Irorder1"], sensitivities=names)
     slopes = sensitivity(found, W)
@@ -268,7 +269,7 @@ def test_multisine_through_the_nonlinear_model(link):
 
 
 def test_multisine_through_a_delay(link):
-    plant = link.with_effects(DELAY)
+    plant = apply_effects(link, DELAY)
     found = simulated_response(plant, "Vdcref1", ["Vdc1"], [20.0, 60.0], 1e-5, rtol=1e-9)
     want = linearize(plant, inputs=["Vdcref1"], outputs=["Vdc1"]).response(found.omega)
     np.testing.assert_allclose(found.values, want, rtol=2e-3)
@@ -307,7 +308,7 @@ def test_the_voltage_loop_as_a_formula(link):
     latex = found.latex()
     assert "s^{3}" in latex and "KIVDC" in latex and latex.startswith(r"\frac")
     with pytest.raises(LinearizationError, match="delays"):
-        symbolic_transfer(link.with_effects(DELAY), "Vdcref1", "Vdc1", ["KPVDC"])
+        symbolic_transfer(apply_effects(link, DELAY), "Vdcref1", "Vdc1", ["KPVDC"])
 
 
 def test_default_frequencies_cover_the_poles(model):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError, UnknownNameError
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
@@ -82,7 +83,7 @@ def _chosen(e, values):
 @pytest.mark.parametrize("effects", [[], DELAYED], ids=["plain", "delayed"])
 def test_total_derivatives_by_parameters(effects):
     """dA/dp ... with the shift of the operating point, against differences of whole linearisations."""
-    model = load_model("vsc-hvdc-link").with_effects(effects).with_values({"Qref1": 0.1, "KPP": 0.5})
+    model = apply_effects(load_model("vsc-hvdc-link"), effects).with_values({"Qref1": 0.1, "KPP": 0.5})
     names = [n for n in model.parameters if model.parameters[n].value > 0]
     found = linearize(model, sensitivities=names)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers import linear, stable
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError, SteadyStateError, UnknownNameError
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
@@ -72,8 +73,8 @@ def test_zero_eigenvalues_are_classified():
     angle = linear([[-1, 0], [1, 0]], [[1], [0]], [[1, 0]]).modes()
     assert angle[0].kind == "angle reference or unobserved integrator"
     assert angle[0].damping == 0.0
-    link = load_model("vsc-hvdc-link").with_effects(
-        [{"effect": "window-mean", "at": "P2_m", "parameters": {"T": 0.02}}]
+    link = apply_effects(
+        load_model("vsc-hvdc-link"), [{"effect": "window-mean", "at": "P2_m", "parameters": {"T": 0.02}}]
     )
     zero = [m for m in linearize(link).modes() if abs(m.eigenvalue) < 1e-6]
     assert [m.kind for m in zero] == ["sliding mean (cancelled by its delay)"]

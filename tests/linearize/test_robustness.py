@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from helpers import linear, stable
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize import (
     balanced,
@@ -217,8 +218,8 @@ def test_scaled_channels_count_in_other_units():
     model = stable(2).scaled({"u0": 10.0, "y1": 0.5})
     w = np.array([0.3, 4.0])
     np.testing.assert_allclose(model.response(w), stable(2).response(w) * np.array([[10, 1], [20, 2]]), rtol=1e-12)
-    delayed = load_model("vsc-hvdc-link").with_effects(
-        [{"effect": "delay", "at": ["Irorder1"], "parameters": {"T": 0.002}}]
+    delayed = apply_effects(
+        load_model("vsc-hvdc-link"), [{"effect": "delay", "at": ["Irorder1"], "parameters": {"T": 0.002}}]
     )
     from hvdc_ident.linearize import linearize
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.linearize import hinf_norm, linearize, loop, margins, nu_gap, root_locus
 from hvdc_ident.linearize.distance import difference
 from hvdc_ident.linearize.reduction import without_sliding_means
@@ -14,7 +15,7 @@ W = np.logspace(-1, 2.5, 9)
 @pytest.fixture(scope="module")
 def link():
     mean = {"effect": "window-mean", "at": ["P2_m"], "parameters": {"T": 0.01}}
-    return load_model("vsc-hvdc-link").with_effects([mean])
+    return apply_effects(load_model("vsc-hvdc-link"), [mean])
 
 
 @pytest.fixture(scope="module")

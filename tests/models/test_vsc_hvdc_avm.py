@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import UnknownNameError
 from hvdc_ident.models import load_model
 from hvdc_ident.models.vsc_hvdc_avm import RATINGS, VARIANTS, model
@@ -63,7 +64,7 @@ def test_the_study_of_the_phasor_link_drives_it_too():
     phasor, average = load_model("vsc-hvdc-link"), load_model("vsc-hvdc-avm")
     assert set(phasor.inputs) == set(average.inputs) and set(phasor.outputs) <= set(average.outputs)
     assert set(phasor.parameters) <= set(average.parameters)
-    assert set(phasor.slots) <= set(average.slots)
+    assert set(phasor.insertion_points) <= set(average.insertion_points)
     same = [n for n in phasor.parameters if phasor.values[n] != average.values[n]]
     assert same == []
 
@@ -93,7 +94,7 @@ def test_sampling_and_computing_late_are_effects_on_its_slots():
     step = experiment("step", np.linspace(0.0, 0.4, 401), {"Pref2": InputSignal.step(0.1, 0.4, 0.5)})
     plain, sampled = (
         simulate(m, step, rtol=1e-6)
-        for m in (load_model("vsc-hvdc-avm"), load_model("vsc-hvdc-avm").with_effects(late))
+        for m in (load_model("vsc-hvdc-avm"), apply_effects(load_model("vsc-hvdc-avm"), late))
     )
     assert 1e-6 < np.abs(plain["Irorder2"] - sampled["Irorder2"]).max() < 2e-3
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, UnknownNameError
 from hvdc_ident.expression import parse
 from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
@@ -99,7 +100,7 @@ def test_design_values_are_seen(link: Model) -> None:
 
 
 def test_an_effect_brings_its_parameter(link: Model) -> None:
-    lagged = link.with_effects([{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}}])
+    lagged = apply_effects(link, [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.0016}}])
     new = [n for n in lagged.parameters if n not in link.parameters]
     assert ask(lagged, ["Irorder1"], [*GAINS[:2], *new], inputs=steps("Vdcref1")).identifiable == (*GAINS[:2], *new)
 

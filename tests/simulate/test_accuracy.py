@@ -4,17 +4,19 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.simulate.reference import Reference, sided
 
 RTOL = 1e-8
 LINK = load_model("vsc-hvdc-link")
-LAGGED = LINK.with_effects(
+LAGGED = apply_effects(
+    LINK,
     [
         {"effect": "lag", "at": ["Ir1", "Ii1", "Ir2", "Ii2"], "parameters": {"T": 0.0016}},
         {"effect": "limit", "at": ["Ir2"], "parameters": {"level": 0.45}},
-    ]
+    ],
 )
 VDC_P_Q = {
     "Vdcref1": InputSignal.step(0.02, 1.0, 1.019),

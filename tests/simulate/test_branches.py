@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from hvdc_ident import find_operating_point, simulate
 from hvdc_ident.data import experiment
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.linearize import linearize
 from hvdc_ident.model import parse_card, write_card
@@ -90,7 +90,7 @@ def test_an_effect_that_keeps_the_rest_keeps_the_branch(effect):
     source = "m" if effects()[effect].needs_source else ""
     for place in ("V", "P", "order", "P0", "g"):
         use = EffectUse(effect, (place,), effects()[effect].example, source=source)
-        model = LOAD.with_effects([use])
+        model = apply_effects(LOAD, [use])
         for _ in range(5):
             e, x = random.uniform(0.7, 1.3), random.uniform(0.2, 0.9)
             power = random.uniform(0.1, 0.98) * e**2 / (2 * x)
@@ -115,7 +115,7 @@ def test_an_effect_that_shifts_the_rest_stays_on_the_branch_or_says_where_that_e
     ends = 0
     for _ in range(12):
         size = {n: v * random.uniform(0.6, 1.6) for n, v in effects()[effect].example.items()}
-        model = LOAD.with_effects([EffectUse(effect, ("order",), size)])
+        model = apply_effects(LOAD, [EffectUse(effect, ("order",), size)])
         power = random.uniform(0.5, 1.2)
         effective = SHIFTING[effect](power, size)
         if effective < 1.0:
@@ -129,7 +129,7 @@ def test_an_effect_that_shifts_the_rest_stays_on_the_branch_or_says_where_that_e
 
 def test_a_sensitivity_at_the_start_is_that_of_the_branch():
     """dg/dX of the smaller root through a lag, against the closed form."""
-    lagged = LOAD.with_effects([EffectUse("lag", ("V",), {"T": 0.02})])
+    lagged = apply_effects(LOAD, [EffectUse("lag", ("V",), {"T": 0.02})])
     run = simulate(lagged, experiment("rest", np.array([0.0, 0.1])), {"X": 0.7}, sensitivities=("X",))
     h = 1e-6
     slope = (conductance(0.6, x=0.7 + h) - conductance(0.6, x=0.7 - h)) / (2 * h)
@@ -160,7 +160,7 @@ def swing_rest(pm, vref, k):
 @pytest.mark.parametrize("place", ["Vm", "Pe", "err", "delta", "E"])
 def test_a_machine_starts_below_its_largest_power(effect, place):
     random = np.random.default_rng(3)
-    model = SWING.with_effects([EffectUse(effect, (place,), effects()[effect].example)])
+    model = apply_effects(SWING, [EffectUse(effect, (place,), effects()[effect].example)])
     for _ in range(4):
         pm, vref, k = random.uniform(0.3, 1.1), random.uniform(0.9, 1.1), math.exp(random.uniform(2, 5))
         expected = swing_rest(pm, vref, k)
@@ -171,7 +171,7 @@ def test_a_machine_starts_below_its_largest_power(effect, place):
 
 def test_linearisation_stands_where_a_simulation_starts():
     """With a lag, at other values, and the run stays there; the slope against scipy's own run of the load."""
-    lagged = LOAD.with_effects([EffectUse("lag", ("P",), {"T": 0.02})])
+    lagged = apply_effects(LOAD, [EffectUse("lag", ("P",), {"T": 0.02})])
     point = find_operating_point(lagged, {"P0": 0.9, "E": 1.1})
     run = simulate(lagged, experiment("rest", np.array([0.0, 2.0]), {}, values={"P0": 0.9}), {"E": 1.1})
     assert run["g"].tolist() == pytest.approx([point.states["g"]] * 2, rel=1e-8)
@@ -200,7 +200,7 @@ def test_another_rest_is_told_and_the_own_one_offered():
 
 def test_a_card_of_a_model_with_effects_stays_on_its_branch():
     """A card says nothing of its origin: its guesses do, for every state."""
-    model = SWING.with_effects([EffectUse("lag", ("Vm",), {"T": 0.08})]).with_values({"K": 120.0, "Pm": 1.0})
+    model = apply_effects(SWING, [EffectUse("lag", ("Vm",), {"T": 0.08})]).with_values({"K": 120.0, "Pm": 1.0})
     card = parse_card(write_card(with_guesses(model)))
     assert all(s.guess is not None for s in card.states.values())
     assert start(card)[0] == pytest.approx(start(model)[0], rel=1e-9, abs=1e-9)

@@ -7,7 +7,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.effects import EffectUse
+from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.model import Algebraic, Model, State
 from hvdc_ident.models import load_model
@@ -122,7 +122,7 @@ def test_a_rest_far_from_a_guess_of_zero_is_found_where_a_state_does_not_matter(
 @pytest.mark.parametrize("effect", ["delay", "sample-hold"])
 def test_what_is_delayed_is_at_rest_where_the_signal_is(slot, effect):
     """A delayed voltage that is taken for 0 at first is divided by: the search begins where its source stands."""
-    late = LINK.with_effects([EffectUse(effect, (slot,), {"T" if effect == "delay" else "Ts": 1e-3})])
+    late = apply_effects(LINK, [EffectUse(effect, (slot,), {"T" if effect == "delay" else "Ts": 1e-3})])
     still = experiment("rest", np.array([0.0, 1e-4]), {"Pref2": InputSignal.constant(0.3)})
     expected = simulate(LINK, still, sensitivities=("Rdc",))
     found = simulate(late, still, sensitivities=("Rdc",))

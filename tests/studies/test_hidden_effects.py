@@ -23,7 +23,7 @@ from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.hops import hopped
 from hvdc_ident.discrepancy.trials.refit_jobs import job
 from hvdc_ident.discrepancy.trials.refitted import PROMISING, refitted
-from hvdc_ident.effects import EffectUse, Probe, effects
+from hvdc_ident.effects import EffectUse, Probe, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -78,7 +78,7 @@ def test_what_hides_the_effects_does_not_know_the_package():
 
 
 def test_every_effect_of_the_catalogue_can_be_hidden():
-    assert set(CATALOGUE) == {n for n, e in effects().items() if e.sought and not e.needs_expression}
+    assert set(CATALOGUE) == {n for n, e in effects().items() if e.tried_by_default and not e.needs_expression}
     # A loop that rests on an edge, and a start that is no rest: there the two start otherwise, for reasons.
     assert set(CATALOGUE) - set(TOGETHER) == {"quantisation", "disturbance"}
 
@@ -90,7 +90,7 @@ def test_both_simulators_agree(name):
     plain, mine = (simulate(STATION, run, h, rows=ROWS)[:, 0] for h in ((), [Hidden(name, at, values, source)]))
     use = EffectUse(name, (at,), FrozenMap(values), source=source)
     inputs = {n: InputSignal.corners(points) for n, points in MOVES.items()}
-    model = model_of("station").with_effects([use])
+    model = apply_effects(model_of("station"), [use])
     theirs = package(model, experiment("e", TIME, inputs), outputs=STATION.outputs).trajectory.values
     effect = np.abs(mine - plain).max(axis=0)
     assert effect.max() > 2e-3
@@ -122,11 +122,11 @@ def test_a_row_on_a_sampling_instant_is_read_before_it_by_both():
     mine = simulate(
         DRIVE, [Run({n: Signal(p) for n, p in moves.items()})], [Hidden("sample-hold", "wm", values)], rows=ROWS
     )
-    model = model_of("drive").with_effects([EffectUse("sample-hold", ("wm",), FrozenMap(values))])
+    model = apply_effects(model_of("drive"), [EffectUse("sample-hold", ("wm",), FrozenMap(values))])
     inputs = {n: InputSignal.corners(p) for n, p in moves.items()}
     theirs = package(model, experiment("e", TIME, inputs), outputs=DRIVE.outputs).trajectory.values
     after = {"Ts": 9 * STEP * (1 - sizes.LATE), "compute": 0.0}
-    model = model_of("drive").with_effects([EffectUse("sample-hold", ("wm",), FrozenMap(after))])
+    model = apply_effects(model_of("drive"), [EffectUse("sample-hold", ("wm",), FrozenMap(after))])
     other = package(model, experiment("e", TIME, inputs), outputs=DRIVE.outputs).trajectory.values
     np.testing.assert_allclose(mine[:, 0], theirs, atol=2e-6)
     met = np.flatnonzero(np.abs(other - theirs).max(axis=1) > 1e-4)
@@ -142,7 +142,7 @@ def test_both_simulators_agree_on_the_plants(plant):
     theirs = package(model_of(plant.name), case, values, outputs=plant.outputs).trajectory.values
     np.testing.assert_allclose(mine, theirs, atol=1e-6)
     assert {n: p.value for n, p in model_of(plant.name).parameters.items()} == plant.parameters
-    slots = {s for s in model_of(plant.name).slots if not s.startswith("outputs.")}
+    slots = {s for s in model_of(plant.name).insertion_points if not s.startswith("outputs.")}
     assert slots == set(plant.slots)
 
 
@@ -159,7 +159,7 @@ def test_a_plant_answers_the_same_at_half_the_step(plant, excitation):
 def test_a_quantiser_in_a_loop_comes_to_the_same_sliding_rest(plant, at, step):
     """It lies on an edge, and the loop drives it there from both sides."""
     mine = simulate(plant, [Run()], [Hidden("quantisation", at, {"step": step})], rows=50)[:, 0].mean(axis=0)
-    model = model_of(plant.name).with_effects([EffectUse("quantisation", (at,), FrozenMap({"step": step}))])
+    model = apply_effects(model_of(plant.name), [EffectUse("quantisation", (at,), FrozenMap({"step": step}))])
     watched = plant.outputs[:2]
     theirs = package(model, experiment("e", TIME[:50]), outputs=watched).trajectory.values
     assert np.ptp(theirs, axis=0).max() < 1e-6, "it is a rest"
@@ -179,7 +179,7 @@ def test_a_disturbance_is_seen_the_same_however_the_record_begins(plant, lead):
     quiet = simulate(plant, runs, rows=ROWS)[:, 0]
     record = simulate(plant, runs, [Hidden("disturbance", at, values)], rows=ROWS, lead=lead)[:, 0]
     sigma = 0.02 * np.ptp(quiet, axis=0)
-    model = model_of(plant.name).with_effects([EffectUse("disturbance", (at,), FrozenMap(values))])
+    model = apply_effects(model_of(plant.name), [EffectUse("disturbance", (at,), FrozenMap(values))])
     measured = Trajectory(TIME, record, plant.outputs)
     noise = dict(zip(plant.outputs, sigma.tolist(), strict=True))
     inputs = {n: InputSignal.corners(p) for n, p in moves.items()}

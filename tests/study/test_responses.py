@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit.frequency_data import WithResponses, frequency_experiment
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse, Port
@@ -230,7 +231,7 @@ def test_derivatives_are_those_of_differences(tmp_path, kind):
     model = load_model(tmp_path / "m.toml")
     names = ["H", "K"]
     if kind == "delayed":
-        model = model.with_effects([{"effect": "delay", "at": "Pe", "parameters": {"T": 0.02}}])
+        model = apply_effects(model, [{"effect": "delay", "at": "Pe", "parameters": {"T": 0.02}}])
         names += [n for n in model.parameters if n not in ("H", "K", "T")]
     w = np.array([1.0, 8.0, 30.0])
     port = Port(("Pe",), ("w",), ("Pe",)) if kind == "port" else None

@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.context import Round
 from hvdc_ident.discrepancy.trials.select import CandidateFit, at_edge, behinds, best_gain, best_of
-from hvdc_ident.effects import each_its_own, effects
+from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
 NEEDED = 4.0
@@ -69,7 +69,7 @@ def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) 
     best = found.candidates[found.winner.pick.candidate]
     one, two = effects()[best.effect], effects()[other.effect]
     weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
-    delays = one.late is not None and two.late is not None and one.name not in two.widens
+    delays = one.equivalent_delay is not None and two.equivalent_delay is not None and one.name not in two.generalises
     return other.at == best.at and (weak or delays)
 
 
@@ -130,8 +130,8 @@ def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
     likes: list[Rival] = []
     for c in found.candidates:
         entry, gain = effects()[c.effect], gains.get(c.at)
-        bends = c.still and entry.late is None and entry.states == "none" and not entry.needs_source
-        if gain is not None and bends and (entry.scanned or gain.parameters.get("k", 0.0) < 1.0):
+        bends = c.still and entry.equivalent_delay is None and entry.states == "none" and not entry.needs_source
+        if gain is not None and bends and (entry.needs_grid or gain.parameters.get("k", 0.0) < 1.0):
             likes.append(Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False))
     return likes
 
@@ -144,7 +144,7 @@ def _as_loss(found: Round, group: Sequence[Rival]) -> list[Rival]:
     return [
         replace(r, effect="loss", parameters=FrozenMap(), refitted=False)
         for r in leaks
-        if all(s in p.slots and _keeps_sign(p.signal(s)) for p in paths for s in each_its_own(r.source, r.at))
+        if all(s in p.slots and _keeps_sign(p.signal(s)) for p in paths for s in split_sources(r.source, r.at))
     ]
 
 

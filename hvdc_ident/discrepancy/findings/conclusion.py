@@ -53,7 +53,7 @@ class FoundEffect:
     @property
     def late(self) -> float | None:
         """By how long it delays a slow signal, s; None for what is no delay of any kind."""
-        return effects()[self.effect].late_by({n: size.value for n, size in self.parameters.items()})
+        return effects()[self.effect].delay_with({n: size.value for n, size in self.parameters.items()})
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Rival:
     @property
     def late(self) -> float | None:
         """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
-        return effects()[self.effect].late_by(self.parameters) if self.parameters else None
+        return effects()[self.effect].delay_with(self.parameters) if self.parameters else None
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
     own = dict.fromkeys(placed.candidate.sources)
     brought = f"its own of {listed(tuple(own))}" if len(own) > 1 else placed.candidate.source
     words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought}
-    if (late := entry.late_by(sizes)) is not None:
-        words["late"] = quantity(late, "s")
+    if (late := entry.delay_with(sizes)) is not None:
+        words["equivalent_delay"] = quantity(late, "s")
     text = entry.sentence
     for name, value in words.items():
         text = text.replace("{" + name + "}", value)

@@ -8,7 +8,7 @@ from typing import Any
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.findings.conclusion import Diagnosis, FoundEffect
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
@@ -103,9 +103,9 @@ def _with(model: Model, found: Diagnosis, value: float | None) -> Model:
     first = found.effects[0]
     for effect in found.effects:
         if effect is not first:
-            model = model.with_effects([_use(effect, {}).within(model)])
+            model = apply_effects(model, [_use(effect, {}).within(model)])
         elif value is not None:
-            model = model.with_effects([_use(first, {next(iter(first.parameters)): value})])
+            model = apply_effects(model, [_use(first, {next(iter(first.parameters)): value})])
     return model
 
 

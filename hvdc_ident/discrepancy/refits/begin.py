@@ -10,7 +10,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -62,12 +62,12 @@ def added(
     settled = tuple((n, values[n]) for n in present if n not in chosen.free)
     key = (candidate.effect, candidate.at, candidate.source, candidate.named, tuple(present), settled)
     made = {} if made is None else made
-    larger = made[key] = made.get(key) or model.with_effects([use])
+    larger = made[key] = made.get(key) or apply_effects(model, [use])
     new = [n for n in larger.parameters if n not in model.parameters]
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
     free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    free_initial_states = problem.free_initial_states or effects()[candidate.effect].restless
+    free_initial_states = problem.free_initial_states or effects()[candidate.effect].self_exciting
     more = replace(
         problem,
         simulator=ModelSimulator(larger, PATIENCE),
@@ -115,7 +115,7 @@ def moved(candidate: CandidateEffect, probe: int, factor: float) -> dict[str, fl
         neutral = values[q.neutral] if isinstance(q.neutral, str) else float(q.neutral)
         if np.isinf(neutral):
             # A delay is in proportion to 1/wn; where a bend begins is in proportion to nothing.
-            if entry.late is not None and factor > 0:
+            if entry.equivalent_delay is not None and factor > 0:
                 found[n] = values[n] / size
             continue
         found[n] = neutral + sign * size * (values[n] - neutral)

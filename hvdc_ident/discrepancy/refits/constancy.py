@@ -38,7 +38,7 @@ def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
     """
     names = left.problem.names
     own = [names.index(n) for n in placed.names.values() if n in names]
-    if effects()[placed.candidate.effect].scanned or not own:
+    if effects()[placed.candidate.effect].needs_grid or not own:
         return NOTHING
     more = _by_experiment(left, own)
     spare = refit.effective - left.basis.shape[1] - more.shape[1]

@@ -12,7 +12,7 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.noise.records import OutputNoise
 from hvdc_ident.discrepancy.refits.begin import Placed
 from hvdc_ident.discrepancy.refits.nominal import Nominal, orthonormal
-from hvdc_ident.effects import clearance, effects
+from hvdc_ident.effects import distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
@@ -148,7 +148,7 @@ def run(job: RefitJob) -> Refit:
     """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
     best: Refit | None = None
     why = ""
-    scanned = any(effects()[p.candidate.effect].scanned for p in job.placed)
+    scanned = any(effects()[p.candidate.effect].needs_grid for p in job.placed)
     most = min(job.evaluations, SCANNED) if scanned else job.evaluations
     begins = _apart(job.begins)
     for k, begin in enumerate([*begins, *job.spare]):
@@ -213,13 +213,13 @@ def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks
     """Distance of an effect's parameters from neutral, in standard deviations; 0 where that is not known."""
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
     fitted = [n for n, name in placed.names.items() if name in known.names]
-    here = clearance(entry, sizes)
+    here = distance_from_neutral(entry, sizes)
     if not fitted or not here:
         return 0.0
     slopes: Array = np.zeros((len(here), len(fitted)))
     for k, n in enumerate(fitted):
         h = 1e-6 * abs(sizes[n]) or 1e-9
-        there = clearance(entry, {**sizes, n: sizes[n] + h})
+        there = distance_from_neutral(entry, {**sizes, n: sizes[n] + h})
         slopes[:, k] = np.array([there.get(m, v) - v for m, v in here.items()]) / h
     at = [known.names.index(placed.names[n]) for n in fitted]
     spread = slopes @ _covariance(known, at, blocks) @ slopes.T

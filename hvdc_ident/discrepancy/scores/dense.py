@@ -13,7 +13,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
-from hvdc_ident.effects import Probe, SlotSignal, effects, scanned
+from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
 from hvdc_ident.immutable import FrozenMap
 
 BENT = 50
@@ -63,19 +63,19 @@ class Dense:
 
 def has_to_be_met(candidate: CandidateEffect) -> bool:
     """Return True where the size has to be met exactly (levels of a quantiser, periods of a sampler)."""
-    return effects()[candidate.effect].scanned
+    return effects()[candidate.effect].needs_grid
 
 
 def by_level(candidate: CandidateEffect) -> bool:
     """Return True where the size has to be met exactly and is a level of the signal, not a time."""
-    return has_to_be_met(candidate) and effects()[candidate.effect].late is None
+    return has_to_be_met(candidate) and effects()[candidate.effect].equivalent_delay is None
 
 
 def bent(candidate: CandidateEffect) -> bool:
     """Return True for a nonlinear effect at one slot with one parameter that need not be met exactly, and no kind of delay."""
     entry = effects()[candidate.effect]
     single = len(candidate.at) == 1 and not candidate.source and all(len(p.free) == 1 for p in candidate.probes)
-    return single and entry.late is None and not entry.scanned and not is_linear(kind_of(candidate, 0))
+    return single and entry.equivalent_delay is None and not entry.needs_grid and not is_linear(kind_of(candidate, 0))
 
 
 def widened(candidate: CandidateEffect) -> Dense:
@@ -86,16 +86,16 @@ def widened(candidate: CandidateEffect) -> Dense:
     return Dense(candidate, np.geomspace(max(low, min(tried) / WIDE), min(high, max(tried) * WIDE), BENT))
 
 
-def every_size(candidate: CandidateEffect, signal: SlotSignal) -> Dense:
+def every_size(candidate: CandidateEffect, signal: SignalScales) -> Dense:
     """Every size worth a look of a candidate whose size has to be met. signal: that of its slot."""
-    probe, sizes = scanned(effects()[candidate.effect], signal)
+    probe, sizes = size_grid(effects()[candidate.effect], signal)
     return Dense(replace(candidate, probes=(probe,)), np.sort(sizes))
 
 
 def sized(candidate: CandidateEffect) -> str:
     """The parameter whose size is looked for: the one that has to be met, or the only one."""
     parameters = effects()[candidate.effect].parameters
-    return next((n for n, q in parameters.items() if q.scan is not None), next(iter(parameters)))
+    return next((n for n, q in parameters.items() if q.grid is not None), next(iter(parameters)))
 
 
 def _resized(probe: Probe, name: str, size: float) -> Probe:

@@ -146,7 +146,7 @@ def scored(
         else None
     )
     residual = nominal.projected(nominal.residual[:, None])
-    restless = np.array([effects()[found[c.candidate].effect].restless for c in columns], dtype=bool)
+    restless = np.array([effects()[found[c.candidate].effect].self_exciting for c in columns], dtype=bool)
     starts = nominal.starts if restless.any() else np.zeros((residual.shape[0], 0))
     parts = [residual, nominal.basis, starts]
     if noise is not None:
@@ -250,7 +250,7 @@ def signature_rows(
             part[index] = whitening(y).T
         whole.append(part)
     rows = nominal.projected(np.hstack(whole).T).T
-    restless = [k for k, c in enumerate(chosen) if effects()[found[c.candidate].effect].restless]
+    restless = [k for k, c in enumerate(chosen) if effects()[found[c.candidate].effect].self_exciting]
     if restless:
         rows[restless] -= (rows[restless] @ nominal.starts) @ nominal.starts.T
     return rows

@@ -107,7 +107,7 @@ def as_late(opened: Round, trials: Sequence[CandidateFit]) -> list[Pick]:
     done_here = {t.pick.candidate: late for t in sound if (late := _late(t)) and late > 0.0}
     picks = []
     for k, c in enumerate(found):
-        late_of, goal = effects()[c.effect].late, goals.get(c.at)
+        late_of, goal = effects()[c.effect].equivalent_delay, goals.get(c.at)
         if late_of is None or goal is None or (k in done_here and _apart(done_here[k], goal) < LIKE):
             continue
         lates = {n: late_of(p.values) for n, p in enumerate(c.probes)}
@@ -139,7 +139,7 @@ def carried(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]
     """
     found, sound = opened.candidates, by_cost(trials)
     best = found[sound[0].pick.candidate] if sound else None
-    if best is None or not effects()[best.effect].scanned or len(best.at) > 1:
+    if best is None or not effects()[best.effect].needs_grid or len(best.at) > 1:
         return []
     refit, placed = sound[0].refit, sound[0].refit.placed[-1]
     picks, jobs = [], []
@@ -178,11 +178,11 @@ def leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateEffe
 def is_akin(candidate: CandidateEffect, best: Sequence[CandidateEffect]) -> bool:
     """Return True for a candidate related to the best so far, worth a grid refinement: the same at any place, where its size has
     to be met; a bend at any place, where something bends its signal; a sampler where something delays it."""
-    if effects()[candidate.effect].scanned and best and best[0].effect == candidate.effect:
+    if effects()[candidate.effect].needs_grid and best and best[0].effect == candidate.effect:
         return True
-    if effects()[candidate.effect].late is not None:
-        return any(effects()[c.effect].late is not None and c.at == candidate.at for c in best)
-    return any(bent(c) for c in best) and not effects()[candidate.effect].scanned
+    if effects()[candidate.effect].equivalent_delay is not None:
+        return any(effects()[c.effect].equivalent_delay is not None and c.at == candidate.at for c in best)
+    return any(bent(c) for c in best) and not effects()[candidate.effect].needs_grid
 
 
 def _apart(a: float, b: float) -> float:
@@ -193,4 +193,4 @@ def _apart(a: float, b: float) -> float:
 def _late(trial: CandidateFit) -> float | None:
     """By how long the effect that a trial added delays a slow signal, s; None for what is no kind of delay."""
     placed = trial.refit.placed[-1]
-    return effects()[placed.candidate.effect].late_by(trial.refit.sizes(placed))
+    return effects()[placed.candidate.effect].delay_with(trial.refit.sizes(placed))

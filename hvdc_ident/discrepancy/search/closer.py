@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.refit_jobs import as_given
 from hvdc_ident.discrepancy.trials.select import Pick
-from hvdc_ident.effects import SlotSignal, effects
+from hvdc_ident.effects import SignalScales, effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.model import Model
 
@@ -35,10 +35,10 @@ def closer_look(
 ) -> tuple[Round, tuple[Pick, ...]]:
     """The round with the sizes that a closer look found, and the picks to refit for them. wanted: what is looked at."""
     before, found, options = opened.before, opened.candidates, search.options
-    asked = [c for c in found if effects()[c.effect].scanned and _worth_a_scan(c) and wanted(c)]
+    asked = [c for c in found if effects()[c.effect].needs_grid and _worth_a_scan(c) and wanted(c)]
     times = [a.time for a in opened.paths.values()]
     signals = slot_signals(before.model, opened.paths, before.placed)
-    dense = [every_size(c, SlotSignal.of(times, signals[c.at[0]])) for c in asked]
+    dense = [every_size(c, SignalScales.of(times, signals[c.at[0]])) for c in asked]
     if all(isinstance(p, Along) for p in opened.paths.values()):
         dense += [widened(c) for c in found if not c.still and bent(c) and wanted(c)]
     if not dense:

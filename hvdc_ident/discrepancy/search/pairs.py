@@ -45,7 +45,7 @@ def pair(search: SearchContext, before: Refit, found: Round) -> tuple[Round, Rou
 
 
 def _scanned(found: Round, pick: Pick) -> bool:
-    return effects()[found.candidates[pick.candidate].effect].scanned
+    return effects()[found.candidates[pick.candidate].effect].needs_grid
 
 
 def _best(rows: Array, residual: Array) -> list[tuple[int, int]]:

@@ -1,6 +1,6 @@
 """Output of an effect driven by given signals, many at once, on a grid of instants: its own equations, without the plant.
 
-The equations are those of the catalogue (`effects.alone`); states are stepped by an exponential form that is exact for
+The equations are those of the catalogue (`effects.effect_model`); states are stepped by an exponential form that is exact for
 a linear effect of a signal of straight pieces. What the steps cannot take (a delay of a state) goes to the simulator.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.discrepancy.signatures.march import hold, march
-from hvdc_ident.effects import Effect, EffectUse, alone
+from hvdc_ident.effects import Effect, EffectUse, effect_model
 from hvdc_ident.expression import FUNCTIONS, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, ordered_signals
@@ -277,12 +277,12 @@ def _made(effect: str, present: tuple[str, ...], source: bool) -> EffectBlock:
     # Any value away from neutral gives the structure; the run takes its own values.
     values = {n: _away(q) if n in present else q.value for n, q in entry.parameters.items()}
     use = EffectUse(effect, ("u",), FrozenMap(values), prefix="own", source="source" if source else "")
-    return EffectBlock(alone(use, source), _quick(entry))
+    return EffectBlock(effect_model(use, source), _quick(entry))
 
 
 def _quick(entry: Effect) -> Quick | None:
     """The effect's own short cut, of a block's parameters."""
-    short = entry.quick
+    short = entry.numpy_form
     return short and (lambda u, p: short(u, {n: p[parameter(n)] for n in entry.parameters}))
 
 

@@ -14,13 +14,13 @@ from hvdc_ident.effects import (
     Effect,
     EffectUse,
     Probe,
-    SlotSignal,
-    each_its_own,
+    SignalScales,
+    admissible_sources,
     effects,
-    joined,
+    joined_sources,
     probes,
-    resistances,
-    sources,
+    resistance_parameters,
+    split_sources,
 )
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.immutable import FrozenMap
@@ -57,7 +57,7 @@ class CandidateEffect:
     @property
     def sources(self) -> tuple[str, ...]:
         """By place the signal that is brought in there; () where none is."""
-        return each_its_own(self.source, self.at)
+        return split_sources(self.source, self.at)
 
     def use(self, probe: Probe) -> EffectUse:
         """The effect as the model takes it."""
@@ -68,7 +68,7 @@ def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:
     """The effects of the catalogue to try; forms that have to be found first are not among them. A name may be "all", too:
     those that a search for every effect tries, beside which others may be named."""
     catalogue = effects()
-    sought = [n for n, e in catalogue.items() if e.sought]
+    sought = [n for n, e in catalogue.items() if e.tried_by_default]
     chosen: dict[str, None] = {}
     for name in ["all"] if names == "all" else names:
         if name != "all" and name not in catalogue:
@@ -88,7 +88,7 @@ def candidates(
     """Every candidate. signals: at the model's slots, those of measured outputs included; times: (K,) of each experiment."""
     live = [p for p in signals if _moves(model, p)]
     groups = places_of(model, live, places)
-    about = {p: SlotSignal.of(times, signals[p], tones) for p in live}
+    about = {p: SignalScales.of(times, signals[p], tones) for p in live}
     brought = source_signals(model, signals)
     if not isinstance(model, Model):
         brought += tuple(p for p in live if kind_of(model, p) == "output")
@@ -96,11 +96,11 @@ def candidates(
     doubled = any(e.name == "coupling" for e in tried)
     found: list[CandidateEffect] = []
     for at in groups:
-        joined = SlotSignal.joined([about[p] for p in at])
+        joined = SignalScales.joined([about[p] for p in at])
         still = joined.high - joined.low <= STILL * max(joined.peak, STILL)
         kinds = {kind_of(model, p) for p in at}
         for effect in tried:
-            if not kinds <= set(effect.places):
+            if not kinds <= set(effect.insertion_kinds):
                 continue
             if effect.name == "droop" and doubled:
                 continue  # without its deadband a droop is a negative coupling, which is tried
@@ -115,13 +115,13 @@ def _at(
     model: AnyModel,
     effect: Effect,
     at: tuple[str, ...],
-    signal: SlotSignal,
+    signal: SignalScales,
     still: bool,
-    about: Mapping[str, SlotSignal],
+    about: Mapping[str, SignalScales],
     brought: Sequence[str],
 ) -> list[CandidateEffect]:
     if effect.resistance:
-        found = list(resistances(model, at[0])) if len(at) == 1 and isinstance(model, Model) else []
+        found = list(resistance_parameters(model, at[0])) if len(at) == 1 and isinstance(model, Model) else []
         return [
             CandidateEffect(
                 effect.name, at, probes(effect, signal, given={effect.resistance: model.parameters[n].value}),
@@ -133,12 +133,12 @@ def _at(
         return [CandidateEffect(effect.name, at, probes(effect, signal), still=still and not additive(effect))]
     open_to = [_open_to(model, p, [*about]) for p in at]
     seen = {
-        own: SlotSignal.joined([about[s] for s in own])
+        own: SignalScales.joined([about[s] for s in own])
         for own in own_sources(at, brought, about)
         if all(s in may for s, may in zip(own, open_to, strict=True))
     }
     return [
-        CandidateEffect(effect.name, at, _halved(probes(effect, signal, other)), source=joined(own))
+        CandidateEffect(effect.name, at, _halved(probes(effect, signal, other)), source=joined_sources(own))
         for own, other in seen.items()
         if not (still and other.high == other.low)
     ]
@@ -194,14 +194,16 @@ def kind_of(model: AnyModel, place: str) -> str:
         return "input"
     if place.removeprefix("outputs.") in model.outputs:
         return "output"
-    raise unknown_name("slot", place, model.slots, where=f"model '{model.name}', which is closed inside")
+    raise unknown_name(
+        "insertion point", place, model.insertion_points, where=f"model '{model.name}', which is closed inside"
+    )
 
 
 def _open_to(model: AnyModel, place: str, brought: Sequence[str]) -> set[str]:
     """Signals that an effect at a place may bring in: none that would close a circle. At an end of a closed model signals of its
     own side: an output at an input would close a loop around it, and what comes out does not see what goes in."""
     if isinstance(model, Model):
-        return {*sources(model, place)} - {place}
+        return {*admissible_sources(model, place)} - {place}
     return {s for s in brought if s != place and kind_of(model, s) == kind_of(model, place)}
 
 

@@ -108,6 +108,6 @@ def slot_signals(
     are in the model already; nothing is looked for inside them.
     """
     first, *others = (a.slots for a in paths.values())
-    common = [p for p in first if p in model.slots and all(p in slots for slots in others)]
+    common = [p for p in first if p in model.insertion_points and all(p in slots for slots in others)]
     outer = [p for p in common if not any(one.use.made(p) for one in placed)]
     return {p: tuple(a.signal(p) for a in paths.values()) for p in outer}

@@ -13,7 +13,7 @@ from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.scores.scored import Path
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.trials.library import Term, along
-from hvdc_ident.effects import EffectUse
+from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -51,7 +51,7 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
     values = {n: float(c) for n, c in zip(names, coefficients, strict=True)}
     use = EffectUse("term", (place,), FrozenMap(values), expression=expression)
     had = set(before.model.parameters)
-    model = before.model.with_effects([use])
+    model = apply_effects(before.model, [use])
     new = [n for n in model.parameters if n not in had]
     # Of a curve the largest value tells how large the others may become: one may begin at 0.
     most = max(map(abs, values.values())) if all(t.form == "hat" for t in chosen) else 0.0

@@ -25,7 +25,7 @@ from hvdc_ident.discrepancy.trials.context import SearchContext
 from hvdc_ident.discrepancy.trials.objections import unseen_rows
 from hvdc_ident.discrepancy.trials.race import done
 from hvdc_ident.discrepancy.trials.refit_jobs import as_given
-from hvdc_ident.effects import SlotSignal, effects, scanned
+from hvdc_ident.effects import SignalScales, effects, size_grid
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
@@ -151,8 +151,8 @@ def _levels(here: Refit) -> Array:
     _, _, low, high = _size(here)
     placed = here.placed[-1]
     seen = signal(here, placed.use.at[0])
-    about = SlotSignal.of([e.time for e in here.problem.fitted_experiments], list(seen.values()))
-    _, sizes = scanned(effects()[placed.candidate.effect], about)
+    about = SignalScales.of([e.time for e in here.problem.fitted_experiments], list(seen.values()))
+    _, sizes = size_grid(effects()[placed.candidate.effect], about)
     return np.sort(sizes[(sizes > low) & (sizes < high) & (sizes > about.range / LEVELS)])
 
 

@@ -13,7 +13,7 @@ from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.trials.select import Pick
-from hvdc_ident.effects import effects
+from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -88,13 +88,13 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         parameters: dict[str, float | str] = {**values, **named}
         use = replace(p.use, parameters=FrozenMap(parameters), prefix="").within(model)
         before = set(model.parameters)
-        model = model.with_effects([use])
+        model = apply_effects(model, [use])
         new = [n for n in model.parameters if n not in before]
         names = dict(zip(p.names, new, strict=True))
         free += [FitParameter(names[n], values[n], *p.bounds[n]) for n in p.bounds]
         moved = replace(p.candidate, at=use.at, source=use.source)
         again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    free_initial_states = any(effects()[p.use.effect].restless for p in placed)
+    free_initial_states = any(effects()[p.use.effect].self_exciting for p in placed)
     problem = replace(
         here.problem,
         simulator=ModelSimulator(model, PATIENCE),

@@ -93,7 +93,7 @@ def once_more(
     chosen: dict[str, list[CandidateFit]] = {}
     for t in sorted(order, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
-        if effects()[effect].scanned and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < most:
+        if effects()[effect].needs_grid and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < most:
             chosen[effect].append(t)
     kept = list(trials)
     for heat in ([group[:1] for group in chosen.values()], [group[1:] for group in chosen.values()]):

@@ -86,7 +86,12 @@ def best_of(scores: Scores, found: Sequence[CandidateEffect]) -> tuple[Pick, ...
             best[c] = k
     picks = [
         # The size of an effect that is scanned is met or it is not.
-        Pick(c, scores.columns[k].probe, 1.0 if effects()[found[c].effect].scanned else float(expected[k]), float(t[k]))
+        Pick(
+            c,
+            scores.columns[k].probe,
+            1.0 if effects()[found[c].effect].needs_grid else float(expected[k]),
+            float(t[k]),
+        )
         for c, k in best.items()
     ]
     # Of equal scores the simpler: fewer places first, as listed.

@@ -39,12 +39,12 @@ def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
     assert winner is not None and found.ruler is not None
     placed = winner.refit.placed[-1]
     effect = effects()[placed.candidate.effect]
-    if effect.late is not None and not effect.scanned:
+    if effect.equivalent_delay is not None and not effect.needs_grid:
         tried = filters(search, found, found.before.nominal()) if found.filters is None else found.filters
         return tuple(gained(t, found.before, found.ruler) for t in tried)
     # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
     remembers = effect.states != "none" and not effect.needs_source
-    if remembers or effect.scanned or additive(effect):
+    if remembers or effect.needs_grid or additive(effect):
         return ()
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
         return ()

@@ -78,7 +78,7 @@ def _quick(left: Nominal) -> Doubt | None:
 def _one_way(last: Refit) -> Doubt | None:
     """Doubt because a play was passed in one direction only: whatever shifts a signal once it has moved does the same."""
     for placed in last.placed:
-        width = last.sizes(placed).get(effects()[placed.candidate.effect].turns)
+        width = last.sizes(placed).get(effects()[placed.candidate.effect].reversal)
         if width is None:
             continue
         try:

@@ -187,7 +187,7 @@ def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
 
 def _one_kind(group: Sequence[Rival]) -> bool:
     """Return True where the members of a set are one effect at several places, or delays of one kind or another."""
-    return len({r.effect for r in group}) == 1 or all(effects()[r.effect].late is not None for r in group)
+    return len({r.effect for r in group}) == 1 or all(effects()[r.effect].equivalent_delay is not None for r in group)
 
 
 def noise_left(left: Nominal) -> float:

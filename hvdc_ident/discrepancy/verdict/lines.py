@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.search.forward import SearchOutcome
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.trials.context import Round
 from hvdc_ident.discrepancy.trials.select import CandidateFit
-from hvdc_ident.effects import clearance, effects
+from hvdc_ident.effects import distance_from_neutral, effects
 from hvdc_ident.immutable import FrozenMap
 
 ABSORBED = 0.99
@@ -82,7 +82,7 @@ def smallest(r: Round, c: CandidateEffect, columns: Sequence[int], threshold: fl
     s, entry = r.scores, effects()[c.effect]
     points = []
     for k in columns:
-        away = clearance(entry, dict(c.probes[s.columns[k].probe].values))
+        away = distance_from_neutral(entry, dict(c.probes[s.columns[k].probe].values))
         distance = max((abs(v) for v in away.values()), default=0.0)
         if s.sound[k] and distance > 0 and s.left[k] > 0 and s.absorbed[k] < 1.0 - 1e-6:
             points.append((distance, float(s.left[k]), k))

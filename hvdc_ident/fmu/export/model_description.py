@@ -34,7 +34,7 @@ class ExportedVariables:
     """All variables in the ranges of value references that internal.h names.
 
     A name stands once in an FMU. An output that is a state or an input of its name is that variable where it is a state;
-    any other output whose name is taken becomes outputs.NAME, as slots are named.
+    any other output whose name is taken becomes outputs.NAME, as insertion points are named.
     """
 
     program: CModel

@@ -157,7 +157,7 @@ def _where(found: dict[str, Any]) -> str:
         parts.append(f"It is densest where {text(region['signal'])} lies between {ends}.")
     if slots := place.get("slots"):
         listed = ", ".join(f"{text(n)} {100 * min(v, 1.0):.0f} %" for n, v in slots.items())
-        parts.append(f"An effect at one slot could make good of it at most: {listed}.")
+        parts.append(f"An effect at one insertion point could explain at most: {listed}.")
     explained, rest = left.get("explained_share"), "noise" if left.get("adequate") else "not all noise"
     if explained is not None:
         parts.append(f"{100 * explained:.1f} % of the gap is explained; what is left is {rest}.")
@@ -217,7 +217,7 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def hidden_curve(at: str, curve: Mapping[str, Any]) -> Figure:
-    """Figure of the signal added at a slot, over time or over a signal, with its 95 % band where that is known."""
+    """Figure of the signal added at an insertion point, over time or over a signal, with its 95 % band where that is known."""
     fig = figure(7.4, 2.6, {"left": 0.12, "right": 0.98, "bottom": 0.2, "top": 0.97})
     axes = fig.subplots()
     x, y = np.array(curve["at"]), np.array(curve["value"])

@@ -17,7 +17,7 @@ from hidden.sizes import UNIT, WIDTH, on_jumps
 from hvdc_ident import simulate
 from hvdc_ident.data import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.effects import EffectUse, effects
+from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.immutable import FrozenMap
@@ -86,7 +86,7 @@ def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
         "truth": case.truth,
     }
     model, experiments, free = model_of(design.plant), experiments_of(case), free_of(case)
-    others = [n for n, e in effects().items() if e.sought and n not in design.effects]
+    others = [n for n, e in effects().items() if e.tried_by_default and n not in design.effects]
     tried: Any = others if design.part == "left-out" else "all"
     begin = time.perf_counter()
     try:
@@ -189,7 +189,7 @@ def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: S
     for h in case.hidden:
         use = EffectUse(h.effect, (h.at,), FrozenMap(_numbers(h.parameters)), source=h.source)
         before = set(model.parameters)
-        model = model.with_effects([use])
+        model = apply_effects(model, [use])
         bounds = _bounds(h.effect, _numbers(h.parameters))
         for name in (n for n in model.parameters if n not in before):
             own = next(
@@ -220,7 +220,7 @@ def _bounds(effect: str, values: Mapping[str, float]) -> dict[str, tuple[float, 
     found = {}
     for name, q in effects()[effect].parameters.items():
         value = values.get(name, q.value)
-        if q.held or (q.optional and value == q.neutral):
+        if q.fixed or (q.optional and value == q.neutral):
             continue
         low, high = sorted((value / 10.0, value * 10.0)) if value else (-1.0, 1.0)
         found[name] = (max(low, q.min), min(high, q.max))

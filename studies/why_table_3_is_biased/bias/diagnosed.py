@@ -10,6 +10,7 @@ from common import diagnosing, paper
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.effects import effects as catalogue
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import FitParameter, Problem, fit
@@ -95,8 +96,8 @@ def put_in(told: Mapping[str, Any], name: str) -> dict[str, Any]:
         return {"effects": sized(told)} | {k: dict(told[k]) for k in ("refitted", "augmented")}
     best, plain = told["first round"][0], link()
     brought = {"from": best["from"]} if best["from"] else {}
-    model = plain.with_effects(
-        [{"effect": best["effect"], "at": best["at"], "parameters": best["parameters"], **brought}]
+    model = apply_effects(
+        plain, [{"effect": best["effect"], "at": best["at"], "parameters": best["parameters"], **brought}]
     )
     own = dict(zip((n for n in model.parameters if n not in plain.parameters), best["parameters"], strict=True))
     sizes = tuple(FitParameter(n, v, v / 5, 5 * v) for n, q in own.items() if (v := best["parameters"][q]))
@@ -128,7 +129,7 @@ def augmented(told: Mapping[str, Any]) -> Model:
         | ({"from": e["from"]} if e["from"] else {})
         for e in told["effects"]
     ]
-    return load_model(paper.LINK).with_effects(uses)
+    return apply_effects(load_model(paper.LINK), uses)
 
 
 def figure_8(told: Mapping[str, Any]) -> dict[str, dict[str, float]]:

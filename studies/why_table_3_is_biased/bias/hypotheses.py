@@ -11,6 +11,7 @@ import numpy as np
 from common import paper
 
 from hvdc_ident.data import Experiment
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.models import load_model, vsc_hvdc_avm
@@ -62,7 +63,7 @@ def causes() -> dict[str, Cause]:
     """Return every cause that is scored."""
     link = load_model(paper.LINK)
     found = {"nothing missing": Cause(link), "the average-value link": Cause(vsc_hvdc_avm.model())}
-    found |= {name: Cause(link.with_effects(uses)) for name, uses in EFFECTS.items()}
+    found |= {name: Cause(apply_effects(link, uses)) for name, uses in EFFECTS.items()}
     found |= {n: Cause(link.with_values({c: by * link.values[c] for c in ("C1", "C2")})) for n, by in VALUES.items()}
     return found | {
         "recorded steps 1.5 ms late": Cause(link, late=LATE),

@@ -1,16 +1,23 @@
-"""An effect put into a model: where it sits, with which values, and what signal it brings in."""
+"""Insertion of effects into a model: `EffectUse` says which effect sits where, with which values and which other signal.
+
+`effects` is the catalogue, found by walking this folder; `apply_effects` inserts a list of uses, one after the other.
+"""
 
 from __future__ import annotations
 
+import importlib
 import math
+import pkgutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cache
+from pathlib import Path
+from typing import Any, overload
 
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.errors import InputError, ModelError, unknown_name
+from hvdc_ident.errors import InputError, ModelError, require_known, unknown_name
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, fresh, insertion_point, insertion_point_of, rewritten
@@ -19,14 +26,26 @@ from hvdc_ident.parameters import Parameter
 COEFFICIENT = EffectParameter(0.0, neutral=0.0, min=-math.inf, optional=True, description="coefficient of the term")
 
 
+NOT_EFFECTS = ("base", "placement", "probing")
+"""Modules of this folder that hold no effect."""
+
+
+@cache
+def effects() -> FrozenMap[Effect]:
+    """Return every effect of the catalogue by name."""
+    names = [m.name for m in pkgutil.iter_modules([str(Path(__file__).parent)]) if m.name not in NOT_EFFECTS]
+    entries = [importlib.import_module(f"hvdc_ident.effects.{name}").EFFECT for name in names]
+    return FrozenMap({e.name: e for e in sorted(entries, key=lambda e: e.name)})
+
+
 @dataclass(frozen=True)
 class EffectUse:
-    """An effect at one or more slots that share its parameters.
+    """An effect at one or more insertion points that share its parameters.
 
-    parameters: values that differ from the effect's own; a text is the name of a parameter of the model that stands
-    in for it. source: the other signal that the effect brings in (`from` in a study file): any slot; or, joined by commas,
-    one for each of its places, as each station brings in a signal of its own. prefix: of its names in the model; default
-    EFFECT_SLOT. expression: the term, where the effect is one.
+    parameters: values that differ from the effect's defaults; a text is the name of a parameter of the model that replaces
+    it. source: the other signal that the effect brings in (`from` in a study file): any insertion point; or, joined by
+    commas, one for each place of the effect, as each station brings in its own signal. prefix: of its names in the model;
+    default EFFECT_PLACE. expression: the term, where the effect is one.
     """
 
     effect: str
@@ -38,17 +57,14 @@ class EffectUse:
 
     @classmethod
     def of(cls, given: EffectUse | Mapping[str, Any]) -> EffectUse:
-        """From itself or from a mapping as in a study file."""
+        """Return the use itself, or that which a mapping describes as in a study file."""
         if isinstance(given, EffectUse):
             return given
-        known = ("effect", "at", "parameters", "from", "expression", "prefix")
-        for key in given:
-            if key not in known:
-                raise unknown_name("key", key, known, where="an effect")
+        require_known("key", given, ("effect", "at", "parameters", "from", "expression", "prefix"), "an effect")
         if "effect" not in given or "at" not in given:
             raise ModelError(
                 "an effect needs its name and its place",
-                expected="effect = NAME, at = SLOT or [SLOT, ...]",
+                expected="effect = NAME, at = PLACE or [PLACE, ...]",
                 got=str(dict(given)),
             )
         at, source = given["at"], given.get("from", "")
@@ -57,55 +73,59 @@ class EffectUse:
             (at,) if isinstance(at, str) else tuple(at),
             FrozenMap(given.get("parameters", {})),
             str(given.get("prefix", "")),
-            source if isinstance(source, str) else joined(source),
+            source if isinstance(source, str) else joined_sources(source),
             str(given.get("expression", "")),
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The use as it stands in a study file; `of` gives it back."""
+        """Return the use as it stands in a study file; `of` is the inverse."""
         result: dict[str, Any] = {"effect": self.effect, "at": list(self.at), "parameters": dict(self.parameters)}
         source = list(self.sources) if "," in self.source else self.source
         extra = {"from": source, "expression": self.expression, "prefix": self.prefix}
-        return result | {key: told for key, told in extra.items() if told}
+        return result | {key: value for key, value in extra.items() if value}
 
     def within(self, model: AnyModel) -> EffectUse:
-        """Return the use at this model's slots: what sat behind an effect that the model lacks sits where that one did."""
-        source = joined(insertion_point_of(model.slots, s) for s in self.sources)
-        return replace(self, at=tuple(insertion_point_of(model.slots, place) for place in self.at), source=source)
+        """Return the use at this model's points: what sat behind an effect that the model lacks sits where that one did."""
+        source = joined_sources(insertion_point_of(model.insertion_points, s) for s in self.sources)
+        return replace(
+            self, at=tuple(insertion_point_of(model.insertion_points, place) for place in self.at), source=source
+        )
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """By place the signal that is brought in there; () where the effect brings none in. Raises ModelError where they
-        are neither one for all places nor one for each."""
-        return each_its_own(self.source, self.at)
+        """Name of the signal brought in at each place, () where the effect brings none in.
+
+        Raises ModelError where there is neither one for all places nor one for each.
+        """
+        return split_sources(self.source, self.at)
 
     @property
     def label(self) -> str:
-        """The effect's name as part of an identifier."""
+        """Name of the effect as part of an identifier."""
         return self.effect.replace("-", "_")
 
     def parameter_name(self, name: str) -> str:
-        """Name of a parameter of the effect in the model."""
+        """Return the name of a parameter of the effect in the model."""
         prefix = self.prefix or self.prefix_at(self.at[0])
         return f"{prefix}_{name}"
 
     def made(self, name: str) -> bool:
-        """True for a state or signal of the model that is part of this effect, False for a slot that it sits at."""
+        """Return True for a state or signal of the model that is part of this effect, False for its insertion points."""
         return any(name.startswith(f"{self.prefix_at(place)}_") for place in self.at)
 
     def prefix_at(self, place: str) -> str:
-        """Prefix of the names of all that the effect adds at a place."""
+        """Return the prefix of the names of all that the effect adds at a place."""
         return f"{self.label}_{place.replace('.', '_')}"
 
 
-def joined(sources: Iterable[str]) -> str:
-    """One text of what is brought in by place: of one signal its name."""
-    own = list(sources)
-    return ", ".join(own[:1] if len(set(own)) == 1 else own)
+def joined_sources(sources: Iterable[str]) -> str:
+    """Return the names of the signals brought in, one a place, as one text; one name where all are the same."""
+    names = list(sources)
+    return ", ".join(names[:1] if len(set(names)) == 1 else names)
 
 
-def each_its_own(source: str, at: Sequence[str]) -> tuple[str, ...]:
-    """By place what `joined` put into one text: one signal for all, or one for each."""
+def split_sources(source: str, at: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that `joined_sources` put into one text, one a place. Raises ModelError for another number of names."""
     names = tuple(name.strip() for name in source.split(",")) if source else ()
     if len(names) > 1 and len(names) != len(at):
         raise ModelError(
@@ -117,8 +137,32 @@ def each_its_own(source: str, at: Sequence[str]) -> tuple[str, ...]:
     return names * len(at) if len(names) == 1 else names
 
 
-def apply(model: Model, use: EffectUse, effect: Effect) -> Model:
-    """The model with the effect in it; the same model where the effect is neutral.
+@overload
+def apply_effects(model: Model, uses: Iterable[EffectUse | Mapping[str, Any]]) -> Model: ...
+@overload
+def apply_effects(model: AnyModel, uses: Iterable[EffectUse | Mapping[str, Any]]) -> AnyModel: ...
+def apply_effects(model: AnyModel, uses: Iterable[EffectUse | Mapping[str, Any]]) -> AnyModel:
+    """Return the model with the effects inserted one after the other; an effect at its neutral value changes nothing.
+
+    uses: `EffectUse` objects or dicts {"effect": name, "at": place or places, "parameters": {NAME: value}}.
+
+        >>> lagging = apply_effects(load_model("vsc-hvdc-link"), [{"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}}])
+
+    Raises ModelError or UnknownNameError for an effect, parameters, places and signals that do not fit the model.
+    """
+    if not isinstance(model, Model):
+        return model.with_effects(uses)
+    catalogue = effects()
+    for given in uses:
+        use = EffectUse.of(given)
+        if use.effect not in catalogue:
+            raise unknown_name("effect", use.effect, catalogue)
+        model = _with_effect(model, use, catalogue[use.effect])
+    return model
+
+
+def _with_effect(model: Model, use: EffectUse, effect: Effect) -> Model:
+    """Return the model with the effect in it; the model itself where the effect is neutral.
 
     Raises ModelError or UnknownNameError for parameters, places and signals that do not fit, with the effect's place.
     """
@@ -126,14 +170,17 @@ def apply(model: Model, use: EffectUse, effect: Effect) -> Model:
     parameters = _parameters(use, effect, where)
     _check_places(model, use, effect, where)
     given = {n: use.parameters.get(n, q.value) for n, q in parameters.items()}
-    values = {n: _resolved(model, v, f"{where}, parameter '{n}'") for n, v in given.items()}
+    values: dict[str, float] = {}
+    for n, v in given.items():
+        require_known("parameter", [v] if isinstance(v, str) else (), model.parameters, f"{where}, parameter '{n}'")
+        values[n] = model.parameters[v].value if isinstance(v, str) else float(v)
     if replace(effect, parameters=FrozenMap(parameters)).is_neutral(values):
         return model
     if bool(use.source) != effect.needs_source:
         raise ModelError(
             "the effect needs another signal" if effect.needs_source else "the effect brings no other signal in",
             where=where,
-            expected="from = SLOT" if effect.needs_source else "no `from`",
+            expected="from = NAME" if effect.needs_source else "no `from`",
             got=repr(use.source) if use.source else "nothing",
         )
     symbols: dict[str, sp.Expr] = {}
@@ -165,18 +212,18 @@ def _at_one(
     symbols: Mapping[str, sp.Expr],
     where: str,
 ) -> Model:
-    """The model with the effect at one of its slots. source: what is brought in there."""
+    """Return the model with the effect at one of its places. source: the signal brought in there."""
     kind, name = insertion_point(model, place)
     circular = kind in ("signal", "algebraic") and _leads_back(model, name)
 
     def rewrite(m: Model, u: sp.Expr) -> tuple[Model, sp.Expr]:
         p = dict(symbols)
-        # The slot's own name stands for what it was before the effect: after it, it would run in a circle.
-        own = {symbol(name): u} if kind in ("signal", "algebraic") else {}
+        # In the effect the name of its place means the signal before the effect: the one after it would close a circle.
+        before = {symbol(name): u} if kind in ("signal", "algebraic") else {}
         if effect.needs_source:
-            p["from"] = _source(m, source, where).xreplace(own)
+            p["from"] = _source(m, source, where).xreplace(before)
         if effect.needs_expression:
-            p["expression"] = _term(use, symbols, where).xreplace(own)
+            p["expression"] = _term(use, symbols, where).xreplace(before)
         add = Additions(m, use.prefix_at(place), kind, circular)
         y = effect.rewrite(u, p, add)
         return add.model, y
@@ -188,7 +235,7 @@ def _at_one(
 
 
 def _leads_back(model: Model, name: str) -> bool:
-    """True where a signal or unknown is computed from itself, through other signals and unknowns alone."""
+    """Return True where a signal or unknown is computed from itself, through other signals and unknowns alone."""
     equations = {n: s.value for n, s in model.signals.items()} | {n: a.equation for n, a in model.algebraic.items()}
     seen: set[str] = set()
     stack = [name]
@@ -202,7 +249,7 @@ def _leads_back(model: Model, name: str) -> bool:
 
 
 def _parameters(use: EffectUse, effect: Effect, where: str) -> Mapping[str, EffectParameter]:
-    """The effect's parameters in this use: its own, or the coefficients of a term."""
+    """Return the effect's parameters in this use: those of the catalogue, or the coefficients of a term."""
     if effect.needs_expression:
         if not use.expression or not use.parameters:
             raise ModelError(
@@ -214,43 +261,31 @@ def _parameters(use: EffectUse, effect: Effect, where: str) -> Mapping[str, Effe
         return dict.fromkeys(use.parameters, COEFFICIENT)
     if use.expression:
         raise ModelError("only a term has an expression", where=where, got=repr(use.expression))
-    for name in use.parameters:
-        if name not in effect.parameters:
-            raise unknown_name("parameter", name, effect.parameters, where=where)
+    require_known("parameter", use.parameters, effect.parameters, where)
     return effect.parameters
 
 
 def _check_places(model: Model, use: EffectUse, effect: Effect, where: str) -> None:
     if not use.at:
-        raise ModelError("the effect has no place", where=where, expected="at least one slot")
+        raise ModelError("the effect has no place", where=where, expected="at least one insertion point")
     for place in use.at:
         kind = insertion_point(model, place)[0]
-        if kind not in effect.places:
+        if kind not in effect.insertion_kinds:
             raise ModelError(
-                f"the effect cannot sit at the {kind} '{place}'", where=where, expected=" or ".join(effect.places)
+                f"the effect cannot sit at the {kind} '{place}'",
+                where=where,
+                expected=" or ".join(effect.insertion_kinds),
             )
 
 
-def _resolved(model: Model, value: float | str, where: str) -> float:
-    """The number of a parameter that is given as one or as the name of a parameter of the model."""
-    if isinstance(value, str):
-        if value not in model.parameters:
-            raise unknown_name("parameter", value, model.parameters, where=where)
-        return model.parameters[value].value
-    return float(value)
-
-
 def _source(model: Model, name: str, where: str) -> sp.Expr:
-    kind, name = insertion_point(model, name) if name in model.slots else _no_source(model, name, where)
+    require_known("signal", [name], model.insertion_points, f"{where}, from")
+    kind, name = insertion_point(model, name)
     return model.outputs[name].value if kind == "output" else symbol(name)
 
 
-def _no_source(model: Model, name: str, where: str) -> tuple[str, str]:
-    raise unknown_name("signal", name, model.slots, where=f"{where}, from")
-
-
 def _term(use: EffectUse, symbols: Mapping[str, sp.Expr], where: str) -> sp.Expr:
-    """The term's expression, its coefficients under the names they have in the model; those at 0 are gone."""
+    """Return the term with its coefficients under the names they have in the model; those at 0 are left out."""
     coefficients = {symbol(n): symbols.get(n, sp.S.Zero) for n in use.parameters}
     expression = parse(use.expression, where=f"{where}, expression")
     missing = sorted(c.name for c in coefficients if c not in expression.free_symbols)
