@@ -19,7 +19,7 @@ from hvdc_ident.fmu.export.model_description import KINDS, ExportedVariables, bu
 from hvdc_ident.model import Model
 
 VERSIONS = ("2.0", "3.0")
-_SHARED = (
+_RUNTIME = (
     "linear.c",
     "equations.c",
     "start.c",
@@ -28,6 +28,7 @@ _SHARED = (
     "tangent.c",
     "instance.c",
     "snapshot.c",
+    "fmi.c",
 )
 _NAMESPACE = uuid.UUID("4f1f2a5e-6d0b-5a43-9f0e-3d5c1f6e7a90")
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same model gives the same file
@@ -97,21 +98,20 @@ def identifier_of(name: str) -> str:
 
 
 def _content(program: CModel, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
-    interface = "fmi2.c" if version == "2.0" else "fmi3.c"
     runtime = resources.files("hvdc_ident.fmu.export") / "runtime"
-    names = ("model.c", *_SHARED, interface)
-
+    shared = (*_RUNTIME, f"fmi{version[0]}.c")
+    names = ("model.c", *shared)
     variables = ExportedVariables(program)
-    files = {"model.c": variables.program.source, "tableau.h": tableau()}
-    files |= {n: (runtime / n).read_text("utf-8") for n in (*_SHARED, interface, "internal.h")}
+    files = {"model.c": program.source, "tableau.h": tableau()}
+    files |= {n: (runtime / n).read_text("utf-8") for n in (*shared, "fmi.h", "internal.h")}
 
     def described(token: str) -> str:
         return description(variables, token, version, identifier, kinds, names, stop)
 
-    # The token names this very content: an importer's stored state of another model is refused.
-    everything = [described(""), variables.program.header(""), *(files[n] for n in sorted(files))]
+    # The token is a digest of the content: an importer's stored state of another model is refused.
+    everything = [described(""), program.header("", version), *(files[n] for n in sorted(files))]
     token = f"{{{uuid.uuid5(_NAMESPACE, ''.join(everything))}}}"
-    files["model.h"] = variables.program.header(token)
+    files["model.h"] = program.header(token, version)
     content = {"modelDescription.xml": described(token)}
     content |= {f"sources/{n}": t for n, t in files.items()}
     if version == "3.0":

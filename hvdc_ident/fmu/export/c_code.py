@@ -79,8 +79,8 @@ class CModel:
         names = list(self.model.parameters)
         return frozenset(names[i] for v in self.structure.timing for i in self.structure.partial(v, "p"))
 
-    def header(self, token: str) -> str:
-        """The text of model.h. token: what an importer has to name to get an instance."""
+    def header(self, token: str, version: str) -> str:
+        """Return the text of model.h. token: what an importer has to name to get an instance. version: of FMI."""
         s = self.structure.sizes
         sizes = {"NX": s.nx, "NZ": s.nz, "NU": s.nu, "ND": s.nd, "NQ": s.nq, "NS": s.ns, "NO": s.no}
         sizes |= {"NP": len(self.model.parameters), "FACTORS": self._elimination.count if self._elimination else 0}
@@ -88,6 +88,7 @@ class CModel:
             f"/* {_comment(self.model.name)}: sizes, names and equations; generated. */",
             "#ifndef HVDC_MODEL_H",
             "#define HVDC_MODEL_H",
+            f"#define FMI_VERSION {version[0]}",
             *(f"#define {n} {v}" for n, v in sizes.items()),
             f"#define MODEL_TOKEN {c_string(token)}",
             f"#define DEFAULT_TOLERANCE {c_number(TOLERANCE)}",
