@@ -135,7 +135,7 @@ def _why(e: dict[str, Any]) -> str:
     plain, named = (max(abs(found[k][n] / paper.TABLE_1[n] - 1.0) for n in found[k]) for k in ("refitted", "augmented"))
     return (
         f"a lag of 1.6 ms that the model lacks gives {moved}, in the model {back}; without filters and inner loop KIVDC is "
-        f"{inner}; with the effects that `diagnose` finds if a twentieth of the noise is significant, the gains are at most "
+        f"{inner}; with the effects that `diagnose` finds if a twentieth of the noise is relevant, the gains are at most "
         f"{100 * named:.1f} % off Table I (plain link {100 * plain:.0f} %)"
     )
 

@@ -43,7 +43,7 @@ MORE = (*paper.OUTPUTS, "Vdc1", "P2", "Q1", "Ir1", "Ir2")
 TOLD_NOTHING = {"the paper's signals": Asked(paper.OUTPUTS), "P, Q, Vdc and currents too": Asked(MORE)}
 FINER = {
     # A gap of a twentieth of the noise matters here, for it is the gains that are asked for.
-    "the same, smaller gap significant": Asked(MORE, replace(OPTIONS, holdout_share=0.05))
+    "the same, smaller gap relevant": Asked(MORE, replace(OPTIONS, holdout_share=0.05))
 }
 ASKED = TOLD_NOTHING | FINER
 FREE = ("KIP", "KPVDC", "KIVDC", "KIQ")
