@@ -1,4 +1,4 @@
-"""Where work runs and where its progress is shown: the two protocols that every verb takes, and the progress bar."""
+"""Executors and progress: the two protocols that every verb takes, the outcome of an item, and the progress bar."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+from hvdc_ident.errors import ComputationError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -25,23 +28,21 @@ class Executor(Protocol):
         """Return the function's results in the items' order."""
 
 
-class Ended(Protocol):
-    """The end of one item: its place among the items, and its value, or why it has none."""
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of one item: its index among the items, its value, and why it has none, empty where it has."""
 
-    @property
-    def index(self) -> int: ...
-    @property
-    def value(self) -> Any: ...
-    @property
-    def failure(self) -> str: ...
+    index: int
+    value: Any = None
+    failure: str = ""
 
 
 @runtime_checkable
-class Runner(Protocol):
-    """An executor that tells the end of each item, in any order: an item that is lost costs no other."""
+class TolerantExecutor(Protocol):
+    """An executor that reports the outcome of each item, in any order: an item that is lost costs no other."""
 
-    def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Ended]:
-        """Return the ends of the items."""
+    def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Outcome]:
+        """Yield the outcome of each item."""
 
 
 def mapped(executor: Executor | None, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -49,17 +50,36 @@ def mapped(executor: Executor | None, function: Callable[[T], R], items: Iterabl
     return map(function, items) if executor is None else iter(executor.map(function, items))
 
 
-def ends(executor: Executor, function: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[int, R, str]]:
-    """Yield place, value and failure of each item, as they come; the failure is empty where there is a value.
-
-    A plain `map` raises where an item fails. An executor that tells the end of each item goes on.
-    """
-    if isinstance(executor, Runner):
-        for end in executor.run(function, items):
-            yield end.index, cast("R", end.value), end.failure
+def outcomes(executor: Executor, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Outcome]:
+    """Yield the outcome of each item, as they come. A plain `map` raises where an item fails."""
+    if isinstance(executor, TolerantExecutor):
+        yield from executor.run(function, items)
     else:
         for index, value in enumerate(executor.map(function, items)):
-            yield index, value, ""
+            yield Outcome(index, value)
+
+
+def attempted(function: Callable[[Any], Any], index: int, item: Any) -> Outcome:
+    """Return the outcome of a function of one item; what it raises is the failure."""
+    try:
+        return Outcome(index, function(item))
+    except MemoryError:
+        return Outcome(index, None, "not enough memory")
+    except Exception as error:
+        return Outcome(index, None, " ".join(f"{type(error).__name__}: {error}".split())[:500])
+
+
+def in_order(outcomes: Iterable[Outcome]) -> Iterator[Any]:
+    """Yield the values in the items' order. Raises ComputationError at the first outcome without a value."""
+    waiting: dict[int, Any] = {}
+    following = 0
+    for outcome in outcomes:
+        if outcome.failure:
+            raise ComputationError(f"item {outcome.index + 1} failed", where="the pool of workers", got=outcome.failure)
+        waiting[outcome.index] = outcome.value
+        while following in waiting:
+            yield waiting.pop(following)
+            following += 1
 
 
 def silent(done: int, total: int, text: str) -> None:

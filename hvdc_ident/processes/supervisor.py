@@ -25,6 +25,7 @@ from typing import IO
 from hvdc_ident.processes.endings import Budget, Ending
 from hvdc_ident.processes.messages import (
     BEGAN,
+    ITEM,
     NOW,
     PROCESS,
     RESIDENT,
@@ -66,6 +67,16 @@ class ChildProcess:
     def last_line(self) -> str:
         """The last line that it printed."""
         return last_line(self.printed)
+
+    @property
+    def item(self) -> int:
+        """The number of the present piece of work."""
+        return int(self.progress[ITEM])
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the present piece of work began."""
+        return time.monotonic() - self.progress[BEGAN]
 
     def begin(self) -> None:
         """Note that a piece of work begins: deadlines count from now on."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
-from hvdc_ident.executor import Executor, Progress, ends
+from hvdc_ident.executor import Executor, Progress, outcomes
 from hvdc_ident.files import csv_cell
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -373,14 +373,14 @@ def _run(table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor:
     left = missing[count:]
     if not left.size or executor is None:
         return
-    for place, packed, failure in ends(executor, table.task, (row for _, row in _rows(table.points, left))):
-        index = int(left[place])
+    for outcome in outcomes(executor, table.task, (row for _, row in _rows(table.points, left))):
+        index = int(left[outcome.index])
         row = table.points.rows(index, index + 1)[0]
-        if failure:
-            table.failed[index] = failure
+        if outcome.failure:
+            table.failed[index] = outcome.failure
             told.step()
         else:
-            _finish(table, index, row, packed, shelf, told)
+            _finish(table, index, row, outcome.value, shelf, told)
 
 
 def _finish(table: _Table, index: int, row: Array, packed: bytes, shelf: Kept | None, told: _Told) -> None:

@@ -15,10 +15,9 @@ from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.checks import steady_notes, violations
 from hvdc_ident.study.executors import open_executor
-from hvdc_ident.study.executors.kept import KeptExecutor
 from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
-from hvdc_ident.study.store import Store, exclusive, source_hash
+from hvdc_ident.study.store import CachingExecutor, Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
 
 if TYPE_CHECKING:
@@ -247,7 +246,9 @@ def workers_of(options: StageOptions) -> Iterator[OpenPool | DaskPool | None]:
 
 
 @contextmanager
-def executor_of(study: Study, options: StageOptions, name: str) -> Iterator[KeptExecutor | OpenPool | DaskPool | None]:
+def executor_of(
+    study: Study, options: StageOptions, name: str
+) -> Iterator[CachingExecutor | OpenPool | DaskPool | None]:
     """An executor for a stage's work of that name, whose finished pieces are kept where the options name a folder.
 
     The name tells apart the kinds of work of a study; the study's files, the seed and what is forced tell apart its
@@ -260,4 +261,4 @@ def executor_of(study: Study, options: StageOptions, name: str) -> Iterator[Kept
             return
         store = stack.enter_context(Store(options.folder))
         decided = json_text({"sources": dict(study.sources), "seed": options.seed, "force": list(options.force)})
-        yield KeptExecutor(store.job(name, decided), pool)
+        yield CachingExecutor(store.job(name, decided), pool)

@@ -17,8 +17,9 @@ import json
 import math
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -27,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import ComputationError, InputError
+from hvdc_ident.executor import Outcome, TolerantExecutor, in_order
 from hvdc_ident.files import digest, make_folder
 from hvdc_ident.immutable import FrozenMap
 
@@ -190,6 +192,63 @@ class Job:
     def put(self, key: bytes, value: bytes) -> None:
         """Keep the value: a kill of this process at any instant afterwards does not lose it."""
         self._store._put(self.name, key, value)
+
+
+class CachingExecutor:
+    """The `map` of a pool, or of this process where there is none, whose results are kept in a job and not computed again.
+
+    A stage does the same work in the same order whenever it is given the same study, seed and software, whatever executor
+    it has. So the place of an item in that order, with a digest of the item itself where it has one, is its key.
+    """
+
+    def __init__(self, job: Job, pool: TolerantExecutor | None = None) -> None:
+        self._job, self._pool, self._calls = job, pool, 0
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Any]:
+        """Return the function's results in the items' order, those of an earlier run not computed again.
+
+        Raises ComputationError where an item has no result in the pool; in this process, what the function raises.
+        """
+        self._calls += 1
+        return self._results(self._calls, function, list(items))
+
+    def _results(self, call: int, function: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
+        keys = [f"{call}/{index}/{_item_digest(item)}".encode() for index, item in enumerate(items)]
+        stored = self._job.get(keys)
+        known = {index: unpacked(stored[key]) for index, key in enumerate(keys) if key in stored}
+        missing = [index for index in range(len(items)) if index not in known]
+
+        def outcomes() -> Iterator[Outcome]:
+            assert self._pool is not None
+            yield from (Outcome(index, value) for index, value in known.items())
+            for outcome in self._pool.run(function, [items[index] for index in missing]):
+                index = missing[outcome.index]
+                if not outcome.failure:
+                    self._put(keys[index], outcome.value)
+                yield replace(outcome, index=index)
+
+        if self._pool is not None and len(missing) > 1:
+            yield from in_order(outcomes())
+            return
+        for index, item in enumerate(items):
+            if index not in known:
+                known[index] = function(item)
+                self._put(keys[index], known[index])
+            yield known.pop(index)
+
+    def _put(self, key: bytes, value: Any) -> None:
+        try:
+            self._job.put(key, packed(value))
+        except TypeError as error:
+            raise ComputationError("a result cannot be kept", got=str(error)) from None
+
+
+def _item_digest(item: Any) -> str:
+    """Return a digest of an item, so that a result is never taken for another's; empty where it has no text form."""
+    try:
+        return digest(packed(item))[:16]
+    except TypeError:
+        return ""
 
 
 @cache

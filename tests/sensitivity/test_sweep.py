@@ -11,11 +11,11 @@ import pytest
 
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.errors import InputError, StudyError, UnknownNameError
+from hvdc_ident.executor import Outcome
 from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
 from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
 from hvdc_ident.sensitivity import grid, latin_hypercube, listed, sweep
-from hvdc_ident.study.executors import Ended
 from tests.effort import calls
 
 CARD = """
@@ -100,7 +100,9 @@ class Backwards:
 
     def run(self, function, items):
         for index, item in reversed(list(enumerate(items))):
-            yield Ended(index, function(item)) if index % 7 else Ended(index, None, "its worker was ended by SIGSEGV")
+            yield (
+                Outcome(index, function(item)) if index % 7 else Outcome(index, None, "its worker was ended by SIGSEGV")
+            )
 
 
 def test_rows_stand_where_their_points_stand(monkeypatch):

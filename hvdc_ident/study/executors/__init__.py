@@ -1,4 +1,4 @@
-"""Where many runs are done: this machine's processes, or workers of a dask cluster; one kind per file."""
+"""Executors of many runs: a pool of this machine's processes, or the workers of a dask cluster; one kind a file."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.study.executors.ended import Ended
 from hvdc_ident.study.executors.local import LocalPool, OpenPool
 
 if TYPE_CHECKING:
     from hvdc_ident.study.executors.dask import DaskPool
 
 
-__all__ = ["Ended", "LocalPool", "open_executor"]
+__all__ = ["LocalPool", "open_executor"]
 
 
 LOCAL = "local"

@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import Any
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.study.executors.ended import Ended, in_order
+from hvdc_ident.executor import Outcome, attempted, in_order
 
 AHEAD = 4  # batches that wait for each thread
 MOST = 64  # items of a batch
@@ -61,11 +61,11 @@ class DaskPool:
             yield DaskPool(client, threads)
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Any]:
-        """The function's results in the items' order. Raises ComputationError where an item has none."""
+        """Return the function's results in the items' order. Raises ComputationError where an item has none."""
         return in_order(self.run(function, items))
 
-    def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Ended]:
-        """What became of each item, as it ends. The function and the items must be picklable."""
+    def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Outcome]:
+        """Yield the outcome of each item, as they come. The function and the items must be picklable."""
         from distributed import as_completed
 
         content = pickle.dumps(function)
@@ -85,13 +85,13 @@ class DaskPool:
         for future in running:
             batch = size.pop(future.key)
             if future.status == "finished":
-                yield from (Ended(*end) for end in future.result())
+                yield from future.result()
             elif len(batch) > 1:  # one of them ended a worker: each goes alone
                 for item in batch:
                     send([item])
                 continue
             else:
-                yield Ended(batch[0][0], None, _reason(future))
+                yield Outcome(batch[0][0], None, _reason(future))
             following = next(batches, None)
             if following is not None:
                 send(following)
@@ -164,14 +164,6 @@ def _loaded(name: str, content: bytes) -> Callable[[Any], Any]:
     return pickle.loads(content)
 
 
-def _do(name: str, content: bytes, batch: list[tuple[int, Any]]) -> list[tuple[int, Any, str]]:
+def _do(name: str, content: bytes, batch: list[tuple[int, Any]]) -> list[Outcome]:
     work = _loaded(name, content)
-    found: list[tuple[int, Any, str]] = []
-    for index, item in batch:
-        try:
-            found.append((index, work(item), ""))
-        except MemoryError:
-            found.append((index, None, "not enough memory"))
-        except Exception as error:
-            found.append((index, None, " ".join(f"{type(error).__name__}: {error}".split())[:500]))
-    return found
+    return [attempted(work, index, item) for index, item in batch]

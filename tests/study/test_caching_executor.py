@@ -19,8 +19,7 @@ from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.executors import LocalPool
-from hvdc_ident.study.executors.kept import KeptExecutor
-from hvdc_ident.study.store import packed, unpacked
+from hvdc_ident.study.store import CachingExecutor, packed, unpacked
 
 
 class Shelf(dict):
@@ -45,34 +44,34 @@ class Counted:
 def test_a_second_run_does_only_what_is_missing():
     shelf, first = Shelf(), Counted(stop_at=6)
     with pytest.raises(KeyboardInterrupt):
-        list(KeptExecutor(shelf).map(first, range(10)))
+        list(CachingExecutor(shelf).map(first, range(10)))
     second = Counted()
-    found = list(KeptExecutor(shelf).map(second, range(10)))
+    found = list(CachingExecutor(shelf).map(second, range(10)))
     assert second.done == [6, 7, 8, 9]
     assert np.array_equal(found, [[x, x / 3.0] for x in range(10)])
 
 
 def test_calls_and_items_are_told_apart():
     shelf = Shelf()
-    kept = KeptExecutor(shelf)
+    kept = CachingExecutor(shelf)
     assert [list(kept.map(lambda x: x, [1, 2])), list(kept.map(lambda x: -x, [1, 2]))] == [[1, 2], [-1, -2]]
-    again = KeptExecutor(shelf)
+    again = CachingExecutor(shelf)
     assert list(again.map(lambda x: 100 * x, [1, 3])) == [1, 300]
 
 
 def test_in_a_pool_the_same_is_kept():
     shelf = Shelf()
     with LocalPool(2).open() as pool:
-        found = list(KeptExecutor(shelf, pool).map(pool_jobs.Job(), range(20)))
+        found = list(CachingExecutor(shelf, pool).map(pool_jobs.Job(), range(20)))
         assert found == [x * x for x in range(20)]
         assert list(pool.map(pool_jobs.Job(fails={99}), range(5))) == [0, 1, 4, 9, 16]  # the workers are still there
-    assert list(KeptExecutor(shelf).map(pool_jobs.Job(fails=set(range(20))), range(20))) == found
+    assert list(CachingExecutor(shelf).map(pool_jobs.Job(fails=set(range(20))), range(20))) == found
 
 
 def test_a_failed_item_is_not_kept():
     shelf = Shelf()
     with LocalPool(1).open() as pool, pytest.raises(ComputationError, match="item 3 failed"):
-        list(KeptExecutor(shelf, pool).map(pool_jobs.Job(fails={2}), range(5)))
+        list(CachingExecutor(shelf, pool).map(pool_jobs.Job(fails={2}), range(5)))
     assert not any(key.startswith(b"1/2/") for key in shelf)
 
 
@@ -110,7 +109,7 @@ def test_only_dataclasses_of_the_package_are_made(name):
 
 def test_what_cannot_be_kept_says_so():
     with pytest.raises(ComputationError, match="cannot be kept"):
-        list(KeptExecutor(Shelf()).map(lambda x: Path(), [1]))
+        list(CachingExecutor(Shelf()).map(lambda x: Path(), [1]))
 
 
 class Valley:
@@ -128,7 +127,7 @@ class Valley:
 
 def walked(valley, shelf):
     unknowns = (FitParameter("x", 0.0), FitParameter("y", 0.0))
-    return profiles(LeastSquares(unknowns, valley), np.array([1.0, 1.0]), executor=KeptExecutor(shelf))
+    return profiles(LeastSquares(unknowns, valley), np.array([1.0, 1.0]), executor=CachingExecutor(shelf))
 
 
 def test_a_profile_goes_on_from_its_last_step():
