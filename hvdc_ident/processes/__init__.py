@@ -4,8 +4,7 @@ They are forked from a process that has loaded what they need (`Supervisor`), en
 killed, and it is said how they ended. An FMU's machine code runs in them.
 """
 
-from hvdc_ident.processes.endings import MIB, Budget, Ending
 from hvdc_ident.processes.messages import Message, packed, unpacked
-from hvdc_ident.processes.supervisor import ChildProcess, Supervisor, Watch
+from hvdc_ident.processes.supervisor import MIB, Budget, ChildProcess, Ending, Supervisor, Watch
 
 __all__ = ["MIB", "Budget", "ChildProcess", "Ending", "Message", "Supervisor", "Watch", "packed", "unpacked"]

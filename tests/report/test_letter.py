@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.report.letter import letter_of, write_letter
 from hvdc_ident.report.results import Results
+from hvdc_ident.report.sections.letter import letter_of, write_letter
 
 HEADING = {"schema": 1, "study": "s", "model": "m", "software": "hvdc_ident 0", "seed": 0, "sources": {}}
 

@@ -10,7 +10,7 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit.windowed_errors import WINDOWS
-from hvdc_ident.report.sections import errors, gains, residuals
+from hvdc_ident.report.sections import gains, output_errors, residuals
 from hvdc_ident.study import fitting
 from hvdc_ident.study.examples import write_starter
 from hvdc_ident.study.stages import StageOptions, stage
@@ -77,7 +77,7 @@ def test_a_plain_fit_has_everything_a_reader_needs(plain):
     assert header == ["time", "Irorder1", "Irorder1.measured", "Irorder1.low", "Irorder1.high"]
     rows = np.genfromtxt(files["fit.ramp.csv"].splitlines(), delimiter=",", names=True)
     assert (rows["Irorder1low"] < rows["Irorder1"]).all() and (rows["Irorder1high"] > rows["Irorder1"]).all()
-    page = "".join(s.SECTION.render(Pages(data)) for s in (gains, errors, residuals))
+    page = "".join(s.SECTION.render(Pages(data)) for s in (gains, output_errors, residuals))
     for words in ("The fit converged", "Correlation", "during", "Held-out experiments", "F test", "61400-27-2"):
         assert words in page
     assert "complian" not in page.lower()
@@ -117,7 +117,7 @@ def test_nuisances_of_every_kind(folder):
     assert own["KIVDC"]["value"] == pytest.approx(734.7, abs=1.0)
     assert own["Pref2"]["value"] == pytest.approx(0.0, abs=1e-4)
     assert data["validation"]["ramp"]["nuisance"]["KIVDC"] == pytest.approx(734.7, abs=5.0)
-    assert "from this record itself" in errors.SECTION.render(Pages(data))
+    assert "from this record itself" in output_errors.SECTION.render(Pages(data))
     assert "Pref2" in gains.SECTION.render(Pages(data))
 
 

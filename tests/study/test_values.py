@@ -25,8 +25,8 @@ from typer.testing import CliRunner
 from hvdc_ident import export, load_study
 from hvdc_ident.cli import app
 from hvdc_ident.errors import InputError, StudyError
-from hvdc_ident.report.letter import letter_of
 from hvdc_ident.report.results import Results
+from hvdc_ident.report.sections.letter import letter_of
 from hvdc_ident.study.export import SSV, value_set
 
 GIVEN = {"K": 11.0, "T": 0.05, "g": 1.0}
