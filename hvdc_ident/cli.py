@@ -28,7 +28,7 @@ from hvdc_ident.command import (
     pasteable,
     within,
 )
-from hvdc_ident.errors import InputError
+from hvdc_ident.errors import InputError, require_known
 from hvdc_ident.study.stages import Stage, StageOptions, stages
 
 if TYPE_CHECKING:
@@ -214,7 +214,10 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
         loaded = access.study(study)
         folder = out or loaded.folder
         with within(budget), console.progress() as progress:
-            done = run_stage(loaded, stage.name, folder, work.options(console, progress))
+            options = work.options(console, progress)
+            hint = "NAME = {min = ..., max = ...} in [parameters], which makes a parameter a candidate"
+            require_known("candidate", options.force, loaded.candidates, "--force", hint)
+            done = run_stage(loaded, stage.name, folder, options)
         console.print_json(done.data)
         console.say(*(f"steady state, {line}" for line in done.data.get("steady_state", ())))
         lines = () if done.failed or console.json or console.quiet else stage.tell(done.data)

@@ -101,10 +101,12 @@ LINE = 100
 """Characters: a message shows as many known names as a line holds, and never more than 12."""
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "", listing: str = "") -> UnknownNameError:
+def unknown_name(
+    kind: str, name: str, known: Iterable[str], *, where: str = "", listing: str = "", hint: str = ""
+) -> UnknownNameError:
     """Return the error for a name that is not among the known ones, with the nearest of them as the hint.
 
-    listing: what lists all of them, said where the message cannot.
+    listing: what lists all of them, said where the message cannot. hint: what to try where none is near.
     """
     names = [str(k) for k in known]
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
@@ -113,7 +115,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "",
         near = sorted((n for n in names if part in n.casefold()), key=len)[:3]
     shown = ", ".join(names[: _shown(names)])
     more = len(names) - _shown(names)
-    hints = [f"did you mean {' or '.join(repr(n) for n in near)}?"] if near else []
+    hints = [f"did you mean {' or '.join(repr(n) for n in near)}?"] if near else [hint] if hint else []
     hints += [f"{listing} lists them"] if listing and more else []
     return UnknownNameError(
         f"no {kind} '{name}'",
@@ -123,11 +125,11 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "",
     )
 
 
-def require_known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str) -> None:
+def require_known(kind: str, names: Iterable[str] | None, known: Collection[str], where: str, hint: str = "") -> None:
     """Raise UnknownNameError for the first of the names that is not among the known ones."""
     for name in names or ():
         if name not in known:
-            raise unknown_name(kind, name, known, where=where)
+            raise unknown_name(kind, name, known, where=where, hint=hint)
 
 
 def _shown(names: list[str]) -> int:

@@ -192,11 +192,15 @@ def _cut(found: Trajectory, window: tuple[float, float], where: str) -> Trajecto
     low, high = window
     inside = (found.time >= low) & (found.time <= high)
     if int(inside.sum()) < 2:
+        start, end = float(found.time[0]), float(found.time[-1])
+        reason = "ends before it begins" if high < low else "holds too few rows"
+        reason = "lies outside the record" if low > end or high < start else reason
         raise WaveformError(
-            f"the window from {low:g} to {high:g} s holds {int(inside.sum())} rows",
+            f"the window from {low:g} to {high:g} s {reason}",
             where=where,
-            expected=f"at least 2 of the {len(found)} rows from {found.time[0]:g} to {found.time[-1]:g} s",
-            hint="the start first, then the end, in s" if high < low else "",
+            expected=f"at least 2 of the {len(found)} rows from {start:g} to {end:g} s",
+            got=f"{int(inside.sum())} rows",
+            hint=f"{high:g} {low:g}" if high < low else f"{start:g} {end:g}, which is all of it",
         )
     return found.rows(inside)
 

@@ -59,7 +59,13 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
     software as they are now. Raises StudyError for another name, and where fitted values are asked for and none stand.
     """
     if wanted is not None and wanted not in SETS:
-        raise StudyError("no such set of values", where="--values", expected=", ".join(SETS), got=repr(wanted))
+        raise StudyError(
+            "no set of values has this name",
+            where="--values",
+            expected=", ".join(SETS),
+            got=repr(wanted),
+            hint="--values given: those the model came with; start: where a search begins; fitted: those of a fit",
+        )
     if wanted == "given":
         return _given(study)
     if wanted == "start":
@@ -136,9 +142,21 @@ def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOpti
     if fmi is None and kind is None and not source_only:
         return None
     if fmi is not None and fmi not in versions:
-        raise StudyError("this version of FMI cannot be written", where="--fmi", expected="2 or 3", got=repr(fmi))
+        raise StudyError(
+            "no FMU is written in this version of FMI",
+            where="--fmi",
+            expected="2 or 3",
+            got=repr(fmi),
+            hint="--fmi 2, which most tools read",
+        )
     if kind is not None and kind not in kinds:
-        raise StudyError("this kind of FMU is not known", where="--kind", expected="me or cs", got=repr(kind))
+        raise StudyError(
+            "an FMU is of no such kind",
+            where="--kind",
+            expected="me or cs",
+            got=repr(kind),
+            hint="--kind me for model exchange, --kind cs for co-simulation; without it the FMU has both",
+        )
     default = FmuOptions()
     return FmuOptions(
         versions[fmi] if fmi else default.version,
@@ -192,7 +210,12 @@ def write(
     ending = path.suffix.lower()
     nonlinear = isinstance(source, Study | Model) and not linear and not reduced
     if fmu is not None and ending != ".fmu":
-        raise StudyError("options of an FMU do not go with this ending", where=str(path), expected="a file *.fmu")
+        raise StudyError(
+            "--fmi, --kind and --source-only are about an FMU, and this ending is another format's",
+            where=str(path),
+            expected="a file *.fmu",
+            hint=f"--to {path.with_suffix('.fmu')}, or leave them out",
+        )
     if ending not in formats() and not (nonlinear and ending in _WRITERS):
         known = sorted({*formats(), *(_WRITERS if nonlinear else ())})
         raise StudyError("no export has this ending", where=str(path), expected=f"one of {', '.join(known)}")

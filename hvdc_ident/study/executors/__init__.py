@@ -35,10 +35,11 @@ def open_executor(name: str, workers: int) -> Iterator[OpenPool | DaskPool | Non
         return
     if not name.startswith(("dask://", "dask+tls://")):
         raise InputError(
-            "no such executor",
+            "no such executor: work is done on this machine or by a dask scheduler",
             where="--executor",
             expected="local, dask://HOST:PORT or dask+tls://HOST:PORT",
-            got=name,
+            got=repr(name),
+            hint="--workers 2 for this machine, or --executor dask://127.0.0.1:8786 once `dask scheduler` runs",
         )
     from hvdc_ident.study.executors.dask import DaskPool
 
