@@ -78,7 +78,7 @@ SIGN = Conversion("sign", -1.0, prior=SIGN_SHARE)
 
 
 def conversions(unit: str, parameters: Mapping[str, Parameter]) -> tuple[Conversion, ...]:
-    """The conversions that a signal of this unit may have suffered, the sign first, each with its prior probability.
+    """Return the conversions that a signal of this unit may have suffered, the sign first, each with its prior probability.
 
     unit: the model's. parameters: the model's; those in V, A, W, var or VA are bases that a per-unit signal may have been
     multiplied by. A conversion and its opposite sign are two.
@@ -97,14 +97,14 @@ def conversions(unit: str, parameters: Mapping[str, Parameter]) -> tuple[Convers
 
 
 def input_conversions(unit: str) -> tuple[Conversion, ...]:
-    """The same for an input, whose level may well be another than the model's: only its sign and what changes it a lot."""
+    """Return the conversions of an input: its sign and what changes it a lot, for its level may well be another than the model's."""
     large = [c for c in conversions(unit, {}) if c.factor > 0.0 and abs(log(abs(c.factor))) > log(30.0)]
     share = OTHER_SHARE / max(len(large) + 1, 1)
     return tuple(Conversion(c.name, c.factor, c.shift, share) for c in (SIGN, *large))
 
 
 def _of_unit(unit: str) -> list[tuple[str, float, float]]:
-    """(what is recorded, factor, shift): the other units of the kind, and what is confused with it beside them."""
+    """Return (what is recorded, factor, shift) of the other units of the kind, and of what is confused with it beside them."""
     pu, found = same_unit(unit, "pu"), []
     for name in (*(u for u in UNITS if u != "‰"), *(prefix + base for base in PREFIXED for prefix in PREFIXES)):
         by = conversion(unit, name)
@@ -160,7 +160,7 @@ FINEST = 1e-3
 """No model's level or movement is expected nearer to the plant's than this share, so a nearer match proves no more."""
 STRONG = 10.0
 """Odds from which evidence is strong (Jeffreys 1961): what a match has to gain by itself."""
-NONE = Conversion("", 1.0)
+UNCHANGED = Conversion("", 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,12 +181,12 @@ class RecordedOutput:
     def of(cls, e: Experiment, output: str, unit: str, experiments: Sequence[Experiment]) -> RecordedOutput:
         assert e.measured is not None
         values = e.measured[output]
-        there = np.isfinite(values)
-        before = there & (e.time < e.event - 1e-12) if e.event is not None else np.zeros(values.size, dtype=bool)
-        after = there & e.compared & ~before
-        noise = max(e.noise.get(output) or 0.0, noise_floor(values[there]))
+        finite = np.isfinite(values)
+        before = finite & (e.time < e.event - 1e-12) if e.event is not None else np.zeros(values.size, dtype=bool)
+        after = finite & e.compared & ~before
+        noise = max(e.noise.get(output) or 0.0, noise_floor(values[finite]))
         deterministic = source_of([e], output) == MISFIT
-        return cls(e.name, output, unit, values, before, after if after.any() else there, noise, deterministic)
+        return cls(e.name, output, unit, values, before, after if after.any() else finite, noise, deterministic)
 
 
 @dataclass(frozen=True)
@@ -231,35 +231,38 @@ class Comparison:
         return cls(record, simulated, recorded, error, model, noise, (model,), moved, size)
 
     def with_run(self, simulated: Array) -> Comparison:
-        """The same with one more run of the model."""
+        """Return the comparison with one more run of the model."""
         movement = _movement(self.record, simulated)
         level = (float(simulated[self.record.before].mean()),) if self.record.before.any() else ()
         return replace(
             self, levels=(*self.levels, *level), movements=(*self.movements, *((movement,) if movement else ()))
         )
 
-    def differs(self, sure: float) -> bool:
+    def differs(self, quantile: float) -> bool:
         """Return whether the recorded level lies outside what the model can be, by more than noise and than a row shows."""
         if self.recorded is None:
             return False
         gap = max(min(self.levels) - self.recorded, self.recorded - max(self.levels), 0.0)
-        return gap > max(sure * self.error, self.noise, FINEST * self.size)
+        return gap > max(quantile * self.error, self.noise, FINEST * self.size)
 
-    def is_moved_otherwise(self, sure: float) -> bool:
+    def moves_otherwise(self, quantile: float) -> bool:
         """Return whether no run of the model moves in the direction and within the size of the record."""
-        return bool(self.movements) and all(abs(m.slope - 1.0) > sure * m.error for m in self.movements)
+        return bool(self.movements) and all(abs(m.slope - 1.0) > quantile * m.error for m in self.movements)
 
     def level_mismatch(self, c: Conversion) -> float:
-        """On a logarithmic scale, once the conversion is undone; not below what noise and the finest match leave."""
+        """Return the mismatch of the level on a logarithmic scale, once the conversion is undone.
+
+        Not below what noise and the finest match leave.
+        """
         if self.recorded is None:
             return 1.0
         undone, error = c.undone(self.recorded), self.error / abs(c.factor)
         near = min(max(undone, min(self.levels)), max(self.levels))
         zero = math.hypot(error, self.size) or FINEST * max(abs(undone), abs(near)) or 1.0
-        return max(math.hypot(apart(undone, near, zero), error / math.hypot(zero, near)), FINEST)
+        return max(math.hypot(log_distance(undone, near, zero), error / math.hypot(zero, near)), FINEST)
 
     def movement_mismatch(self, c: Conversion) -> float:
-        """The same of the movement; 1 where nothing moves, whatever the conversion."""
+        """Return the mismatch of the movement on a logarithmic scale; 1 where nothing moves, whatever the conversion."""
         if not self.movements:
             return 1.0
         slopes = [m.slope / c.factor for m in self.movements]
@@ -269,46 +272,47 @@ class Comparison:
             return min(max(share, FINEST), 1.0)
         best = int(np.argmin([abs(s - near) for s in slopes]))
         error = max(self.movements[best].error / abs(c.factor), FINEST)
-        return max(math.hypot(apart(near, 1.0, error), error / math.hypot(1.0, error)), FINEST)
+        return max(math.hypot(log_distance(near, 1.0, error), error / math.hypot(1.0, error)), FINEST)
 
     def is_matched(self, c: Conversion) -> bool:
-        """Return whether the conversion, undone, brings the level far nearer; or the movement, and leaves the level within a share
-        of the movement."""
-        return self._nearer(self.level_mismatch(c), self.movement_mismatch(c))
+        """Return whether the conversion, undone, brings the level far nearer; or the movement, with the level near it."""
+        return self._is_match(self.level_mismatch(c), self.movement_mismatch(c))
 
     def is_matched_by(self, other: Comparison) -> bool:
         """Return whether another run, or another output, matches the record as a conversion would have to."""
         other = self._as_sized(other)
-        return self._nearer(other.level_mismatch(NONE), other.movement_mismatch(NONE))
+        return self._is_match(other.level_mismatch(UNCHANGED), other.movement_mismatch(UNCHANGED))
 
     def _as_sized(self, other: Comparison) -> Comparison:
         """The other with no larger movement than this one: beside a run that wanders off every level would look near."""
         return replace(other, size=min(self.size, other.size))
 
-    def _nearer(self, level: float, movement: float) -> bool:
-        if STRONG * level <= self.level_mismatch(NONE):
+    def _is_match(self, level: float, movement: float) -> bool:
+        if STRONG * level <= self.level_mismatch(UNCHANGED):
             return True
-        return STRONG * movement <= self.movement_mismatch(NONE) and (self.recorded is None or STRONG * level <= 1.0)
+        return STRONG * movement <= self.movement_mismatch(UNCHANGED) and (
+            self.recorded is None or STRONG * level <= 1.0
+        )
 
     def log_odds(self, c: Conversion) -> float:
-        """Of the conversion against a model that is off, without priors."""
-        level = math.log(self.level_mismatch(NONE) / self.level_mismatch(c))
-        return level + math.log(self.movement_mismatch(NONE) / self.movement_mismatch(c))
+        """Return the log odds of the conversion against a model that is off, without priors."""
+        level = math.log(self.level_mismatch(UNCHANGED) / self.level_mismatch(c))
+        return level + math.log(self.movement_mismatch(UNCHANGED) / self.movement_mismatch(c))
 
     def log_odds_by(self, other: Comparison) -> float:
-        """Of another run, or another output, against this one, without priors."""
+        """Return the log odds of another run, or another output, against this one, without priors."""
         other = self._as_sized(other)
-        level = math.log(self.level_mismatch(NONE) / other.level_mismatch(NONE))
-        return level + math.log(self.movement_mismatch(NONE) / other.movement_mismatch(NONE))
+        level = math.log(self.level_mismatch(UNCHANGED) / other.level_mismatch(UNCHANGED))
+        return level + math.log(self.movement_mismatch(UNCHANGED) / other.movement_mismatch(UNCHANGED))
 
 
-def apart(a: float, b: float, zero: float) -> float:
-    """The distance of two values on a scale that is logarithmic above `zero` and passes through 0."""
+def log_distance(a: float, b: float, zero: float) -> float:
+    """Return the distance of two values on a scale that is logarithmic above `zero` and passes through 0."""
     return abs(math.asinh(a / zero) - math.asinh(b / zero))
 
 
 def _movement(record: RecordedOutput, simulated: Array) -> Movement | None:
-    """None where the record shows nothing but noise, or the model stands still."""
+    """Return the movement after the event; None where the record shows nothing but noise, or the model stands still."""
     if not record.after.any():
         return None
     base = record.before if record.before.any() else record.after
@@ -321,8 +325,8 @@ def _movement(record: RecordedOutput, simulated: Array) -> Movement | None:
     if not moves or size <= 1e-6 * float(np.abs(simulated).max()):
         return None
     slope = float(v @ w) / float(w @ w)
-    left = v - slope * w
-    misfit = math.sqrt(max(float(left @ left) / n - noise**2, noise**2 * math.sqrt(2.0 / n)))
+    residual = v - slope * w
+    misfit = math.sqrt(max(float(residual @ residual) / n - noise**2, noise**2 * math.sqrt(2.0 / n)))
     return Movement(slope, math.hypot(misfit, record.noise / math.sqrt(n)) / size, misfit, size)
 
 
@@ -337,29 +341,29 @@ def _error_of_mean(gap: Array, noise: float, deterministic: bool) -> float:
     return math.hypot(std / math.sqrt(independent), drift / math.sqrt(12.0))
 
 
-def run_of(
+def outputs_of(
     simulator: ModelSimulator,
     e: Experiment,
     values: Mapping[str, float] | None = None,
     nuisance: Mapping[str, float] | None = None,
 ) -> Mapping[str, Array] | str:
-    """The outputs at the experiment's rows, or why there are none."""
+    """Return the outputs at the experiment's rows, or why there are none."""
     try:
         return observe(simulator, e, values or {}, nuisance=nuisance, derivatives=False).values
     except HvdcIdentError as error:
         return str(error)
 
 
-def freed(
-    simulator: ModelSimulator, e: Experiment, candidates: Sequence[FitParameter], own: Sequence[Comparison]
+def with_candidate_runs(
+    simulator: ModelSimulator, e: Experiment, candidates: Sequence[FitParameter], comparisons: Sequence[Comparison]
 ) -> list[Comparison]:
-    """The comparisons with the runs at the ends of every candidate's range, and at the corners that move a level most."""
-    found = list(own)
+    """Return the comparisons with the runs at the ends of every candidate's range, and at the corners that move a level most."""
+    found = list(comparisons)
     ends: dict[str, dict[str, float]] = {}  # level of each output by candidate and end
     local = unknowns(simulator, e)
     for free in (*candidates, *local):
         for share in (0.0, 1.0):
-            run = run_of(simulator, e, *_at(e, {free.name: free.draw(share)}))
+            run = outputs_of(simulator, e, *_at(e, {free.name: free.draw(share)}))
             if isinstance(run, str):
                 continue
             found = [c.with_run(run[c.record.output]) for c in found]
@@ -377,14 +381,14 @@ def freed(
             if len(corner) > 1 and corner not in corners:
                 corners.append(corner)
     for corner in corners:
-        run = run_of(simulator, e, *_at(e, corner))
+        run = outputs_of(simulator, e, *_at(e, corner))
         if not isinstance(run, str):
             found = [c.with_run(run[c.record.output]) for c in found]
     return found
 
 
 def _at(e: Experiment, values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
-    """The parameters and the experiment's own nuisances among some unknowns of a fit."""
+    """Return the parameters and the experiment's nuisances among some unknowns of a fit."""
     local = f"{e.name}:"
     parameters = {n: v for n, v in values.items() if not n.startswith(local)}
     return parameters, {n.removeprefix(local): v for n, v in values.items() if n.startswith(local)}

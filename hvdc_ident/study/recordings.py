@@ -130,18 +130,22 @@ def read_experiments(
     return tuple(found), FrozenMap(notes)
 
 
-def with_noise(experiment: Experiment) -> tuple[Experiment, FrozenMap[NoiseNote]]:
-    """Return the experiment with its event and the noise of its outputs where it does not state them, and their sources.
+def with_noise(
+    experiment: Experiment, stated: Mapping[str, float] | None = None
+) -> tuple[Experiment, FrozenMap[NoiseNote]]:
+    """Return the experiment with its event and the noise of its outputs where they are not stated, and their sources.
 
-    By the rules of a data file: the noise is estimated before the event, and where there is none the fit's residual tells.
+    stated: standard deviations by output, 0 allowed; left out, the experiment's. The noise is estimated before the event,
+    and where there is none the fit's residual tells.
     """
     e = experiment
+    stated = e.noise if stated is None else stated
     event = e.event if e.event is not None else event_time(e.inputs)
     if e.measured is None:
         return e.with_(event=event), FrozenMap()
     table = e.measured
     notes = {
-        o: _noise(e.noise.get(o), e.time, table[o], event, by_row=o in e.noise_profile and o in e.noise)
+        o: _noise(stated.get(o), e.time, table[o], event, by_row=o in e.noise_profile and o in stated)
         for o in e.outputs
     }
     estimated = [o for o, n in notes.items() if n.source == "estimated"]
@@ -205,8 +209,6 @@ def _experiment(
     mapped = {s: _mapped(data[c], mappings[s]) for s, c in columns.items()}
     inputs = {s: _input(table, s, columns[s], time, mapped[s], place) for s in (*table.inputs, *table.drive)}
     outputs = tuple(table.outputs)
-    event = _event(table, inputs, time, place)
-    window = _window(table, time, place)
     for o in outputs:
         _check_recorded(o, columns[o], mapped[o], f"{place}, {table.data}")
     deviations = {
@@ -215,7 +217,6 @@ def _experiment(
     }
     stated = {o: n for o, n in table.noise.items() if isinstance(n, float | int)}
     stated |= {o: float(np.sqrt(np.nanmean(d**2))) for o, d in deviations.items()}
-    notes = {o: _noise(stated.get(o), time, mapped[o], event, by_row=o in deviations) for o in outputs}
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
     origin = replace(
@@ -224,27 +225,23 @@ def _experiment(
         converted=(*data.origin.converted, *(line for line in converted if line)),
     )
     measured = Trajectory(time, np.column_stack([mapped[o] for o in outputs]), outputs, units, origin)
+    instrument = {o: line.model_dump(by_alias=True, exclude_none=True) for o, line in table.instrument.items()}
     experiment = Experiment(
-        name=table.name,
-        time=time,
-        inputs=FrozenMap(inputs),
-        values=FrozenMap(table.values),
+        time,
+        table.name,
+        inputs=inputs,
+        values=table.values,
         measured=measured,
-        noise=FrozenMap({o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}),
-        noise_dof=FrozenMap(
-            {o: _noise_dof(time[np.isfinite(mapped[o])], event) for o, n in notes.items() if n.source == "estimated"}
-        ),
-        noise_profile=FrozenMap(
-            {o: _profile(d, notes[o].std) for o, d in deviations.items() if notes[o].source != "floor"}
-        ),
-        event=event,
-        window=window,
+        # 1 where nothing is recorded, which nobody looks at
+        noise_profile={o: np.where(np.isnan(d), 1.0, d / stated[o]) for o, d in deviations.items()},
+        event=_event(table, time, place),
+        window=_window(table, time, place),
         role=table.role,
         drive=tuple(table.drive),
-        instrument=FrozenMap({o: _instrument(line) for o, line in table.instrument.items()}),
+        instrument=instrument,
         nuisance=tuple(dict.fromkeys(table.nuisance)),
     )
-    return experiment, FrozenMap(notes)
+    return with_noise(experiment, stated)
 
 
 def _time(table: schema.ExperimentTable, data: Trajectory, place: str) -> Array:
@@ -383,10 +380,8 @@ def _time_unit(table: schema.ExperimentTable, origin: Origin) -> str:
     return line.unit or (f"{line.scale:g} s" if line.scale is not None else "")
 
 
-def _event(table: schema.ExperimentTable, inputs: Mapping[str, InputSignal], time: Array, place: str) -> float | None:
-    if table.event is None:
-        return event_time(inputs)
-    if not time[0] <= table.event <= time[-1]:
+def _event(table: schema.ExperimentTable, time: Array, place: str) -> float | None:
+    if table.event is not None and not time[0] <= table.event <= time[-1]:
         raise StudyError(
             "the event lies outside the record",
             where=f"{place}.event",
@@ -442,11 +437,6 @@ def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, fl
     return np.where(there, found, np.nan)
 
 
-def _profile(deviations: Array, std: float) -> Array:
-    """(n,) standard deviations over the one that stands for all; 1 where nothing is recorded, which nobody looks at."""
-    return np.where(np.isnan(deviations), 1.0, deviations / std)
-
-
 def _noise(given: float | None, time: Array, values: Array, event: float | None, *, by_row: bool = False) -> NoiseNote:
     """The larger of what is given, else estimated before the event, and the floor; where that acts the data show no noise."""
     floor = noise_floor(values)
@@ -462,10 +452,6 @@ def _noise_dof(time: Array, event: float | None) -> float:
     """What the rows behind an estimated standard deviation are worth: it is a median's, of efficiency 0.37."""
     assert event is not None
     return max(1.0, MEDIAN_EFFICIENCY * int((time < event).sum()))
-
-
-def _instrument(line: schema.InstrumentTable) -> FrozenMap[float]:
-    return FrozenMap({k: float(v) for k, v in line.model_dump(by_alias=True, exclude_none=True).items()})
 
 
 def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[str]:

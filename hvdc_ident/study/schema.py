@@ -5,7 +5,16 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, StringConstraints, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    StringConstraints,
+    model_validator,
+)
 
 
 def _column_by_name(value: Any) -> Any:
@@ -67,11 +76,31 @@ def _not_text(value: Any) -> str:
     raise ValueError(f"names are text in quotes, not {value!r}")
 
 
+def _rising(ends: list[float]) -> list[float]:
+    """The ends of a range, once the second is above the first."""
+    if not ends[0] < ends[1]:
+        raise ValueError("its end is not above its start")
+    return ends
+
+
+def _check_spread(low: float, high: float, scale: str) -> None:
+    """Raise ValueError where values cannot be spread from min to max."""
+    if not low < high:
+        raise ValueError("max is not above min")
+    if scale == "log" and low <= 0:
+        raise ValueError("a log scale needs min above 0")
+
+
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 FileName = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^\w[\w .+-]*$")]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Names = Annotated[list[Name], Field(min_length=1)]
+NameOrNames = Annotated[Names, BeforeValidator(_as_list)]
+OneOrThree = Annotated[list[Name], BeforeValidator(_one_or_three)]
+Axes = Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
+Three = Annotated[list[Name], Field(min_length=3, max_length=3)]
+Band = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name)]
 Interpolation = Literal["hold", "linear"]
 
@@ -86,7 +115,7 @@ class EffectTable(TomlTable):
     """[[model.effect]]: an effect that the model has from the start."""
 
     effect: Name
-    at: Annotated[Names, BeforeValidator(_as_list)]
+    at: NameOrNames
     parameters: dict[Name, FiniteFloat | Name] = {}
     source: Name | Names | None = Field(default=None, alias="from")
     expression: Annotated[str, StringConstraints(max_length=2000)] | None = None
@@ -164,8 +193,8 @@ class PhasesTable(TomlTable):
     gives: the quantity of each new column, to be named in inputs, outputs, drive or columns like a recorded one.
     """
 
-    voltage: Annotated[list[Name], Field(min_length=3, max_length=3)]
-    current: Annotated[list[Name], Field(min_length=3, max_length=3)] | None = None
+    voltage: Three
+    current: Three | None = None
     frequency: Positive
     filter: Literal["mean", "lowpass", "none"] = "mean"
     window: NotNegative | None = None
@@ -175,8 +204,8 @@ class PhasesTable(TomlTable):
 class PhasorTable(TomlTable):
     """Magnitude and angle of a quantity: one column each, or three in the order of rotation; unit: deg or rad, of the angles."""
 
-    magnitude: Annotated[list[Name], BeforeValidator(_one_or_three)]
-    angle: Annotated[list[Name], BeforeValidator(_one_or_three)]
+    magnitude: OneOrThree
+    angle: OneOrThree
     unit: Literal["deg", "rad"] | None = None
 
     @model_validator(mode="after")
@@ -230,7 +259,7 @@ class ExperimentTable(TomlTable):
     outputs: Columns
     noise: dict[Name, Annotated[float | NoiseTable, BeforeValidator(_known_noise)]] = {}
     event: FiniteFloat | None = None
-    window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_rising)] | None = None
     values: dict[Name, FiniteFloat] = {}
     columns: dict[Name, ColumnTable] = {}
     nuisance: list[Name] = []
@@ -243,9 +272,7 @@ class ExperimentTable(TomlTable):
     ] = None
 
     @model_validator(mode="after")
-    def _ordered(self) -> ExperimentTable:
-        if self.window and not self.window[0] < self.window[1]:
-            raise ValueError("window: its end is not after its start")
+    def _recorded(self) -> ExperimentTable:
         if not self.outputs:
             raise ValueError("outputs: at least one recorded output is needed")
         return self
@@ -279,25 +306,23 @@ class ReduceTable(TomlTable):
 class PlantTable(TomlTable):
     """[linearize] plant: the signals that go into the plant and those the controller measures on it."""
 
-    inputs: Annotated[Names, BeforeValidator(_as_list)]
-    outputs: Annotated[Names, BeforeValidator(_as_list)]
+    inputs: NameOrNames
+    outputs: NameOrNames
 
 
 class PortTable(TomlTable):
     """[[linearize.port]]: where an impedance is seen, d and q or one dc signal each; band: Hz."""
 
     name: FileName
-    source: Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
-    voltage: Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
-    current: Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
+    source: Axes
+    voltage: Axes
+    current: Axes
     angle: Name = "0"
-    band: Annotated[list[Positive], Field(min_length=2, max_length=2)] = [0.1, 1000.0]
+    band: Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)] = [0.1, 1000.0]
     points: Annotated[int, Field(ge=2, le=100_000)] = 200
 
     @model_validator(mode="after")
-    def _ordered(self) -> PortTable:
-        if not self.band[0] < self.band[1]:
-            raise ValueError("band: its end is not above its start")
+    def _as_many(self) -> PortTable:
         if not len(self.source) == len(self.voltage) == len(self.current):
             raise ValueError("source, voltage and current need as many signals each: two (d, q), or one (dc)")
         if len(self.source) == 1 and self.angle != "0":
@@ -316,10 +341,7 @@ class LocusTable(TomlTable):
 
     @model_validator(mode="after")
     def _ordered(self) -> LocusTable:
-        if not self.min < self.max:
-            raise ValueError("max is not above min")
-        if self.scale == "log" and self.min <= 0:
-            raise ValueError("a log scale needs min above 0")
+        _check_spread(self.min, self.max, self.scale)
         return self
 
 
@@ -337,7 +359,7 @@ class LinearizeTable(TomlTable):
     at: Literal["steady", "start"] = "steady"
     side: Literal["refuse", "below", "above"] = "refuse"
     trim: TrimTable | None = None
-    break_at: Annotated[Names, BeforeValidator(_as_list)] | None = None
+    break_at: NameOrNames | None = None
     plant: PlantTable | None = None
     reduce: ReduceTable | None = None
     compare: Name | None = None
@@ -370,20 +392,17 @@ class ResponseTable(TomlTable):
     unit: Annotated[str, StringConstraints(max_length=50)] = ""
     noise: Positive | None = None
     relative_noise: Positive | None = None
-    band: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
+    band: Band | None = None
     values: dict[Name, FiniteFloat] = {}
     trim: TrimTable | None = None
 
     @model_validator(mode="after")
     def _one_place(self) -> ResponseTable:
-        if (self.port is None) == (self.input is None or self.output is None):
-            raise ValueError("give either input and output, or port")
-        if self.port is not None and (self.input or self.output):
+        named = (self.input is not None, self.output is not None, self.port is not None)
+        if named not in ((True, True, False), (False, False, True)):
             raise ValueError("give either input and output, or port")
         if self.noise is not None and self.relative_noise is not None:
             raise ValueError("give either noise or relative_noise")
-        if self.band is not None and not self.band[0] < self.band[1]:
-            raise ValueError("band: its end is not above its start")
         if (self.signals or self.frequencies) and set(self.signals) != {"input", "output"}:
             raise ValueError("signals: a record in time needs the columns of its input and output")
         return self
@@ -415,10 +434,7 @@ class SweepTable(TomlTable):
         if self.values is None:
             if self.min is None or self.max is None or self.points is None:
                 raise ValueError("min, max and points are needed, or values")
-            if not self.min < self.max:
-                raise ValueError("max is not above min")
-            if self.scale == "log" and self.min <= 0:
-                raise ValueError("a log scale needs min above 0")
+            _check_spread(self.min, self.max, self.scale)
         return self
 
 
@@ -466,7 +482,7 @@ class FitTable(TomlTable):
     whiten: Annotated[Literal["no", "pre-event", "residual"], BeforeValidator(_whitening)] = "no"
     guard: NotNegative = 0.0
     residual: Literal["time", "frequency"] = "time"
-    band: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
+    band: Band | None = None
     tolerance: Name = "set-point-step-simulation"
 
     @model_validator(mode="after")
@@ -477,8 +493,6 @@ class FitTable(TomlTable):
             raise ValueError('groups belong to mode "individual"')
         if self.band is not None and self.residual != "frequency":
             raise ValueError('band belongs to residual "frequency"')
-        if self.band is not None and not self.band[0] < self.band[1]:
-            raise ValueError("band: its end is not above its start")
         return self
 
 
