@@ -56,7 +56,7 @@ class Study(Shown):
 
     @property
     def folder(self) -> Path:
-        """Where results go unless --out says otherwise: STUDY-results beside the study."""
+        """Folder of the results unless --out names another: STUDY-results beside the study."""
         return self.path.with_name(f"{self.path.stem}-results")
 
     @property
@@ -70,7 +70,7 @@ class Study(Shown):
 
     @property
     def start(self) -> FrozenMap[float]:
-        """Where a search begins, of the same parameters: what `start` says, else the given value. Nothing else rests on it."""
+        """Start of a search, of the same parameters: what `start` says, else the given value. Nothing else rests on it."""
         stated = {n: line.start for n, line in self._listed.items()}
         return FrozenMap({n: g if (s := stated[n]) is None else s for n, g in self.given.items()})
 
@@ -79,19 +79,10 @@ class Study(Shown):
         units = {n: self.model.parameters[n].unit for n in self.candidates}
         rows = [(n, f.given, f.start, f.min, f.max, units[n]) for n, f in self.candidates.items()]
         yield Table(("parameter", "given", "start", "min", "max", "unit"), tuple(rows)) if rows else ""
-        records = [
-            (
-                e.name,
-                e.role,
-                e.time.size,
-                float(e.time[0]),
-                float(e.time[-1]),
-                e.event,
-                ", ".join(e.inputs),
-                ", ".join(e.outputs),
-            )
-            for e in self.experiments
-        ]
+        records = []
+        for e in self.experiments:
+            span = (e.time.size, float(e.time[0]), float(e.time[-1]), e.event)
+            records.append((e.name, e.role, *span, ", ".join(e.inputs), ", ".join(e.outputs)))
         header = ("experiment", "role", "rows", "from, s", "to, s", "event, s", "inputs", "outputs")
         yield Table(header, tuple(records)) if records else ""
 
@@ -109,7 +100,7 @@ class Study(Shown):
 
 
 def candidate_lines(study: Study) -> dict[str, dict[str, Any]]:
-    """By candidate its given value, where the search begins, its bounds, where starts are drawn from, its unit."""
+    """Return by candidate its given value, start, bounds, the range that starts are drawn from, and its unit."""
     return {
         n: {
             "given": f.given,
@@ -124,13 +115,15 @@ def candidate_lines(study: Study) -> dict[str, dict[str, Any]]:
 
 
 def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float] | None = None) -> Study:
-    """The study of a file. trust: whether a model that is Python code may be run.
+    """Return the study of a file. trust: whether a model that is Python code may be run.
 
     limits: of an FMU, by their keys in [model], where they differ from what stands there: deadline and load in s, memory
     in MiB.
 
     Raises InputError: StudyError, ModelError, UnknownNameError or WaveformError, with the place in the file.
     """
+    from hvdc_ident.study.stages.sweep import sweep_reference
+
     file = Path(path)
     content = _read(file)
     settings = parse_study(content, file)
@@ -138,8 +131,11 @@ def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float
         settings = settings.model_copy(update={"model": settings.model.model_copy(update=dict(limits))})
     where = file.name
     model, model_sources = _model(settings, file, trust)
-    other, other_sources = _compared_with(settings, file, trust)
-    compared, compared_sources = _linear_model_compared_with(settings, file, trust)
+    reference: str | None = sweep_reference(settings.sweep, f"{where}, sweep")
+    reference = None if reference in ("data", "base") else reference
+    compare = settings.linearize.compare if settings.linearize else None
+    against, against_sources = _other_model(reference, settings, file, "sweep.against", trust)
+    compared, compared_sources = _other_model(compare, settings, file, "linearize.compare", trust)
     recordings = Recordings(file.parent)
     model = with_unknowns(settings, model, where)
     candidates = candidates_of(settings, model, where)
@@ -158,13 +154,13 @@ def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float
             {
                 where: digest(content),
                 **model_sources,
-                **other_sources,
+                **against_sources,
                 **compared_sources,
                 **recordings.digests,
                 **response_sources,
             }
         ),
-        against=other,
+        against=against,
         compared=compared,
         responses=responses,
     )
@@ -187,7 +183,7 @@ def _read(file: Path) -> bytes:
 
 
 def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyModel, dict[str, str]]:
-    """The model as the study wants it, and the hash of the file it comes from."""
+    """Return the model as the study wants it, and the hash of the file it comes from."""
     table = settings.model
     source, sources = _source(table.source, file, "model.source")
     place = "model.source"
@@ -210,13 +206,13 @@ def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyMode
 
 
 def _limits(table: schema.ModelTable) -> dict[str, float] | None:
-    """The limits of an FMU that are stated, by their keys."""
+    """Return the limits of an FMU that are stated, by their keys."""
     stated = {n: v for n in ("deadline", "load", "memory") if (v := getattr(table, n)) is not None}
     return stated or None
 
 
 def _recorded(settings: schema.StudyFile) -> Iterable[tuple[str, Iterable[str]]]:
-    """The names of outputs that a study's tables ask for, and where."""
+    """Yield the place and the names of the outputs that each of a study's tables asks for."""
     for e in settings.experiment:
         yield f"experiment '{e.name}'.outputs", e.outputs
     for r in settings.response:
@@ -228,7 +224,7 @@ def _recorded(settings: schema.StudyFile) -> Iterable[tuple[str, Iterable[str]]]
 
 
 def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, str]]:
-    """A shipped model's name, or a file's path from the study's folder, with that file's hash."""
+    """Return a shipped model's name, or a file's path from the study's folder, with that file's hash."""
     if is_shipped(name) or not _is_path(name):
         return name, {}
     source = file.parent / name
@@ -237,32 +233,17 @@ def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, st
             f"no model file '{name}'",
             where=f"{file.name}, {place}",
             expected="a path from the study's folder, or a shipped model: " + ", ".join(shipped_models()),
+            hint=f"a path as seen from {file.parent}, or a name that `hvdc-ident models` lists",
         )
     return source, {name: digest(source.read_bytes())}
 
 
-def _compared_with(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyModel | None, dict[str, str]]:
-    """The other model that sweeps are compared with, where they are, and its file's hash."""
-    from hvdc_ident.study.stages.sweep import sweep_reference
-
-    name = sweep_reference(settings.sweep, f"{file.name}, sweep")
-    if name in ("data", "base"):
-        return None, {}
-    return _other_model(name, settings, file, "sweep.against", trust)
-
-
-def _linear_model_compared_with(
-    settings: schema.StudyFile, file: Path, trust: bool
-) -> tuple[AnyModel | None, dict[str, str]]:
-    """The other model that the linear model is compared with, where it is, and its file's hash."""
-    asked = settings.linearize.compare if settings.linearize else None
-    return _other_model(asked, settings, file, "linearize.compare", trust) if asked else (None, {})
-
-
 def _other_model(
-    name: str, settings: schema.StudyFile, file: Path, place: str, trust: bool
-) -> tuple[AnyModel, dict[str, str]]:
-    """A model that a study names beside its own, and its file's hash."""
+    name: str | None, settings: schema.StudyFile, file: Path, place: str, trust: bool
+) -> tuple[AnyModel | None, dict[str, str]]:
+    """Return a model that a study names beside its own, None where it names none, and its file's hash."""
+    if name is None:
+        return None, {}
     source, sources = _source(name, file, place)
     try:
         model = load_model(source, trust=trust, limits=_limits(settings.model) if name.endswith(".fmu") else None)
@@ -306,7 +287,7 @@ def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> Fr
 
 
 def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
-    """The model with its ties and its given values.
+    """Return the model with its ties and its given values.
 
     Raises StudyError or UnknownNameError for a tie, or a parameter of each experiment, that does not fit the model.
     """
@@ -350,7 +331,7 @@ def with_nuisances(
     candidates: Sequence[str],
     where: str,
 ) -> tuple[Experiment, ...]:
-    """The experiments with the parameters each has for itself: those asked for, and the free starts of states.
+    """Return the experiments with the parameters each has for itself: those asked for, and the free starts of states.
 
     A start that is "free" is unknown: it is estimated in every experiment unless it is a candidate, one for all. Raises StudyError
     where the bounds of one do not hold its start.
@@ -372,7 +353,7 @@ def with_nuisances(
 
 
 def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> FitParameter:
-    """The unknown of a fit that a line of [parameters] describes; what it leaves out is the model's, its given value too.
+    """Return the unknown of a fit that a line of [parameters] describes; what it leaves out is the model's, its given value too.
 
     Raises StudyError where the bounds do not hold the start.
     """
@@ -381,7 +362,7 @@ def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> FitParam
 
 
 def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> FrozenMap[Prior]:
-    """The priors by unknown of a fit; one of a parameter that each experiment has for itself holds in every experiment."""
+    """Return the priors by unknown of a fit; one of a parameter that each experiment has for itself holds in every experiment."""
     from hvdc_ident.fit.likelihood import Prior
     from hvdc_ident.fit.simulator import unknown_of
 
