@@ -1,6 +1,6 @@
 """Model checks on a fit's residuals: their size beside that of the noise, and whether they are white.
 
-The mean squared residual per degree of freedom (chi2/dof) is 1 where a right model meets the noise that was told. It is
+The mean squared residual per degree of freedom (chi2/dof) is 1 where a right model meets the noise that was stated. It is
 judged twice: it has to differ from 1 by more than chance allows (the F quantile, of the independent samples in the residual
 and of those behind an estimated noise), and by enough to matter. It matters from 2 on: more than half of the residual's
 power is then not noise, and intervals that rest on the noise alone cover less than that half. Below 1/2 they are too wide in
@@ -30,13 +30,14 @@ MATTERS = 2.0
 NEXT = "hvdc-ident diagnose STUDY"
 
 Verdict = Literal["fits", "does-not-fit", "noise-understated", "noise-overstated", "not-judged"]
+WORST_FIRST: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
 
 
 @dataclass(frozen=True)
 class ResidualSize:
     """The residual of one output. ratio: its power over that of the noise, per degree of freedom.
 
-    low, high: between them the ratio says nothing; noise: the standard deviation told or, where none was, the scatter from
+    low, high: between them the ratio is what chance allows; noise: the standard deviation stated or, where none was, the scatter from
     row to row, in the output's unit; None where there is neither. white: whether the residual has no significant
     autocorrelation.
     """
@@ -58,9 +59,9 @@ class ResidualSize:
 class Adequacy:
     """The verdict on the size of the residuals.
 
-    verdict: fits; does-not-fit; noise-understated (white residuals above the noise told: not the mark of a wrong model);
+    verdict: fits; does-not-fit; noise-understated (white residuals above the noise stated: not the mark of a wrong model);
     noise-overstated; not-judged (no noise is known but the residual's own). chi2_per_dof: over all outputs, against the noise
-    told. outputs: by output. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
+    stated. outputs: by output. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
     """
 
     verdict: Verdict
@@ -71,9 +72,9 @@ class Adequacy:
 
     @property
     def widening(self) -> float:
-        """The factor of the estimates' variances that the excess of the residual over the noise told calls for.
+        """The factor of the estimates' variances that the excess of the residual over the noise stated calls for.
 
-        The misfit then stands for the noise, as it does where none is told; 1 where the residual is no larger.
+        The misfit then stands for the noise, as it does where none is stated; 1 where the residual is no larger.
         """
         above = self.verdict in ("does-not-fit", "noise-understated")
         return max(self.chi2_per_dof or 1.0, 1.0) if above else 1.0
@@ -86,7 +87,7 @@ def adequacy(
     effective: Mapping[str, float],
     rho: Mapping[str, float],
 ) -> Adequacy:
-    """The verdict on the residuals at an optimum of the problem.
+    """Return the verdict on the residuals at an optimum of the problem.
 
     blocks: with residuals in units of sigma. By output: sources (`noise_source`), effective (independent samples), rho (the
     residuals' AR(1) coefficient, 0 where it is not significant).
@@ -99,18 +100,19 @@ def adequacy(
     level = LEVEL / max(len(problem.outputs), 1)
     sizes = {}
     for output in problem.outputs:
-        own = [b for b in blocks if b.output == output]
-        sizes[output] = _size(problem, output, own, share, (effective[output], rho[output]), sources[output], level)
-    told = [b for b in blocks if not from_misfit(sources[b.output])]
-    power = sum(_power(problem, b.residual) * b.residual.size for b in told)
-    chi2 = power / (sum(b.residual.size for b in told) * share) if told else None
-    verdict = _together(sizes)
-    text, what = _words(problem, sizes, verdict, sources)
-    return Adequacy(verdict, chi2, FrozenMap(sizes), text, what)
+        of_output = [b for b in blocks if b.output == output]
+        source = sources[output]
+        sizes[output] = _size(problem, output, of_output, share, effective[output], rho[output], source, level)
+    known = [b for b in blocks if not from_misfit(sources[b.output])]
+    power = sum(_power(problem, b.residual) * b.residual.size for b in known)
+    chi2 = power / (sum(b.residual.size for b in known) * share) if known else None
+    verdict = min((s.verdict for s in sizes.values()), key=WORST_FIRST.index)
+    text, advice = _sentence(sizes, verdict, sources)
+    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice)
 
 
 def _power(problem: Problem, residual: Array) -> float:
-    """The mean squared residual; under a robust loss by the median, for outliers are not noise."""
+    """Return the mean squared residual; under a robust loss by the median, for outliers are not noise."""
     if problem.loss.linear:
         return float(np.mean(residual**2))
     return (MAD * float(np.median(np.abs(residual)))) ** 2
@@ -121,13 +123,14 @@ def _size(
     output: str,
     blocks: Sequence[ResidualBlock],
     share: float,
-    independence: tuple[float, float],
+    effective: float,
+    rho: float,
     source: str,
     level: float,
 ) -> ResidualSize:
-    """The size of one output's residual. share: of the rows that the unknowns leave free. independence: effective, rho."""
+    """Return the size of one output's residual. share: of the rows that the unknowns leave free."""
     residual = np.concatenate([b.residual for b in blocks])
-    effective, white = _independent(residual.size, independence), independence[1] == 0.0
+    effective, white = _independent(residual.size, effective, rho), rho == 0.0
     spare = max(effective - residual.size * (1.0 - share), 1.0)
     if from_misfit(source) and source != MISFIT:
         return ResidualSize(None, 0.0, np.inf, None, white, "fits")
@@ -152,10 +155,12 @@ def _size(
     return ResidualSize(ratio, low, high, noise, white, verdict)
 
 
-def _independent(rows: int, independence: tuple[float, float]) -> float:
-    """The independent samples in so many rows; of correlated ones at the upper end of what their coefficient may be, for
-    artanh of it has a standard error of 1/sqrt(rows) (Fisher)."""
-    effective, rho = independence
+def _independent(rows: int, effective: float, rho: float) -> float:
+    """Return the number of independent samples in so many rows, effective ones by the estimate rho of their coefficient.
+
+    Of correlated rows it is taken at the upper end of rho's interval: artanh of it has a standard error of 1/sqrt(rows)
+    (Fisher).
+    """
     if rho == 0.0:
         return max(effective, 1.0)
     upper = float(np.tanh(np.arctanh(min(rho, 1.0 - 1e-9)) + 3.0 / np.sqrt(rows)))
@@ -163,20 +168,12 @@ def _independent(rows: int, independence: tuple[float, float]) -> float:
 
 
 def _quantile(dof: float, behind: float, chance: float) -> float:
-    """The F quantile of dof and `behind` degrees of freedom; an infinite number of them is a large one."""
+    """Return the F quantile of dof and `behind` degrees of freedom; an infinite number of them is a large one."""
     return float(fdtri(dof, min(behind, 1e9), chance))
 
 
-def _together(sizes: Mapping[str, ResidualSize]) -> Verdict:
-    """The worst verdict of any output."""
-    order: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
-    return min((s.verdict for s in sizes.values()), key=order.index)
-
-
-def _words(
-    problem: Problem, sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str]
-) -> tuple[str, str]:
-    """The verdict in words, and what to do."""
+def _sentence(sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str]) -> tuple[str, str]:
+    """Return the verdict in words, and what to do."""
     parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
     text = "; ".join(p for p in parts if p)
     if verdict == "does-not-fit":
@@ -225,7 +222,7 @@ def times_text(factor: float) -> str:
 
 
 def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:
-    """The tests by output and experiment; p is the chance of such a value from white noise, None where not defined.
+    """Return the tests by output and experiment; p is the chance of such a value from white noise, None where not defined.
 
     Each: n, mean and std (in sigma), ljung_box {statistic, lags, p}, runs {runs, expected, p},
     inputs {name: {correlation, lag, p}} with lag in rows, the input leading.
@@ -233,29 +230,21 @@ def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experi
     by_name = {e.name: e for e in experiments}
     table: dict[str, dict[str, Any]] = {}
     for block in blocks:
-        table.setdefault(block.output, {})[block.experiment] = _tests(block, by_name[block.experiment])
+        r, experiment = block.residual, by_name[block.experiment]
+        inputs = {n: signal(experiment.time)[block.rows] for n, signal in experiment.inputs.items()}
+        table.setdefault(block.output, {})[block.experiment] = {
+            "n": int(r.size),
+            "mean": float(r.mean()),
+            "std": float(r.std()),
+            "ljung_box": ljung_box(r, parts=block.stretches),
+            "runs": runs(r),
+            "inputs": {n: cross_correlation(r, u) for n, u in inputs.items() if np.ptp(u) > 0},
+        }
     return table
 
 
-def _tests(block: ResidualBlock, experiment: Experiment) -> dict[str, Any]:
-    r = block.residual
-    inputs = {}
-    for name, signal in experiment.inputs.items():
-        u = signal(experiment.time)[block.rows]
-        if np.ptp(u) > 0:
-            inputs[name] = cross_correlation(r, u)
-    return {
-        "n": int(r.size),
-        "mean": float(r.mean()),
-        "std": float(r.std()),
-        "ljung_box": ljung_box(r, parts=block.stretches),
-        "runs": runs(r),
-        "inputs": inputs,
-    }
-
-
 def ljung_box(r: Array, lags: int | None = None, parts: Sequence[slice] = ()) -> dict[str, Any]:
-    """Ljung and Box's (1978) statistic over the first lags (default: 10, or a fifth of the rows), with its p.
+    """Return Ljung and Box's (1978) statistic over the first lags (default: 10, or a fifth of the rows), with its p.
 
     parts: stretches of rows between which some are missing; none for one stretch.
     """
@@ -272,23 +261,23 @@ def ljung_box(r: Array, lags: int | None = None, parts: Sequence[slice] = ()) ->
 
 
 def runs(r: Array) -> dict[str, Any]:
-    """The number of runs of one sign against what chance gives (Wald and Wolfowitz 1940), with its two-sided p."""
+    """Return the number of runs of one sign against what chance gives (Wald and Wolfowitz 1940), with its two-sided p."""
     signs = np.sign(r)
     signs = signs[signs != 0]
     up, down = int((signs > 0).sum()), int((signs < 0).sum())
-    found = int(1 + (np.diff(signs) != 0).sum()) if signs.size else 0
+    count = int(1 + (np.diff(signs) != 0).sum()) if signs.size else 0
     n = up + down
     if not up or not down or n < 3:
-        return {"runs": found, "expected": None, "p": None}
+        return {"runs": count, "expected": None, "p": None}
     expected = 1.0 + 2.0 * up * down / n
     variance = (expected - 1.0) * (expected - 2.0) / (n - 1.0)
     if variance <= 0:
-        return {"runs": found, "expected": expected, "p": None}
-    return {"runs": found, "expected": expected, "p": math.erfc(abs(found - expected) / math.sqrt(2.0 * variance))}
+        return {"runs": count, "expected": expected, "p": None}
+    return {"runs": count, "expected": expected, "p": math.erfc(abs(count - expected) / math.sqrt(2.0 * variance))}
 
 
 def cross_correlation(r: Array, u: Array, lags: int | None = None) -> dict[str, Any]:
-    """The largest correlation of the residual with the same or an earlier input row, its lag, and the p of all lags.
+    """Return the largest correlation of the residual with the same or an earlier input row, its lag, and the p of all lags.
 
     Both are first filtered by their own AR(1) coefficient, so that two slow signals do not count as related; the
     statistic n sum(ccf^2) over lags 0 to 20 (or a fifth of the rows) is chi-square (Box and Jenkins, section 11.3).
@@ -305,7 +294,7 @@ def cross_correlation(r: Array, u: Array, lags: int | None = None) -> dict[str, 
 
 
 def _innovation(signal: Array) -> Array:
-    """The signal less its mean, filtered by its own AR(1) coefficient."""
+    """Return the signal less its mean, filtered by its own AR(1) coefficient."""
     centred = signal - signal.mean()
     power = float(centred @ centred)
     rho = float(centred[1:] @ centred[:-1]) / power if power else 0.0

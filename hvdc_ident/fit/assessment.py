@@ -1,6 +1,6 @@
-"""How good a fit is: goodness by output and experiment, held-out experiments, bands of the prediction.
+"""Assessment of a fit: goodness by output and experiment, held-out experiments, bands of the prediction.
 
-Everything here takes a problem in its final weights and the result of its fit.
+Everything in this module takes a problem in its final weights and the result of its fit.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Curve:
 
     @property
     def residual(self) -> Array:
-        """The misfit in standard deviations."""
+        """Misfit in standard deviations."""
         return per_deviation(self.misfit, self.sigma, None if self.profile is None else self.profile[self.rows])
 
     @property
@@ -55,25 +55,25 @@ class Curve:
 
 
 def assessed(problem: Problem, result: FitResult) -> FitResult:
-    """The result with `goodness` and `validation`; errors of held-out experiments are taken with their own nuisances."""
+    """Return the result with `goodness` and `validation`; errors of held-out experiments are taken with their own nuisances."""
     nuisances = held_out_nuisances(problem, result)
-    found = curves(problem, result, nuisances)
+    by_experiment = curves(problem, result, nuisances)
     rmse = {o: dict(line) for o, line in result.rmse.items()}
     for e in problem.experiments:
         if nuisances.get(e.name):
-            for output, c in found.get(e.name, {}).items():
+            for output, c in by_experiment.get(e.name, {}).items():
                 rmse[output][e.name] = float(np.sqrt(np.mean(c.misfit**2)))
     result = replace(result, rmse=rmse)
     held_out = {e.name for e in problem.experiments if e.role == "holdout"}
     return replace(
         result,
-        goodness=goodness(problem, result, {n: c for n, c in found.items() if n not in held_out}),
-        validation=validation(problem, result, {n: found.get(n) for n in sorted(held_out)}, nuisances),
+        goodness=goodness(problem, result, {n: c for n, c in by_experiment.items() if n not in held_out}),
+        validation=validation(problem, result, {n: by_experiment.get(n) for n in sorted(held_out)}, nuisances),
     )
 
 
 def in_final_weights(problem: Problem, result: FitResult) -> Problem:
-    """The problem with the standard deviations and the noise model that its fit ended with."""
+    """Return the problem with the standard deviations and the noise model that its fit ended with."""
     return replace(
         problem,
         weights=problem.weights | _weights(result),
@@ -82,11 +82,11 @@ def in_final_weights(problem: Problem, result: FitResult) -> Problem:
 
 
 def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[str, float] | None]:
-    """By held-out experiment its nuisances, estimated from its own record with the parameters at their estimates.
+    """Return the nuisances of each held-out experiment, estimated from its own record with the parameters at their estimates.
 
     None where they cannot be estimated, for the run fails.
     """
-    found: dict[str, dict[str, float] | None] = {}
+    nuisances: dict[str, dict[str, float] | None] = {}
     for e in problem.experiments:
         if e.role != "holdout" or not e.nuisance or not e.outputs:
             continue
@@ -105,14 +105,14 @@ def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[st
         try:
             end = descend(LeastSquares.of(alone), theta, fixed, enough=1e-6)
         except SimulationError:
-            found[e.name] = None
+            nuisances[e.name] = None
             continue
-        found[e.name] = {n: float(v) for n, v in zip(e.nuisance, end.theta[known:], strict=True)}
-    return found
+        nuisances[e.name] = {n: float(v) for n, v in zip(e.nuisance, end.theta[known:], strict=True)}
+    return nuisances
 
 
 def _weights(result: FitResult) -> dict[str, float]:
-    """The standard deviations that came from the misfit, by output."""
+    """Return the standard deviations that came from the misfit, by output."""
     return {
         o: next(s[o] for s in result.sigma.values() if o in s) for o, w in result.noise_source.items() if from_misfit(w)
     }
@@ -121,7 +121,7 @@ def _weights(result: FitResult) -> dict[str, float]:
 def curves(
     problem: Problem, result: FitResult, held_out: Mapping[str, Mapping[str, float] | None] | None = None
 ) -> dict[str, dict[str, Curve]]:
-    """Every output of every experiment at the estimates, by experiment and output; those that fail are left out.
+    """Return every output of every experiment at the estimates, by experiment and output; those that fail are left out.
 
     held_out: nuisances of held-out experiments, None where they could not be estimated.
     """
@@ -131,16 +131,16 @@ def curves(
     for e in problem.experiments:
         if not e.outputs or e.measured is None:
             continue
-        own = {n: v.value for n, v in result.nuisance.get(e.name, {}).items()}
+        nuisance = {n: v.value for n, v in result.nuisance.get(e.name, {}).items()}
         if held_out and e.name in held_out:
             estimated = held_out[e.name]
             if estimated is None:
                 continue
-            own = dict(estimated)
+            nuisance = dict(estimated)
         names = [f.name for f in problem.free]
-        columns = [*names, *(unknown_of(e.name, n) for n in own)]
+        columns = [*names, *(unknown_of(e.name, n) for n in nuisance)]
         try:
-            seen = observe(problem.simulator, e, result.values, names, own)
+            observed = observe(problem.simulator, e, result.values, names, nuisance)
         except SimulationError:
             continue
         table[e.name] = {}
@@ -149,23 +149,23 @@ def curves(
             if known is not None and known.names:
                 pick = [k for k, n in enumerate(columns) if n in known.names]
                 place = [known.names.index(columns[k]) for k in pick]
-                g = seen.gradient[o][:, pick]
+                g = observed.gradient[o][:, pick]
                 variance = np.einsum("ni,ij,nj->n", g, known.matrix[np.ix_(place, place)], g)
                 std = np.sqrt(np.clip(variance, 0.0, None))
                 band = quantile * np.sqrt(std**2 + (sigma if profile is None else sigma * profile) ** 2)
-            table[e.name][o] = Curve(seen.values[o], e.measured[o], compared_rows(e, o), sigma, std, band, profile)
+            table[e.name][o] = Curve(observed.values[o], e.measured[o], compared_rows(e, o), sigma, std, band, profile)
     return table
 
 
-def goodness(problem: Problem, result: FitResult, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
-    """How well the fitted experiments are met.
+def goodness(problem: Problem, result: FitResult, by_experiment: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
+    """Return the goodness of fit over the fitted experiments.
 
     chi2, dof, p: of all residuals together, against the given noise, with the independent samples that correlated
     residuals are worth; None, with the reason, where the noise came from the misfit. noise_dof: samples behind a noise
     that was estimated; the p is then that of F(dof, noise_dof), else of chi-square. outputs: see `_quality`.
     """
     table: dict[str, dict[str, Any]] = {}
-    for experiment, line in found.items():
+    for experiment, line in by_experiment.items():
         for output, c in line.items():
             table.setdefault(output, {})[experiment] = _quality(c)
     samples = sum(q["n"] for line in table.values() for q in line.values())
@@ -187,18 +187,21 @@ def goodness(problem: Problem, result: FitResult, found: Mapping[str, Mapping[st
 
 
 def _quality(c: Curve) -> dict[str, Any]:
-    """n: rows; rmse, in the unit; rmse_per_sigma; r2: share of the variance explained; fit_percent: 100 (1 - |e|/|y -
-    mean|), None where the record stands still; in_band: share of rows in the 95 % band."""
+    """Return the quality of one curve.
+
+    n: rows; rmse, in the unit; rmse_per_sigma; r2: share of the variance explained; fit_percent: 100 (1 - |e|/|y - mean|),
+    None where the record stands still; in_band: share of rows in the 95 % band.
+    """
     e, y = c.misfit, c.measured[c.rows]
     moved = float(np.sum((y - y.mean()) ** 2))
-    left = float(e @ e)
-    rmse = float(np.sqrt(left / e.size))
+    squares = float(e @ e)
+    rmse = float(np.sqrt(squares / e.size))
     return {
         "n": int(e.size),
         "rmse": rmse,
         "rmse_per_sigma": float(np.sqrt(np.mean(c.residual**2))),
-        "r2": 1.0 - left / moved if moved > 0 else None,
-        "fit_percent": 100.0 * (1.0 - np.sqrt(left / moved)) if moved > 0 else None,
+        "r2": 1.0 - squares / moved if moved > 0 else None,
+        "fit_percent": 100.0 * (1.0 - np.sqrt(squares / moved)) if moved > 0 else None,
         "in_band": float(np.mean(np.abs(e) <= c.band[c.rows])) if c.band is not None else None,
     }
 
@@ -206,17 +209,17 @@ def _quality(c: Curve) -> dict[str, Any]:
 def validation(
     problem: Problem,
     result: FitResult,
-    found: Mapping[str, Mapping[str, Curve] | None],
+    by_experiment: Mapping[str, Mapping[str, Curve] | None],
     nuisances: Mapping[str, Mapping[str, float] | None],
 ) -> dict[str, Any]:
-    """The held-out experiments by name: {status, nuisance, outputs {output: quality and comparison with the fit}}.
+    """Return the held-out experiments by name: {status, nuisance, outputs {output: quality and comparison with the fit}}.
 
     of_fit: RMSE over that of the fitted experiments of this output; near 1 the estimates hold there too. ljung_box:
     whiteness of the residual. An experiment that cannot be simulated has status "failed".
     """
     fitted = {e.name for e in problem.experiments if e.role == "fit"}
     table: dict[str, Any] = {}
-    for name, line in found.items():
+    for name, line in by_experiment.items():
         outputs = {}
         for output, c in (line or {}).items():
             errors = [v for e, v in result.rmse.get(output, {}).items() if e in fitted and v is not None]

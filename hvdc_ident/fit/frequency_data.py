@@ -29,7 +29,7 @@ def frequency_experiment(response: MeasuredResponse) -> Experiment:
     for k, label in enumerate(response.labels):
         values = response.values[:, k]
         spread = np.abs(values) if response.std is None else response.std[:, k] / np.sqrt(2.0)
-        # A frequency at which the response is nothing would weigh all: it counts like the smallest of the others.
+        # A frequency at which the response is 0 would outweigh all others: it counts like the smallest of them.
         spread = np.where(spread > 0, spread, spread[spread > 0].min(initial=np.inf))
         spread = np.where(np.isfinite(spread), spread, 1.0)
         size = float(np.sqrt(np.mean(spread**2)))
@@ -70,7 +70,7 @@ class LinearRun:
     gradients: Array
 
     def gradient(self, output: str) -> Array:
-        """(frequencies, parameters): derivatives of one part of one channel."""
+        """Return the derivatives of one part of one channel, (frequencies, parameters)."""
         return np.asarray(self.gradients[:, self.trajectory.names.index(output)])
 
 
@@ -107,18 +107,18 @@ class WithResponses:
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
     ) -> SimulationRun:
-        """A run, or the response at the experiment's frequencies. Raises SimulationError where there is none."""
+        """Return a run, or the response at the experiment's frequencies. Raises SimulationError where there is none."""
         if experiment.domain == "time":
             return self.simulator.simulate(experiment, values, sensitivities)
         response = self.responses[experiment.name]
         try:
-            found, slopes = response.of_model(self.model, values, sensitivities)
+            answer, slopes = response.of_model(self.model, values, sensitivities)
         except (SteadyStateError, LinearizationError) as e:
             where = f"response '{response.name}': {e.where}".removesuffix(": ")
             raise SimulationError(e.what, where=where, expected=e.expected, got=e.got, hint=e.hint) from None
         names = [output_name(response, label, part) for label in response.labels for part in ("re", "im")]
-        columns = np.stack([found.real, found.imag], axis=2).reshape(len(found), -1)
-        gradients = np.stack([slopes.real, slopes.imag], axis=2).reshape(len(found), columns.shape[1], -1)
+        columns = np.stack([answer.real, answer.imag], axis=2).reshape(len(answer), -1)
+        gradients = np.stack([slopes.real, slopes.imag], axis=2).reshape(len(answer), columns.shape[1], -1)
         if not (np.isfinite(columns).all() and np.isfinite(gradients).all()):
             raise SimulationError("the response is not finite", where=f"response '{response.name}'")
         return LinearRun(Trajectory(experiment.time, columns, tuple(names)), tuple(sensitivities), gradients)

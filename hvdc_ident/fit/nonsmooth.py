@@ -1,8 +1,9 @@
 """Optima of a nonsmooth cost: that of its trend over the width of the interval, not the lowest of many local minima.
 
 Events that pass rows, and adaptive steps of a solver that takes others at each parameter value, make the residuals jump from
-one value to the next. The cost is then a saw on a parabola: its lowest tooth lies anywhere within sqrt(2 roughness) standard
-deviations, and a profile that looks for a crossing stops at the next tooth. The roughness is told by fourth differences
+one value to the next. The cost is then a sawtooth on a parabola: its lowest minimum lies anywhere within sqrt(2 roughness)
+standard deviations, and a profile stops at the next local minimum instead of the crossing. The roughness is estimated by
+fourth differences
 (J. J. More and S. M. Wild, SIAM J. Sci. Comput. 33 (2011) 1292), over steps as wide as the interval. Where it is not small
 against the threshold, the optimum is where the trend of the residuals, regressed over that width, has no gradient left.
 """
@@ -27,15 +28,15 @@ FINE = 0.05
 SLIGHT = 2.0 * FINE
 """Roughness, as a share of the threshold, that moves an end by less than that: the rise goes with the distance squared."""
 UNEVEN = -np.cos(np.pi * np.arange(9) / 8)
-"""Places from -1 to 1 along a coordinate: a constant, a slope and a bend leave 6 of 9 to tell the scatter by."""
+"""Places from -1 to 1 along a coordinate: a constant, a slope and a bend leave 6 of 9 to estimate the scatter by."""
 REACH = 2.0
 """First reach of the places, in standard deviations: the interval."""
 LUCK = 3.0
-"""So many times the roughness the cost of the lowest of some twenty teeth, and of the next, may lie apart."""
+"""So many times the roughness may lie between the costs of the lowest of some twenty local minima and of the next."""
 RUNS = 9
-"""Evaluations that tell the roughness."""
+"""Evaluations that an estimate of the roughness takes."""
 ROUNDS = 8
-"""Times that the places are moved or spread before what is known then is taken."""
+"""Times that the places are moved or spread before the last trend is taken."""
 SPREAD = 8.0
 """At most so many times as far the places reach in the next round: the scatter in one is only roughly known."""
 
@@ -44,10 +45,10 @@ SPREAD = 8.0
 class Trend:
     """The optimum of the trend of a rough cost.
 
-    theta: (p,), each unknown in its unit. gain: (p, p), what the covariance of the single run's derivatives is to be
-    multiplied by from both sides, for they are off. scatter: (p, p) covariance of theta by the roughness alone.
-    curvature: (p, p) of the cost. roughness: what the cost, half of chi-square, changes by at random between values within
-    the interval. settled: whether the optimum lies among the places that it was told from.
+    theta: (p,), each unknown in its unit. gain: (p, p), multiplies the covariance from the single run's derivatives from
+    both sides, for these are off. scatter: (p, p) covariance of theta by the roughness alone.
+    curvature: (p, p) of the cost. roughness: random change of the cost, half of chi-square, between values
+    within the interval. settled: whether the optimum lies among the places that the trend was regressed on.
     """
 
     theta: Array
@@ -58,12 +59,12 @@ class Trend:
     settled: bool = True
 
     def holds(self, theta: Array, threshold: float) -> bool:
-        """Return whether a search may have ended at theta, (p,), for a tooth within the interval of this optimum."""
-        off = theta - self.theta
-        return bool(0.5 * off @ self.curvature @ off <= threshold + LUCK * self.roughness)
+        """Return whether theta, (p,), may be a local minimum that a search found within the interval of this optimum."""
+        distance = theta - self.theta
+        return bool(0.5 * distance @ self.curvature @ distance <= threshold + LUCK * self.roughness)
 
     def widened(self, covariance: Array, places: Sequence[int] | None = None) -> Array:
-        """The covariance of the estimates, (k, k), with the derivatives' error and the roughness in it.
+        """Return the covariance of the estimates, (k, k), with the derivatives' error and the roughness in it.
 
         places: of those k among all p unknowns; None: all.
         """
@@ -73,7 +74,7 @@ class Trend:
 
     @property
     def text(self) -> str:
-        """A sentence for the reader."""
+        """Sentence on the roughness, for the reader of a report."""
         return (
             f"Runs of this simulator jump from one parameter value to the next, so that chi-square changes by about "
             f"{2.0 * self.roughness:.2g} at random within the intervals (their ends lie where it has risen by 3.84): "
@@ -82,18 +83,18 @@ class Trend:
 
 
 def residual_at(problem: Problem, theta: Array) -> Array:
-    """(N,) residuals at theta, (p,), without their derivatives. Raises SimulationError."""
+    """Return the residuals, (N,), at theta, (p,), without their derivatives. Raises SimulationError."""
     r, _ = problem.loss.applied(*stacked(problem.blocks(theta, derivatives=False)))
     return np.concatenate([r, problem.prior(theta)[0]]) if problem.priors else r
 
 
 def roughness(problem: Problem, theta: Array) -> float:
-    """Return what the cost changes by at random between values of theta, (p,), within its interval.
+    """Return the random change of the cost between values of theta, (p,), within its interval.
 
-    0 where sensitivities are exact, for such runs are smooth, and where a run fails beside theta: nothing is then known.
-    Residuals r that jump by n change the cost by sum r n + sum n^2/2, the first of mean 0 for noise in r. n is what
-    eight runs more leave of polynomials of degree 4, as fourth differences do, but at uneven steps: teeth that are even
-    would look smooth at even ones.
+    0 where sensitivities are exact, for such runs are smooth, and where a run fails beside theta, so that it is not known.
+    Residuals r that jump by n change the cost by sum r n + sum n^2/2, the first of mean 0 for noise in r. n is the remainder
+    of polynomials of degree 4 through eight more runs, as fourth differences give, but at uneven steps: jumps at even
+    distances would look smooth at even ones.
     """
     if not approximate(problem.simulator):
         return 0.0
@@ -111,24 +112,24 @@ def roughness(problem: Problem, theta: Array) -> float:
     except SimulationError:
         return 0.0
     smooth = np.linalg.qr(np.polynomial.chebyshev.chebvander(UNEVEN, 4))[0]
-    left = runs - smooth @ (smooth.T @ runs)
-    squares = np.sum(left**2, axis=0) / (UNEVEN.size - smooth.shape[1])
+    remainder = runs - smooth @ (smooth.T @ runs)
+    squares = np.sum(remainder**2, axis=0) / (UNEVEN.size - smooth.shape[1])
     return float(np.sqrt(np.sum(r**2 * squares)) + 0.5 * np.sum(squares))
 
 
 def threshold_of(problem: Problem, r: Array) -> float:
-    """The rise of the cost at the ends of an interval, which a misfit larger than the noise makes as much larger."""
+    """Return the rise of the cost at the ends of an interval, which a misfit larger than the noise makes as much larger."""
     return TWO_SIDED * max(1.0, float(r @ r) / max(r.size - len(problem.names), 1))
 
 
 def trend_of(problem: Problem, theta: Array, rough: float | None = None) -> Trend | None:
-    """The optimum of the trend near theta, (p,); None where the cost is smooth enough to be walked on, or a run fails.
+    """Return the optimum of the trend near theta, (p,); None where the cost is smooth enough, or a run fails.
 
     rough: the `roughness` there, where it is known.
 
     At places about the optimum, along each unknown, the Gauss-Newton step is taken with one and the same matrix of
-    derivatives J. Where it leads, q, is regressed on the place: its intercept is the optimum, and its slope B is what J
-    lacks of the trend's own derivatives, for with these q would be the same from everywhere. J has errors that do not
+    derivatives J. Its end, q, is regressed on the place: the intercept is the optimum, and the slope B is the error of J
+    beside the trend's own derivatives, for with these q would be the same from everywhere. J has errors that do not
     depend on the residuals, so it serves as an instrument: the covariance is G (J'J)^-1 G' with G = (1 - B)^-1.
     The places are spread until B is known to `FINE`, and moved until the optimum lies among them.
     """
@@ -140,28 +141,28 @@ def trend_of(problem: Problem, theta: Array, rough: float | None = None) -> Tren
     x = space.scaled(theta)
     inside = np.flatnonzero((x > low) & (x < high))
     reach = np.full(inside.size, REACH)
-    found: Trend | None = None
+    trend: Trend | None = None
     for n in range(ROUNDS):
         try:
-            at = space.unscaled(x)
-            whitened = _Whitened.of(problem, x, inside, problem.residual(at)[1] * space.slope(at))
+            centre = space.unscaled(x)
+            whitened = _Whitened.of(problem, x, inside, problem.residual(centre)[1] * space.slope(centre))
             if whitened is None:
-                return found
+                return trend
             lines = _regressed(whitened, reach)
         except SimulationError:
-            return found
+            return trend
         rough = max(rough, lines.rough) if n == 0 else rough
         error = float(lines.error.max())
         gain = np.linalg.pinv(np.eye(inside.size) - lines.slope)
         ahead = gain @ lines.intercept
         x = np.clip(whitened.place(np.clip(ahead, -reach, reach)), low, high)
         settled = bool((np.abs(ahead) <= reach).all())
-        found = whitened.trend(x, gain * np.sqrt(1.0 + error**2), gain @ lines.scatter @ gain.T, rough, settled)
+        trend = whitened.trend(x, gain * np.sqrt(1.0 + error**2), gain @ lines.scatter @ gain.T, rough, settled)
         if error > FINE:
             reach = reach * min(max(error / FINE, 2.0), SPREAD)
         elif settled:
-            return found
-    return found
+            return trend
+    return trend
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +180,7 @@ class _Whitened:
 
     @classmethod
     def of(cls, problem: Problem, x: Array, inside: NDArray[np.intp], columns: Array) -> _Whitened | None:
-        """The coordinates by (N, p) derivatives; None where they leave a direction undetermined."""
+        """Return the coordinates by (N, p) derivatives; None where they leave a direction undetermined."""
         length = np.linalg.norm(columns[:, inside], axis=0)
         if not inside.size or not (length > 0).all():
             return None
@@ -189,18 +190,18 @@ class _Whitened:
         return cls(problem, x, inside, vt.T / s / length[:, None], u)
 
     def place(self, z: Array) -> Array:
-        """(p,) scaled coordinates of z, (k,)."""
+        """Return the scaled coordinates, (p,), of z, (k,)."""
         moved = self.x.copy()
         moved[self.inside] += self.axes @ z
         return moved
 
-    def led(self, z: Array) -> Array:
-        """Return where a Gauss-Newton step from z leads with the derivatives of the centre, and the cost: (k + 1,)."""
+    def step_end(self, z: Array) -> Array:
+        """Return the end of a Gauss-Newton step from z with the derivatives of the centre, and the cost: (k + 1,)."""
         r = residual_at(self.problem, self.problem.coordinates.unscaled(self.place(z)))
         return np.append(z - self.left.T @ r, 0.5 * float(r @ r))
 
     def room(self, j: int) -> tuple[float, float]:
-        """Return how far the bounds let go along the j-th coordinate, down and up."""
+        """Return the distances to the bounds along the j-th coordinate, down and up."""
         low, high = (b[self.inside] - self.x[self.inside] for b in self.problem.coordinates.bounds)
         axis = self.axes[:, j]
         with np.errstate(divide="ignore"):
@@ -208,7 +209,7 @@ class _Whitened:
         return float(-ends[0].max()), float(ends[1].min())
 
     def trend(self, x: Array, gain: Array, scatter: Array, rough: float, settled: bool) -> Trend:
-        """The trend whose optimum is at x, (p,), with gain and scatter, (k, k), in units of the unknowns."""
+        """Return the trend whose optimum is at x, (p,), with gain and scatter, (k, k), in units of the unknowns."""
         space = self.problem.coordinates
         theta = space.unscaled(x)
         axes = self.axes * space.slope(theta)[self.inside][:, None]
@@ -223,9 +224,11 @@ class _Whitened:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """Regression of where steps lead on where they begin: intercept (k,), slope (k, k) with its standard error, and the
-    intercept's covariance, so large that 1.96 standard deviations cover what Student's t of the places left says. rough:
-    what a parabola leaves of the cost."""
+    """Regression of the ends of steps on their starts.
+
+    intercept: (k,). slope: (k, k); error: its standard error. scatter: covariance of the intercept, so large that 1.96
+    standard deviations cover the interval by Student's t of the remaining places. rough: the cost's remainder of a parabola.
+    """
 
     intercept: Array
     slope: Array
@@ -235,24 +238,24 @@ class _Lines:
 
 
 def _regressed(at: _Whitened, reach: Array) -> _Lines:
-    """The regression from places along each coordinate as far as its reach, (k,)."""
+    """Return the regression from places along each coordinate as far as its reach, (k,)."""
     k = reach.size
-    rows, led = [np.zeros(2 * k)], [at.led(np.zeros(k))]
+    rows, ends = [np.zeros(2 * k)], [at.step_end(np.zeros(k))]
     for j in range(k):
         for t in _nodes(*at.room(j), float(reach[j])):
             z, row = np.zeros(k), np.zeros(2 * k)
             z[j] = t
             row[2 * j : 2 * j + 2] = t / reach[j], (t / reach[j]) ** 2
             rows.append(row)
-            led.append(at.led(z))
-    design, q = np.column_stack([np.ones(len(rows)), np.array(rows)]), np.array(led)
+            ends.append(at.step_end(z))
+    design, q = np.column_stack([np.ones(len(rows)), np.array(rows)]), np.array(ends)
     coefficients, *_ = np.linalg.lstsq(design, q, rcond=None)
-    left = q - design @ coefficients
+    remainder = q - design @ coefficients
     dof = len(rows) - 2 * k - 1
     known = np.linalg.pinv(design.T @ design)
-    *_, rough = np.sqrt(np.sum(left**2, axis=0) / dof)
-    coefficients, left = coefficients[:, :k], left[:, :k]
-    noise = left.T @ left / dof
+    *_, rough = np.sqrt(np.sum(remainder**2, axis=0) / dof)
+    coefficients, remainder = coefficients[:, :k], remainder[:, :k]
+    noise = remainder.T @ remainder / dof
     return _Lines(
         coefficients[0],
         coefficients[1::2].T / reach,
@@ -263,7 +266,7 @@ def _regressed(at: _Whitened, reach: Array) -> _Lines:
 
 
 def _nodes(below: float, above: float, reach: float) -> list[float]:
-    """Places, but for 0, from -reach to reach; where the bounds are nearer than that, more of them on the side with room."""
+    """Return places, but for 0, from -reach to reach; where the bounds are nearer than that, more of them on the side with room."""
     near, far = min(below, above, reach), min(max(below, above), max(reach, 2.0 * reach - min(below, above)))
     places = 0.5 * (far - near + (far + near) * UNEVEN) * (1.0 if above >= below else -1.0)
     middle = int(np.argmin(np.abs(places)))  # 0, but for the rounding, where both sides have room

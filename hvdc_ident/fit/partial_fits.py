@@ -1,4 +1,8 @@
-"""Fits of a problem's parts: one group of parameters after the other, or each experiment alone."""
+"""Fits of a problem's parts: one group of parameters after the other, or each experiment alone.
+
+Groups are fitted each on its own outputs and experiments, the other free parameters held. The fits of single experiments
+show by their spread how well one set of values serves all.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.errors import SimulationError, StudyError, unknown_name
+from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
@@ -47,11 +51,11 @@ def fit_individually(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FitResult:
-    """The fits of the groups, one after the other, as one result.
+    """Return the fits of the groups, one after the other, as one result.
 
     While one group is fitted the other free parameters are held: at their estimate if their turn has been, else at
     their given value. Every estimate is conditional on those. The status is the worst of the groups'; cost, RMSE and tests
-    are those of the whole problem with all estimates put in. A group that fails leaves its parameters there.
+    are those of the whole problem with all estimates put in. A group that fails leaves its parameters at those values.
     Raises StudyError or UnknownNameError for groups that do not fit the problem.
     """
     _check(problem, groups)
@@ -74,54 +78,44 @@ def fit_individually(
 
 
 def _check(problem: Problem, groups: Sequence[Group]) -> None:
-    free = [f.name for f in problem.free]
-    named = [n for g in groups for n in g.parameters]
-    for name in named:
-        if name not in free:
-            raise unknown_name("free parameter", name, free, where="fit groups")
-    if sorted(named) != sorted(free):
+    free, where = [f.name for f in problem.free], "fit groups"
+    grouped = [n for g in groups for n in g.parameters]
+    require_known("free parameter", grouped, free, where)
+    if sorted(grouped) != sorted(free):
         raise StudyError(
-            "groups must hold every free parameter once",
-            where="fit groups",
-            expected=", ".join(free),
-            got=", ".join(named),
+            "groups must hold every free parameter once", where=where, expected=", ".join(free), got=", ".join(grouped)
         )
-    names = [e.name for e in problem.fitted_experiments]
+    experiments = [e.name for e in problem.fitted_experiments]
     for group in groups:
-        for name in group.experiments:
-            if name not in names:
-                raise unknown_name("fitted experiment", name, names, where="fit groups")
-        for name in group.outputs:
-            if name not in problem.outputs:
-                raise unknown_name("measured output", name, problem.outputs, where="fit groups")
+        require_known("fitted experiment", group.experiments, experiments, where)
+        require_known("measured output", group.outputs, problem.outputs, where)
 
 
 def part_of(problem: Problem, group: Group, current: dict[str, float]) -> Problem:
-    """The problem of one group alone."""
+    """Return the problem of one group alone: its parameters, and its outputs in its experiments.
+
+    current: values of the free parameters; those of other groups are held there.
+    """
     mine = tuple(f for f in problem.free if f.name in group.parameters)
     others = {n: v for n, v in current.items() if n not in group.parameters}
-    why = dict.fromkeys(others, "fitted in a group of its own")
+    experiments = []
+    for e in problem.fitted_experiments:
+        outputs = [o for o in e.outputs if not group.outputs or o in group.outputs]
+        if outputs and e.measured is not None and (not group.experiments or e.name in group.experiments):
+            experiments.append(e.with_(measured=e.measured.select(outputs)))
     return replace(
         problem,
-        experiments=tuple(e for e in (_seen(e, group) for e in problem.fitted_experiments) if e is not None),
+        experiments=tuple(experiments),
         free=mine,
         held=problem.held | others,
-        why=problem.why | why,
+        why=problem.why | dict.fromkeys(others, "fitted in a group of its own"),
         conditional_on=FrozenMap({f.name: (*problem.conditional_on.get(f.name, ()), *others) for f in mine}),
         rho=FrozenMap({o: m for o, m in problem.rho.items() if not group.outputs or o in group.outputs}),
     )
 
 
-def _seen(experiment: Experiment, group: Group) -> Experiment | None:
-    """The experiment with the group's outputs alone; None where it has none or is not the group's."""
-    if experiment.measured is None or (group.experiments and experiment.name not in group.experiments):
-        return None
-    outputs = [o for o in experiment.outputs if not group.outputs or o in group.outputs]
-    return experiment.with_(measured=experiment.measured.select(outputs)) if outputs else None
-
-
 def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, float]) -> FitResult:
-    """The groups' results as one, judged on the whole problem."""
+    """Return the groups' results as one, judged on the whole problem."""
     status: Status = min((r.status for r in results), key=_WORST.index)
     message = "; ".join(f"group {i + 1}: {r.status}, {r.message}" for i, r in enumerate(results))
     weights: dict[str, float] = {}
@@ -179,7 +173,7 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
 
 
 def _with_known(experiment: Experiment, nuisance: Mapping[str, Mapping[str, object]]) -> Experiment:
-    """The experiment without nuisances that no group's fit has estimated."""
+    """Return the experiment without nuisances that no group's fit has estimated."""
     known = nuisance.get(experiment.name, {})
     if experiment.role != "fit":
         return experiment
@@ -187,7 +181,7 @@ def _with_known(experiment: Experiment, nuisance: Mapping[str, Mapping[str, obje
 
 
 def _together(results: Sequence[FitResult]) -> Covariance | None:
-    """The covariances side by side: groups fitted one after the other are taken as independent."""
+    """Return the covariances side by side: groups fitted one after the other are taken as independent."""
     parts = [r.covariance for r in results if r.covariance is not None]
     names = tuple(n for c in parts for n in c.names)
     if not parts or len(set(names)) < len(names):
@@ -211,9 +205,9 @@ def fit_each(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """By parameter: the estimates of each experiment alone, and their spread, as the JSON's `per_experiment`.
+    """Return by parameter the estimates of each experiment alone, and their spread, as the JSON's `per_experiment`.
 
-    runs: by a name of its own, the experiments of each fit, where one fit is to see several; left out: each alone.
+    runs: by name, the experiments of each fit, where one fit is to hold several; left out: each alone.
     executor: the fits are shared out over it.
     Each: experiments {name: {value, std, status}}, on_bound, and what `spread` gives, all in the parameter's unit.
     Fits that failed or did not converge are listed and left out of the spread; so are estimates on a bound, whose
@@ -231,13 +225,11 @@ def fit_each(
 
 
 def _parts(problem: Problem, runs: Mapping[str, Sequence[str]] | None) -> dict[str, Problem]:
-    """The problem of each run."""
+    """Return the problem of each run."""
     known = {e.name: e for e in problem.fitted_experiments}
     parts = {}
     for run, names in ({n: (n,) for n in known} if runs is None else runs).items():
-        for name in names:
-            if name not in known:
-                raise unknown_name("fitted experiment", name, known, where=f"run '{run}'")
+        require_known("fitted experiment", names, known, f"run '{run}'")
         if not names:
             raise StudyError("a run without experiments", where=f"run '{run}'", expected="at least one experiment")
         parts[run] = problem.with_(experiments=[known[n] for n in names])
@@ -249,7 +241,7 @@ def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | s
 
 
 def _row(free: FitParameter, results: Mapping[str, FitResult]) -> dict[str, Any]:
-    """One parameter's estimates by run, and their spread."""
+    """Return one parameter's estimates by run, and their spread."""
     rows: dict[str, dict[str, Any]] = {}
     for run, result in results.items():
         e = result.estimates.get(free.name)
@@ -262,7 +254,7 @@ def _row(free: FitParameter, results: Mapping[str, FitResult]) -> dict[str, Any]
 
 
 def spread(values: Array) -> dict[str, Any]:
-    """n, mean, std (n - 1), variance, cv (std over |mean|), and two 95 % intervals; None where n is too small.
+    """Return n, mean, std (n - 1), variance, cv (std over |mean|), and two 95 % intervals; None where n is too small.
 
     `ci95` = mean -+ t std sqrt(1 + 1/n) is where one more value falls; `ci95_of_mean` = mean -+ t std/sqrt(n) is an
     interval of the mean over runs, which shrinks with their number: neither is an interval of the parameter.
@@ -286,5 +278,5 @@ def spread(values: Array) -> dict[str, Any]:
 
 
 def half_width(std: float, n: int) -> float:
-    """t std/sqrt(n): half the 95 % interval of the mean of n values with that standard deviation, in its unit."""
+    """Return t std/sqrt(n), half the 95 % interval of the mean of n values with that standard deviation, in its unit."""
     return float(stdtrit(n - 1, 0.975)) * std / math.sqrt(n)

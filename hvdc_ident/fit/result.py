@@ -1,4 +1,4 @@
-"""What a fit found, and its forms: the JSON of a stage and the values to paste into a study."""
+"""Results of a fit and their forms: the screen, the JSON of a stage and the values to paste into a study."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.immutable import FrozenMap
 
 NOT_ASKED = "not a candidate"
-"""The reason of a parameter that is held because nobody asked for it."""
+"""Reason of a parameter that is held because it was not asked for."""
 FIT_WORDS = {
     "does-not-fit": "The model does not fit these records",
     "noise-understated": "The noise may be understated",
@@ -36,7 +36,7 @@ class Estimate:
     std: standard deviation, corrected for autocorrelated residuals; std_raw: as if they were independent; None where
     there is none, with the reason. ci95: the 95 % interval; an end that is None is not known.
     method: "covariance" (t times std), "one-sided" (on a bound: the bound and a limit from the curvature) or "none".
-    conditional_on: parameters held without which this one could not be told.
+    conditional_on: parameters held without which this one could not be determined.
     ci95_independent: the interval as if the residuals were independent, where they are not.
     """
 
@@ -66,7 +66,7 @@ class StartOutcome:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """How the unknowns scatter together. names: p unknowns; matrix: (p, p), in their units; dof: of Student's t."""
+    """Covariance of p unknowns. names: of the unknowns; matrix: (p, p), in their units; dof: of Student's t."""
 
     names: tuple[str, ...]
     matrix: Array
@@ -125,7 +125,7 @@ class FitResult(Shown):
     covariance: Covariance | None = field(default=None, metadata={"json": False})
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as JSON takes it: full precision, None for what is not finite."""
+        """Return the result as JSON takes it: full precision, None for what is not finite."""
         return {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.metadata.get("json", True)}
 
     def _screen(self) -> Iterator[str | Table]:
@@ -150,7 +150,7 @@ class FitResult(Shown):
         yield f"Next: {self.adequacy.next}" if self.adequacy is not None and self.adequacy.next else ""
 
     def _quality(self) -> str:
-        """The verdict on the residuals, in a line."""
+        """Return the verdict on the residuals, in a line."""
         if self.adequacy is None:
             return ""
         chi2 = "" if self.adequacy.chi2_per_dof is None else f" (chi2/dof {self.adequacy.chi2_per_dof:.3g})"
@@ -158,10 +158,10 @@ class FitResult(Shown):
         return f"{words}{chi2}" + (f": {self.adequacy.text}." if self.adequacy.text else ".")
 
     def _held(self) -> str:
-        """The parameters that are held, a line each; those that nobody asked about in one."""
-        told = {n: why for n, why in self.held.items() if why != NOT_ASKED and n not in self.estimates}
+        """Return the parameters that are held, a line each; those not asked about in one."""
+        explained = {n: why for n, why in self.held.items() if why != NOT_ASKED and n not in self.estimates}
         others = [n for n, why in self.held.items() if why == NOT_ASKED]
-        lines = [f"{n}: {why}" for n, why in told.items()]
+        lines = [f"{n}: {why}" for n, why in explained.items()]
         return "\n".join([*lines, *([f"Not asked about: {', '.join(others)}."] if others else [])])
 
     def plot(self, ax: Any = None) -> Any:
@@ -196,7 +196,7 @@ class FitResult(Shown):
         return data_frame(columns, list(self.estimates), "parameter")
 
     def to_toml_values(self) -> str:
-        """The text of a [model.values] table: fitted and held parameters, full precision, with units as comments."""
+        """Return the text of a [model.values] table: fitted and held parameters, full precision, with units as comments."""
         lines = ["[model.values]"]
         for name, value in self.values.items():
             unit = self.estimates[name].unit if name in self.estimates else ""
@@ -205,7 +205,7 @@ class FitResult(Shown):
 
 
 def _ends(e: Estimate) -> str:
-    """The 95 % interval as text, with the figures that tell its ends apart."""
+    """Return the 95 % interval as text, with the figures that tell its ends apart."""
     low, high = e.ci95 or (None, None)
     if low is None or high is None:
         return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
@@ -215,7 +215,7 @@ def _ends(e: Estimate) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value in dicts, lists, strings and finite numbers; None for infinity and for what is not a number."""
+    """Return the value in dicts, lists, strings and finite numbers; None for infinity and for what is not a number."""
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
@@ -230,6 +230,6 @@ def plain(value: Any) -> Any:
 
 
 def _key(name: str) -> str:
-    """The name as a TOML key."""
+    """Return the name as a TOML key."""
     bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
     return name if bare else json.dumps(name)
