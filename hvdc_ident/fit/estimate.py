@@ -83,14 +83,8 @@ def _result(
 
     Raises SimulationError where a simulator fails at values at which it did not before.
     """
-    local = TrustRegion()
     usable = local_minima(runs)
-    problem, best, rivals = reweighted(first, usable, local)
-    if has_clocks(problem):
-        best = search_clock_offsets(problem, best, local)
-        rivals = [r for r in rivals if r.cost >= best.cost]
-    if whiten == "residual":
-        problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
+    problem, best, rivals = _in_final_weights(first, usable, whiten)
     again = problem is not first or best not in usable
     trend = trend_of(problem, best.theta)
     if trend is not None:
@@ -148,6 +142,20 @@ def _result(
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
         covariance=Covariance(inner.names, inner.corrected, inner.dof),
     )
+
+
+def _in_final_weights(
+    problem: Problem, ends: Sequence[LocalMinimum], whiten: str
+) -> tuple[Problem, LocalMinimum, list[LocalMinimum]]:
+    """Return the problem in its final weights and noise model, its best optimum and the other candidates."""
+    local = TrustRegion()
+    problem, best, rivals = reweighted(problem, ends, local)
+    if has_clocks(problem):
+        best = search_clock_offsets(problem, best, local)
+        rivals = [r for r in rivals if r.cost >= best.cost]
+    if whiten == "residual":
+        problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
+    return problem, best, rivals
 
 
 def _uncertainties(problem: Problem, theta: Array, blocks: Sequence[ResidualBlock]) -> tuple[Uncertainty, Uncertainty]:

@@ -66,7 +66,6 @@ class LinearRun:
     """A response at an experiment's frequencies as a fit takes it, with its derivatives."""
 
     trajectory: Trajectory
-    parameters: tuple[str, ...]
     gradients: Array
 
     def gradient(self, output: str) -> Array:
@@ -121,7 +120,7 @@ class WithResponses:
         gradients = np.stack([slopes.real, slopes.imag], axis=2).reshape(len(answer), columns.shape[1], -1)
         if not (np.isfinite(columns).all() and np.isfinite(gradients).all()):
             raise SimulationError("the response is not finite", where=f"response '{response.name}'")
-        return LinearRun(Trajectory(experiment.time, columns, tuple(names)), tuple(sensitivities), gradients)
+        return LinearRun(Trajectory(experiment.time, columns, tuple(names)), gradients)
 
 
 def with_responses(

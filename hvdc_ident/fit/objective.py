@@ -63,26 +63,6 @@ class LeastSquares:
 
 
 @dataclass(frozen=True, eq=False)
-class Smooth:
-    """Any smooth cost. cost: theta to the cost and its gradient; the curvature comes from differences of gradients."""
-
-    unknowns: tuple[FitParameter, ...]
-    cost: Callable[[Array], tuple[float, Array]]
-
-    def evaluate(self, theta: Array) -> Evaluated:
-        """Return the cost with a curvature made positive, from central differences of the gradient."""
-        value, gradient = self.cost(theta)
-        p = theta.size
-        rows = np.zeros((p, p))
-        for i, u in enumerate(self.unknowns):
-            h = np.zeros(p)
-            h[i] = 1e-5 * max(abs(theta[i]), 1e-3 * u.size)
-            rows[i] = (self.cost(theta + h)[1] - self.cost(theta - h)[1]) / (2.0 * h[i])
-        values, vectors = np.linalg.eigh(0.5 * (rows + rows.T))
-        return Evaluated(float(value), np.asarray(gradient), (vectors * np.abs(values)) @ vectors.T)
-
-
-@dataclass(frozen=True, eq=False)
 class DescentResult:
     """End of a descent: theta, (p,), the objective evaluated there, and the number of evaluations used."""
 

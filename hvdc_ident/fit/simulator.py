@@ -35,10 +35,6 @@ class SimulationRun(Protocol):
     def trajectory(self) -> Trajectory:
         """Every output of the model at the experiment's instants."""
 
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters whose derivatives were asked for, in that order."""
-
     def gradient(self, output: str) -> Array:
         """(n_time, n_parameters): the output's derivatives, in the output's unit over the parameter's unit."""
 

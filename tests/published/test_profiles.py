@@ -6,18 +6,41 @@ at the ends. Costs here are half a sum of squares, so the threshold is 2.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import log, sqrt
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
 
+from hvdc_ident.data import Array
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.objective import LeastSquares, Smooth
+from hvdc_ident.fit.objective import Evaluated, LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.fit.profile_path import ProfileOptions
 
 EXACT = ProfileOptions(tolerance=1e-10)
+
+
+@dataclass(frozen=True, eq=False)
+class Smooth:
+    """Any smooth cost. cost: theta to the cost and its gradient; the curvature comes from differences of gradients."""
+
+    unknowns: tuple[FitParameter, ...]
+    cost: Callable[[Array], tuple[float, Array]]
+
+    def evaluate(self, theta: Array) -> Evaluated:
+        """Return the cost with a curvature made positive, from central differences of the gradient."""
+        value, gradient = self.cost(theta)
+        p = theta.size
+        rows = np.zeros((p, p))
+        for i, u in enumerate(self.unknowns):
+            h = np.zeros(p)
+            h[i] = 1e-5 * max(abs(theta[i]), 1e-3 * u.size)
+            rows[i] = (self.cost(theta + h)[1] - self.cost(theta - h)[1]) / (2.0 * h[i])
+        values, vectors = np.linalg.eigh(0.5 * (rows + rows.T))
+        return Evaluated(float(value), np.asarray(gradient), (vectors * np.abs(values)) @ vectors.T)
 
 
 def free(*names):
