@@ -85,7 +85,7 @@ def _result(
     """
     usable = local_minima(runs)
     problem, best, rivals = _in_final_weights(first, usable, whiten)
-    again = problem is not first or best not in usable
+    refitted = problem is not first or best not in usable
     trend = trend_of(problem, best.theta)
     if trend is not None:
         r, _ = problem.residual(trend.theta)
@@ -96,17 +96,19 @@ def _result(
     blocks = problem.blocks(best.theta)
     inner, everything = (u.on_trend(trend, problem.names) for u in _uncertainties(problem, best.theta, blocks))
     samples = sum(b.residual.size for b in blocks)
-    worth = min(1.0, sum(inner.effective.values()) / samples)
-    optima = [best] if inner.singular else distinct(problem, [best, *rivals], worth)
+    effective_share = min(1.0, sum(inner.effective.values()) / samples)
+    optima = [best] if inner.singular else distinct(problem, [best, *rivals], effective_share)
     if trend is not None:
         optima = [best, *(o for o in optima if o is not best)]
     outcomes = _outcomes(problem, points, runs, weigh=problem is not first)
-    status, message = _status(problem, best, optima, outcomes, worth, trend, again=again)
+    status, message = _status(problem, best, optima, outcomes, effective_share, trend, refitted=refitted)
     noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
     inner, everything = inner.widened(judged.widening), everything.widened(judged.widening)
     estimates = estimates_of(problem, best.theta, blocks, inner, everything)
-    estimates = _with_rivals(problem, estimates, [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT])
+    estimates = _with_rivals(
+        problem, estimates, [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
+    )
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     in_time = blocks if problem.band is None else problem.blocks(best.theta, derivatives=False, in_time=True)
     return problem, FitResult(
@@ -199,40 +201,40 @@ def _status(
     best: LocalMinimum,
     optima: Sequence[LocalMinimum],
     outcomes: Sequence[StartOutcome],
-    worth: float,
+    effective_share: float,
     trend: Trend | None,
     *,
-    again: bool,
+    refitted: bool,
 ) -> tuple[Status, str]:
     """Return the status of the whole fit and its reason, worst first.
 
-    again: whether the optimum was found once more in other weights than the runs had. trend: where the cost is nonsmooth.
+    refitted: whether the optimum was found once more in other weights than the runs had. trend: where the cost is nonsmooth.
     """
     jump = 0.0 if trend is None else LUCK * trend.roughness
-    lower = [o for o in outcomes if o.cost is not None and (best.cost - jump - o.cost) * worth > DISTINCT]
+    lower = [o for o in outcomes if o.cost is not None and (best.cost - jump - o.cost) * effective_share > DISTINCT]
     if trend is not None:
-        lower = [o for o in lower if not trend.holds(_end(problem, o), DISTINCT / worth)]
+        lower = [o for o in lower if not trend.holds(_end(problem, o), DISTINCT / effective_share)]
     if lower:
         return "not-converged", f"a run had reached a lower cost: {lower[0].message}"
     if trend is not None and not trend.settled:
         return "not-converged", f"the trend of the cost has no optimum near the best run's end: {trend.text}"
-    arrived = _arrived(problem, best, outcomes, worth, jump)
-    if not again and trend is None and all(o.status == "flat" for o in arrived):
+    arrived = _arrived(problem, best, outcomes, effective_share, jump)
+    if not refitted and trend is None and all(o.status == "flat" for o in arrived):
         return "not-converged", f"the start with the lowest cost did not move: {arrived[0].message}"
-    if again and trend is None and promised(problem, best.theta) > SETTLED:
+    if refitted and trend is None and promised(problem, best.theta) > SETTLED:
         return "not-converged", (
             "the cost still falls where the best run used up its evaluations: bounds, a nearer start or more of [fit] starts help"
         )
-    if not again and trend is None and not _is_optimum(problem, best, arrived):
+    if not refitted and trend is None and not _is_optimum(problem, best, arrived):
         return "not-converged", f"the best run did not reach an optimum: {arrived[0].message}"
-    near = [o for o in optima[1:] if (o.cost - best.cost) * worth < DISTINCT]
+    near = [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
     if near:
         theta = ", ".join(f"{n} = {v:.6g}" for n, v in zip(problem.names, near[0].theta, strict=True))
         return "two-optima", f"another optimum is as good (cost higher by {near[0].cost - best.cost:.3g}): {theta}"
     at_bound = [f.name for f, v in zip(problem.unknowns, best.theta, strict=True) if not f.min < v < f.max]
     if at_bound:
         return "at-bound", f"on a bound: {', '.join(at_bound)}"
-    if again:
+    if refitted:
         count = sum(o.status == "converged" for o in outcomes)
         return "converged", f"{count} of {len(outcomes)} runs converged, and the best again in the final weights"
     flat = sum(o.status == "flat" for o in outcomes)
@@ -241,14 +243,14 @@ def _status(
 
 
 def _arrived(
-    problem: Problem, best: LocalMinimum, outcomes: Sequence[StartOutcome], worth: float, jump: float
+    problem: Problem, best: LocalMinimum, outcomes: Sequence[StartOutcome], effective_share: float, jump: float
 ) -> list[StartOutcome]:
     """Return the runs that reached the optimum, the best first.
 
     They reached its cost, to within what moves no estimate by half its spread, or its place, to a thousandth of the ranges,
     for a cost may scatter by the simulation's own error. jump: that scatter, where it is known.
     """
-    slack = max(1e-6 * best.cost, SAME / worth) + jump
+    slack = max(1e-6 * best.cost, SAME / effective_share) + jump
     reached = [
         (o.cost, o)
         for o in outcomes

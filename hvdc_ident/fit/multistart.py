@@ -151,27 +151,27 @@ def best_first(ends: Sequence[LocalMinimum]) -> list[LocalMinimum]:
     return ordered
 
 
-def distinct(problem: Problem, ends: Sequence[LocalMinimum], worth: float = 1.0) -> list[LocalMinimum]:
+def distinct(problem: Problem, ends: Sequence[LocalMinimum], effective_share: float = 1.0) -> list[LocalMinimum]:
     """Return the best end of each basin, best first.
 
     Two ends are one optimum where no coordinate differs by a thousandth of its range, or where the cost between them on the
-    straight line (in scaled coordinates) never rises by DISTINCT above the worse one. worth: independent samples per sample.
+    straight line (in scaled coordinates) never rises by DISTINCT above the worse one. effective_share: independent samples per sample.
     """
     kept: list[LocalMinimum] = []
     for end in sorted(ends, key=lambda o: o.cost):
-        if not any(_one_basin(problem, end, other, worth) for other in kept):
+        if not any(_one_basin(problem, end, other, effective_share) for other in kept):
             kept.append(end)
     return kept
 
 
-def _one_basin(problem: Problem, a: LocalMinimum, b: LocalMinimum, worth: float) -> bool:
+def _one_basin(problem: Problem, a: LocalMinimum, b: LocalMinimum, effective_share: float) -> bool:
     space = problem.coordinates
     x, y = space.scaled(a.theta), space.scaled(b.theta)
     if (np.abs(x - y) <= 1e-3 * space.ranges).all():
         return True
-    if (max(a.cost, b.cost) - min(a.cost, b.cost)) * worth >= DISTINCT:
+    if (max(a.cost, b.cost) - min(a.cost, b.cost)) * effective_share >= DISTINCT:
         return False
-    barrier = max(a.cost, b.cost) + DISTINCT / worth
+    barrier = max(a.cost, b.cost) + DISTINCT / effective_share
     try:
         return all(problem.cost(space.unscaled(x + s * (y - x))) < barrier for s in np.linspace(0.0, 1.0, 9)[1:-1])
     except SimulationError:

@@ -122,10 +122,10 @@ def threshold_of(problem: Problem, r: Array) -> float:
     return TWO_SIDED * max(1.0, float(r @ r) / max(r.size - len(problem.names), 1))
 
 
-def trend_of(problem: Problem, theta: Array, rough: float | None = None) -> Trend | None:
+def trend_of(problem: Problem, theta: Array, known_roughness: float | None = None) -> Trend | None:
     """Return the optimum of the trend near theta, (p,); None where the cost is smooth enough, or a run fails.
 
-    rough: the `roughness` there, where it is known.
+    known_roughness: the `roughness` at theta, where it is known.
 
     At places about the optimum, along each unknown, the Gauss-Newton step is taken with one and the same matrix of
     derivatives J. Its end, q, is regressed on the place: the intercept is the optimum, and the slope B is the error of J
@@ -133,7 +133,7 @@ def trend_of(problem: Problem, theta: Array, rough: float | None = None) -> Tren
     depend on the residuals, so it serves as an instrument: the covariance is G (J'J)^-1 G' with G = (1 - B)^-1.
     The places are spread until B is known to `FINE`, and moved until the optimum lies among them.
     """
-    rough = roughness(problem, theta) if rough is None else rough
+    rough = roughness(problem, theta) if known_roughness is None else known_roughness
     if rough == 0.0 or rough <= SLIGHT * threshold_of(problem, residual_at(problem, theta)):
         return None
     space = problem.coordinates

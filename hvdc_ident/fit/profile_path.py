@@ -153,9 +153,9 @@ class ProfilePath:
                 basin = yield DescentStep(point.theta, np.zeros_like(self.fixed), self._enough)
                 self._accept(basin)
             per_step = (root - z) / abs(ahead - x)
-            wish = 1.02 * (goal - root) / per_step if per_step > 0 else np.inf
+            desired = 1.02 * (goal - root) / per_step if per_step > 0 else np.inf
             growth = 4.0 if root < 0.1 * goal else 1.0 if root < z else 2.0  # downhill again: there may be a well
-            step = float(np.clip(wish, 0.3 * step, growth * step))
+            step = float(np.clip(desired, 0.3 * step, growth * step))
             x, current, z = ahead, point, root
         return self._ended("not-found", f"no crossing found up to {self._value(x):.4g}")
 

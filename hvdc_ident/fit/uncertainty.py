@@ -163,11 +163,11 @@ def uncertainty(
     )
 
 
-def _inverse(normalised: Array, seen: Array) -> tuple[Array, Array]:
+def _inverse(normalised: Array, observable: Array) -> tuple[Array, Array]:
     """Return the inverse of J'J, (p, p), over the directions that are determined, and a sparse basis (k, p) of the others."""
-    p = seen.size
+    p = observable.size
     inverse, null = np.zeros((p, p)), np.zeros((0, p))
-    columns = np.flatnonzero(seen)
+    columns = np.flatnonzero(observable)
     if columns.size:
         _, s, vt = np.linalg.svd(np.linalg.qr(normalised[:, columns], mode="r"), full_matrices=True)
         s = np.concatenate([s, np.zeros(columns.size - s.size)])

@@ -109,8 +109,8 @@ class _Run:
                     damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
                     damping = max(damping, 1e-14)
                     reach *= 2.0 if ratio > 0.5 else 1.0
-                    worth = self.options.reduction * (1e-3 if abs(ratio - 1.0) < AS_PROMISED else 1.0)
-                    if max(before - self.cost, predicted) <= worth * before:
+                    smallest = self.options.reduction * (1e-3 if abs(ratio - 1.0) < AS_PROMISED else 1.0)
+                    if max(before - self.cost, predicted) <= smallest * before:
                         return "converged", "the cost does not fall any more"
                     continue
                 if not self.failure and predicted <= self.options.reduction * before:
