@@ -11,7 +11,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -112,11 +112,13 @@ def digest(content: bytes) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON can hold it: mappings, lists, text, numbers; a number that is not finite becomes None."""
+    """Return the value as JSON can hold it: mappings, lists, text, numbers; a number that is not finite becomes None."""
     if value is None or isinstance(value, str | bool | Rows):
         return value
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):

@@ -17,12 +17,12 @@ else:
         __name__,
         {
             "estimate": "fit",
+            "fit_parameter": "FitParameter",
             "optimiser": "Optimiser OptimiserResult",
             "partial_fits": "Group fit_each fit_individually",
             "problem": "Problem",
             "result": "Estimate FitResult StartOutcome",
             "simulator": "SimulationRun Simulator",
-            "fit_parameter": "FitParameter",
         },
     )
 

@@ -79,7 +79,7 @@ Steps = Generator[DescentStep, DescentResult, T]
 
 
 class BetterFoundError(Exception):
-    """A point on the profile of `name` lies below the optimum. theta: (p,); fall: of the cost."""
+    """A point on the profile of `name` lies below the optimum. theta: (p,); fall: of the cost below the optimum's."""
 
     def __init__(self, name: str, theta: Array, fall: float) -> None:
         super().__init__(name)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
-
-import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
+from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.immutable import FrozenMap
 
@@ -53,7 +52,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class StartOutcome:
-    """Where one start of the multistart ended; values by unknown, cost in final weights, None where inadmissible."""
+    """End of one run of the multistart: values by unknown, cost in final weights, None where inadmissible."""
 
     start: FrozenMap[float]
     end: FrozenMap[float]
@@ -212,21 +211,6 @@ def _ends(e: Estimate) -> str:
     width = high - low
     figures = 6 if width <= 0 else min(15, max(4, math.ceil(math.log10(max(abs(low), abs(high)) / width)) + 2))
     return f"{low:.{figures}g} to {high:.{figures}g}"
-
-
-def plain(value: Any) -> Any:
-    """Return the value in dicts, lists, strings and finite numbers; None for infinity and for what is not a number."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _key(name: str) -> str:

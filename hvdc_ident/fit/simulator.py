@@ -49,7 +49,7 @@ class Simulator(Protocol):
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
     ) -> SimulationRun:
-        """A run of the experiment; parameters not in `values` keep their own.
+        """Return a run of the experiment; parameters not in `values` keep their own.
 
         Raises SimulationError where it fails, SteadyStateError where it cannot begin.
         """

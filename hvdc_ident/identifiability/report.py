@@ -11,9 +11,9 @@ import numpy as np
 
 from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
+from hvdc_ident.files import plain
 from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import PairProfile, Profile
-from hvdc_ident.fit.result import plain
 from hvdc_ident.identifiability.combinations import Combination
 from hvdc_ident.identifiability.heterogeneity import Heterogeneity, Misspecification
 from hvdc_ident.identifiability.optima import OtherOptimum

@@ -10,7 +10,7 @@ from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SteadyStateError
-from hvdc_ident.fit.result import plain
+from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.signatures.candidates import kind_of, source_signals
 from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.trials.formula import Law, filled, labelled
 from hvdc_ident.effects import effects
-from hvdc_ident.fit.result import plain
+from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import listed
 
