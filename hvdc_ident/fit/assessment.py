@@ -76,7 +76,7 @@ def in_final_weights(problem: Problem, result: FitResult) -> Problem:
     """Return the problem with the standard deviations and the noise model that its fit ended with."""
     return replace(
         problem,
-        weights=problem.weights | _weights(result),
+        weights=problem.weights | deviations_from_misfit(result),
         rho=problem.rho | dict(result.whitening),
     )
 
@@ -96,7 +96,7 @@ def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[st
             rho=FrozenMap(),
             band=None,
             priors=FrozenMap(),
-            weights=FrozenMap(_weights(result)),
+            weights=FrozenMap(deviations_from_misfit(result)),
         )
         theta = alone.start
         known = len(alone.free)
@@ -111,7 +111,7 @@ def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[st
     return nuisances
 
 
-def _weights(result: FitResult) -> dict[str, float]:
+def deviations_from_misfit(result: FitResult) -> dict[str, float]:
     """Return the standard deviations that came from the misfit, by output."""
     return {
         o: next(s[o] for s in result.sigma.values() if o in s) for o, w in result.noise_source.items() if from_misfit(w)

@@ -27,7 +27,7 @@ from hvdc_ident.fit.multistart import (
 )
 from hvdc_ident.fit.noise_model import source_of, source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
-from hvdc_ident.fit.objective import promised
+from hvdc_ident.fit.objective import predicted_reduction
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
@@ -221,7 +221,7 @@ def _status(
     arrived = _arrived(problem, best, outcomes, effective_share, jump)
     if not refitted and trend is None and all(o.status == "flat" for o in arrived):
         return "not-converged", f"the start with the lowest cost did not move: {arrived[0].message}"
-    if refitted and trend is None and promised(problem, best.theta) > SETTLED:
+    if refitted and trend is None and predicted_reduction(problem, best.theta) > SETTLED:
         return "not-converged", (
             "the cost still falls where the best run used up its evaluations: bounds, a nearer start or more of [fit] starts help"
         )
@@ -277,7 +277,7 @@ def _is_optimum(problem: Problem, best: LocalMinimum, arrived: Sequence[StartOut
 
     Runs that ended at one point from different starts have found what there is to be found, whatever stopped them.
     """
-    if any(o.status == "converged" for o in arrived) or promised(problem, best.theta) <= SETTLED:
+    if any(o.status == "converged" for o in arrived) or predicted_reduction(problem, best.theta) <= SETTLED:
         return True
     return sum(o.status == "stalled" and _same_place(problem, best, o) for o in arrived) > 1
 

@@ -65,11 +65,6 @@ class Loss:
 HUBER, SOFT, CAUCHY = 1.345, 1.287, 2.385
 
 
-def _huber_rho(r: Array) -> Array:
-    a = np.abs(r)
-    return np.where(a <= HUBER, 0.5 * r**2, HUBER * (a - 0.5 * HUBER))
-
-
 LOSSES = {
     loss.name: loss
     for loss in (
@@ -77,7 +72,7 @@ LOSSES = {
         Loss(
             "huber",
             f"the square up to {HUBER:g} sigma, then a line",
-            _huber_rho,
+            lambda r: np.where(np.abs(r) <= HUBER, 0.5 * r**2, HUBER * (np.abs(r) - 0.5 * HUBER)),
             lambda r: np.clip(r, -HUBER, HUBER),
             lambda r: (np.abs(r) <= HUBER).astype(float),
         ),

@@ -112,7 +112,7 @@ def descend(
     return DescentResult(theta, current, used)
 
 
-def promised(problem: Problem, theta: Array) -> float:
+def predicted_reduction(problem: Problem, theta: Array) -> float:
     """Return the fall of the cost that a Gauss-Newton step within the bounds promises. Raises SimulationError."""
     space = problem.coordinates
     r, jacobian = problem.residual(theta)

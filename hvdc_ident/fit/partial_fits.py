@@ -13,19 +13,20 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
-from hvdc_ident.data import Array, Experiment
+from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
-from hvdc_ident.fit.assessment import assessed
+from hvdc_ident.fit.assessment import assessed, deviations_from_misfit
 from hvdc_ident.fit.estimate import fit
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import from_misfit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import Covariance, FitResult, Status
+from hvdc_ident.fit.simulator import unknown_of
 from hvdc_ident.immutable import FrozenMap
 
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
@@ -118,22 +119,22 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     """Return the groups' results as one, judged on the whole problem."""
     status: Status = min((r.status for r in results), key=_WORST.index)
     message = "; ".join(f"group {i + 1}: {r.status}, {r.message}" for i, r in enumerate(results))
-    weights: dict[str, float] = {}
     nuisance: FrozenMap = FrozenMap()
     for r in results:
         nuisance = nuisance | r.nuisance
-        for output, source in r.noise_source.items():
-            if from_misfit(source):
-                weights[output] = next(s[output] for s in r.sigma.values() if output in s)
+    weights = {o: w for r in results for o, w in deviations_from_misfit(r).items()}
     models = {o: m for r in results for o, m in r.whitening.items()}
     whole = replace(
         problem,
         weights=problem.weights | weights,
         rho=problem.rho | models,
-        experiments=tuple(_with_known(e, nuisance) for e in problem.experiments),
+        experiments=tuple(
+            e if e.role != "fit" else e.with_(nuisance=tuple(n for n in e.nuisance if n in nuisance.get(e.name, {})))
+            for e in problem.experiments
+        ),
     )
-    shift = {f"{e}:{n}": v.value for e, group in nuisance.items() for n, v in group.items()}
-    theta = np.array([current.get(u.name, shift.get(u.name, u.start)) for u in whole.unknowns])
+    estimated = current | {unknown_of(e, n): v.value for e, own in nuisance.items() for n, v in own.items()}
+    theta = np.array([estimated.get(u.name, u.start) for u in whole.unknowns])
     result = FitResult(
         status=status,
         message=message,
@@ -156,7 +157,7 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
         loss=problem.loss.name,
         whitening=models,
         dof=min((r.dof for r in results if r.dof is not None), default=None),
-        covariance=_together(results),
+        covariance=_joint(results),
     )
     try:
         cost = whole.cost(theta)
@@ -172,26 +173,13 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     return assessed(whole, result)
 
 
-def _with_known(experiment: Experiment, nuisance: Mapping[str, Mapping[str, object]]) -> Experiment:
-    """Return the experiment without nuisances that no group's fit has estimated."""
-    known = nuisance.get(experiment.name, {})
-    if experiment.role != "fit":
-        return experiment
-    return experiment.with_(nuisance=tuple(n for n in experiment.nuisance if n in known))
-
-
-def _together(results: Sequence[FitResult]) -> Covariance | None:
-    """Return the covariances side by side: groups fitted one after the other are taken as independent."""
+def _joint(results: Sequence[FitResult]) -> Covariance | None:
+    """Return the covariances as one: groups fitted one after the other are taken as independent."""
     parts = [r.covariance for r in results if r.covariance is not None]
     names = tuple(n for c in parts for n in c.names)
     if not parts or len(set(names)) < len(names):
         return None  # a nuisance that two groups estimated
-    matrix = np.zeros((len(names), len(names)))
-    place = 0
-    for c in parts:
-        matrix[place : place + len(c.names), place : place + len(c.names)] = c.matrix
-        place += len(c.names)
-    return Covariance(names, matrix, min(c.dof for c in parts))
+    return Covariance(names, block_diag(*(c.matrix for c in parts)), min(c.dof for c in parts))
 
 
 def fit_each(

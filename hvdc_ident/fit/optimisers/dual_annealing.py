@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.objective import promised
+from hvdc_ident.fit.objective import predicted_reduction
 from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun, generator
 from hvdc_ident.fit.problem import Problem
 
@@ -60,7 +60,7 @@ class DualAnnealing:
             return run.spent()
         if run.cost is None:
             return run.ended(False, "")
-        promise = promised(problem, run.best)
+        promise = predicted_reduction(problem, run.best)
         good = promise <= self.stationary * run.cost + 1e-9
         remark = (
             "the best point is an optimum" if good else f"the best point is no optimum: {promise:.3g} is still to gain"
