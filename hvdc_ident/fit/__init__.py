@@ -1,4 +1,8 @@
-"""Estimation of parameters from experiments: a fit over the set it is given, for anything that can be simulated."""
+"""Estimation of parameters from experiments, for anything that can be simulated.
+
+`fit` solves a `Problem`: the parameters to estimate, the experiments, the noise. `fit_each` and `fit_individually` fit parts
+of it. Profile likelihoods, bootstraps and uncertainties are in modules of their own.
+"""
 
 from typing import TYPE_CHECKING
 

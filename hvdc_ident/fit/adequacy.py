@@ -1,10 +1,9 @@
 """Model checks on a fit's residuals: their size beside that of the noise, and whether they are white.
 
-The mean squared residual per degree of freedom (chi2/dof) is 1 where a right model meets the noise that was stated. It is
-judged twice: it has to differ from 1 by more than chance allows (the F quantile, of the independent samples in the residual
-and of those behind an estimated noise), and by enough to matter. It matters from 2 on: more than half of the residual's
-power is then not noise, and intervals that rest on the noise alone cover less than that half. Below 1/2 they are too wide in
-the same proportion.
+The mean squared residual per degree of freedom (chi2/dof) is 1 where a right model meets the stated noise. A verdict needs it
+to differ from 1 by more than chance allows (the F quantile, of the independent samples in the residual and of those behind an
+estimated noise), and by enough to matter: from 2 on more than half of the residual's power is not noise, and intervals that
+rest on the noise alone cover less than that half. Below 1/2 they are too wide in the same proportion.
 """
 
 from __future__ import annotations

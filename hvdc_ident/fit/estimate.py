@@ -1,4 +1,8 @@
-"""The verb `fit`: a multistart of least squares, and what the optimum says about the parameters."""
+"""The verb `fit`: a multistart of least squares, and the result at its best optimum.
+
+The search itself is in `multistart`. Here its optima become a status, estimates with intervals, tests of the residuals and
+the table of starts.
+"""
 
 from __future__ import annotations
 

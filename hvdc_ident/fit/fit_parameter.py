@@ -1,4 +1,7 @@
-"""A quantity to be estimated: its starting value, its bounds and its scaling."""
+"""A quantity to be estimated: its starting value, its bounds and its scaling.
+
+`Coordinates` scales several of them: optimisers and profiles move in coordinates of order 1.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Measured frequency responses beside waveforms: experiments in the frequency domain, answered by the linear model."""
+"""Measured frequency responses beside recordings: experiments in the frequency domain, answered by the linear model.
+
+The real and the imaginary part of each channel are outputs like any other; `WithResponses` is the simulator that gives them.
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,7 @@
 """The likelihood of a residual: least squares, robust losses, quantised noise, and priors beside the data.
 
-A robust loss is put as least squares of a changed residual s(r) with s^2/2 = the loss, so that every optimiser, profile
-and bootstrap sees it without knowing. Tuning constants are those of 95 % efficiency in white normal noise.
-
-A record rounded to steps D gives a value z away from the model's from anywhere within half a step of it, so with white
-noise of standard deviation s below D its likelihood is P(z) = Phi((z + D/2)/s) - Phi((z - D/2)/s). Taken for white noise
-of D/sqrt(12) instead, a steady stretch, where the rounding error is the same in every row, would reward whatever moves the
-model by that error. As a residual: g(z) = sign(z) sqrt(-2 log(P(z)/P(0))), whose squares add up to the deviance.
+Each is put as least squares of a changed residual s(r) with s^2/2 = the loss, so that every optimiser, profile and bootstrap
+serves all. Tuning constants of the losses are those of 95 % efficiency in white normal noise.
 """
 
 from __future__ import annotations
@@ -200,7 +195,13 @@ def quantised_residuals(misfit, step, noise):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class QuantisedNoise:
-    """White noise of standard deviation `noise`, its values rounded to multiples of `step`; both in the output's unit."""
+    """White noise of standard deviation `noise`, its values rounded to multiples of `step`; both in the output's unit.
+
+    A value z away from the model's was rounded from anywhere within half a step D of it, so its likelihood is
+    P(z) = Phi((z + D/2)/s) - Phi((z - D/2)/s) with s the noise. Taken for white noise of D/sqrt(12) instead, a steady
+    stretch, where the rounding error is the same in every row, would reward whatever moves the model by that error. As a
+    residual: g(z) = sign(z) sqrt(-2 log(P(z)/P(0))), whose squares add up to the deviance.
+    """
 
     step: float
     noise: float

@@ -1,11 +1,9 @@
 """Optima of a nonsmooth cost: that of its trend over the width of the interval, not the lowest of many local minima.
 
-Events that pass rows, and adaptive steps of a solver that takes others at each parameter value, make the residuals jump from
-one value to the next. The cost is then a sawtooth on a parabola: its lowest minimum lies anywhere within sqrt(2 roughness)
-standard deviations, and a profile stops at the next local minimum instead of the crossing. The roughness is estimated by
-fourth differences
-(J. J. More and S. M. Wild, SIAM J. Sci. Comput. 33 (2011) 1292), over steps as wide as the interval. Where it is not small
-against the threshold, the optimum is where the trend of the residuals, regressed over that width, has no gradient left.
+Events that pass rows, and adaptive steps of a solver, make the residuals jump from one parameter value to the next. The cost
+is then a sawtooth on a parabola: its lowest minimum lies anywhere within sqrt(2 roughness) standard deviations. The roughness
+is estimated by fourth differences (More and Wild, SIAM J. Sci. Comput. 33 (2011) 1292) over steps as wide as the interval.
+Where it is not small against the threshold, the optimum is that of the trend of the residuals, regressed over that width.
 """
 
 from __future__ import annotations

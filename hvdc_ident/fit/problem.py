@@ -1,4 +1,7 @@
-"""A fit put as a least-squares problem: unknowns, experiments, and the residuals of all experiments."""
+"""A fit put as a least-squares problem: its unknowns, its experiments, and the residuals of all of them.
+
+A `Problem` is a value: it says what is estimated from what, and evaluates residuals, their derivatives and the cost.
+"""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
 """The residuals of one experiment with their derivatives: weighted, and if asked whitened or turned into a spectrum.
 
-Where a record does not begin at rest, what the states' unknown starts can make good is taken out of the residuals. What
-moves a system by itself, a periodic disturbance say, has moved it before the record's first row too; the steady start of a
-run is then one of many, and the difference dies out like any other answer to the states' start. The best start for given
-parameters is found by a step from the steady one; about it the starts are eliminated: variable projection (Golub and
-Pereyra 1973) with the jacobian of Kaufman (1975), whose gradient is exact because it is taken at the best start.
+Where a record does not begin at rest, the part that unknown initial states can make good is taken out of the residuals by
+variable projection (Golub and Pereyra 1973) with the jacobian of Kaufman (1975): the best start is found by a step from the
+steady one, and about it the starts are eliminated. The gradient is exact because it is taken at the best start.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Results of a fit and their forms: the screen, the JSON of a stage and the values to paste into a study."""
+"""Results of a fit and their forms.
+
+A `FitResult` prints as one screen, and gives the JSON of the stage, a data frame, a figure and the values to paste into a study.
+"""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
 """Simulators as a fit needs them: parameters with bounds, runs with sensitivities, and nuisances of single experiments.
 
-A nuisance is unknown about one experiment alone and estimated with it. It stands by name in `Experiment.nuisance` and has
-one unknown an experiment (`unknowns`):
-- "time-shift": the recorder's clock is late by so many s;
-- an input (or a driven slot): a constant is added to it all along, the steady start included;
-- a state: it begins at an unknown value and not at rest, as that of a block driven by recordings does;
-- a parameter: it has a value of its own in this experiment.
+A nuisance is unknown about one experiment alone and estimated with it (`unknowns`). It stands by name in
+`Experiment.nuisance`: a clock offset, an offset of an input, a start of a state, a parameter with a value of its own.
 """
 
 from __future__ import annotations
@@ -121,9 +117,11 @@ def unknown_of(experiment: str, nuisance: str) -> str:
 def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[FitParameter, ...]:
     """Return the unknowns of the experiment alone, in the order it names them.
 
-    A time shift starts at 0 s and may reach 2 % of the record, or two rows. An offset starts at 0, a state's start at
-    the model's guess, without bounds. A parameter has the start and the bounds of the experiment's `search`, else the
-    simulator's.
+    - "time-shift": the recorder's clock is late by so many s. It starts at 0 and may reach 2 % of the record, or two rows.
+    - an input (or a driven slot): a constant is added to it all along, the steady start included. It starts at 0.
+    - a state: it begins at an unknown value and not at rest. It starts at the model's guess, without bounds.
+    - a parameter: it has a value of its own in this experiment, with the start and the bounds of the experiment's `search`,
+      else the simulator's.
     Raises StudyError for a nuisance that is not known here.
     """
     return tuple(_nuisance_parameter(simulator, experiment, name) for name in experiment.nuisance)

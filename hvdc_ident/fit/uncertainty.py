@@ -1,4 +1,8 @@
-"""Uncertainty of an optimum: covariance, its inflation by autocorrelated residuals, undetermined directions, intervals."""
+"""Uncertainty of an optimum from the curvature of the cost.
+
+Covariance, its inflation by autocorrelated residuals, directions that are not determined, and the estimates with their
+intervals.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ if TYPE_CHECKING:
 TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
 ONE_SIDED = 1.353
-"""The same for the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+"""Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
 WIDER = 2.0
 """From this ratio of an interval to that of independent residuals on, the difference is said in words."""
 SINGULAR = 1e-7
