@@ -143,19 +143,19 @@ def trend_of(problem: Problem, theta: Array, known_roughness: float | None = Non
     for n in range(ROUNDS):
         try:
             centre = space.unscaled(x)
-            whitened = _Whitened.of(problem, x, inside, problem.residual(centre)[1] * space.slope(centre))
-            if whitened is None:
+            local = _StandardCoordinates.of(problem, x, inside, problem.residual(centre)[1] * space.slope(centre))
+            if local is None:
                 return trend
-            lines = _regressed(whitened, reach)
+            regression = _regressed(local, reach)
         except SimulationError:
             return trend
-        rough = max(rough, lines.rough) if n == 0 else rough
-        error = float(lines.error.max())
-        gain = np.linalg.pinv(np.eye(inside.size) - lines.slope)
-        ahead = gain @ lines.intercept
-        x = np.clip(whitened.place(np.clip(ahead, -reach, reach)), low, high)
+        rough = max(rough, regression.rough) if n == 0 else rough
+        error = float(regression.error.max())
+        gain = np.linalg.pinv(np.eye(inside.size) - regression.slope)
+        ahead = gain @ regression.intercept
+        x = np.clip(local.place(np.clip(ahead, -reach, reach)), low, high)
         settled = bool((np.abs(ahead) <= reach).all())
-        trend = whitened.trend(x, gain * np.sqrt(1.0 + error**2), gain @ lines.scatter @ gain.T, rough, settled)
+        trend = local.trend(x, gain * np.sqrt(1.0 + error**2), gain @ regression.scatter @ gain.T, rough, settled)
         if error > FINE:
             reach = reach * min(max(error / FINE, 2.0), SPREAD)
         elif settled:
@@ -164,20 +164,21 @@ def trend_of(problem: Problem, theta: Array, known_roughness: float | None = Non
 
 
 @dataclass(frozen=True, eq=False)
-class _Whitened:
+class _StandardCoordinates:
     """Coordinates about x in which the estimates have the covariance 1 by the derivatives there.
 
-    inside: the k unknowns that move. axes: (k, k) a step in scaled coordinates for each. left: (N, k) orthonormal.
+    inside: the k unknowns that move. axes: (k, k) a step in scaled coordinates for each.
+    basis: (N, k) orthonormal, of the residuals' tangent space.
     """
 
     problem: Problem
     x: Array
     inside: NDArray[np.intp]
     axes: Array
-    left: Array
+    basis: Array
 
     @classmethod
-    def of(cls, problem: Problem, x: Array, inside: NDArray[np.intp], columns: Array) -> _Whitened | None:
+    def of(cls, problem: Problem, x: Array, inside: NDArray[np.intp], columns: Array) -> _StandardCoordinates | None:
         """Return the coordinates by (N, p) derivatives; None where they leave a direction undetermined."""
         length = np.linalg.norm(columns[:, inside], axis=0)
         if not inside.size or not (length > 0).all():
@@ -196,7 +197,7 @@ class _Whitened:
     def step_end(self, z: Array) -> Array:
         """Return the end of a Gauss-Newton step from z with the derivatives of the centre, and the cost: (k + 1,)."""
         r = residual_at(self.problem, self.problem.coordinates.unscaled(self.place(z)))
-        return np.append(z - self.left.T @ r, 0.5 * float(r @ r))
+        return np.append(z - self.basis.T @ r, 0.5 * float(r @ r))
 
     def room(self, j: int) -> tuple[float, float]:
         """Return the distances to the bounds along the j-th coordinate, down and up."""
@@ -221,7 +222,7 @@ class _Whitened:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lines:
+class _StepRegression:
     """Regression of the ends of steps on their starts.
 
     intercept: (k,). slope: (k, k); error: its standard error. scatter: covariance of the intercept, so large that 1.96
@@ -235,7 +236,7 @@ class _Lines:
     rough: float
 
 
-def _regressed(at: _Whitened, reach: Array) -> _Lines:
+def _regressed(at: _StandardCoordinates, reach: Array) -> _StepRegression:
     """Return the regression from places along each coordinate as far as its reach, (k,)."""
     k = reach.size
     rows, ends = [np.zeros(2 * k)], [at.step_end(np.zeros(k))]
@@ -254,7 +255,7 @@ def _regressed(at: _Whitened, reach: Array) -> _Lines:
     *_, rough = np.sqrt(np.sum(remainder**2, axis=0) / dof)
     coefficients, remainder = coefficients[:, :k], remainder[:, :k]
     noise = remainder.T @ remainder / dof
-    return _Lines(
+    return _StepRegression(
         coefficients[0],
         coefficients[1::2].T / reach,
         np.sqrt(np.outer(np.diag(noise), np.diag(known)[1::2])) / reach,

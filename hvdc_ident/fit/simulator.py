@@ -118,7 +118,7 @@ def unknowns(simulator: Simulator, experiment: Experiment) -> tuple[FitParameter
     """Return the unknowns of the experiment alone, in the order it names them.
 
     - "time-shift": the recorder's clock is late by so many s. It starts at 0 and may reach 2 % of the record, or two rows.
-    - an input (or a driven slot): a constant is added to it all along, the steady start included. It starts at 0.
+    - an input (or a driven insertion point): a constant is added to it all along, the steady start included. It starts at 0.
     - a state: it begins at an unknown value and not at rest. It starts at the model's guess, without bounds.
     - a parameter: it has a value of its own in this experiment, with the start and the bounds of the experiment's `search`,
       else the simulator's.
