@@ -4,7 +4,7 @@
 
 The link, 8 gains as parameters, 1.5 s, three steps, 3001 points. "stiff": the link as it is (index-1 DAE, a mode near
 -41 000 1/s). "smooth": lags on all currents, measurements and the dc line, no fast mode. Times are CPU time, the minimum
-of several runs; only ratios of one run mean anything on a shared machine.
+of several runs; compare only ratios within one run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CASE = experiment("steps", np.linspace(0.0, 1.5, 3001), {n: InputSignal.step(*s)
 
 
 def best(function, repeat=15, warm=2):
-    """The shortest of several runs, s."""
+    """Return the shortest of several runs, s."""
     for _ in range(warm):
         function()
     return min(_timed(function) for _ in range(repeat))
@@ -51,7 +51,7 @@ def _many(address, y, w, p, m, out, count):
 
 
 def cost(code, name):
-    """Seconds of one call of a generated function."""
+    """Return the time of one call of a generated function, s."""
     s = code.structure.sizes
     address = code._address[NAMES.index(name)]
     p = np.array(list(code.structure.model.values.values()))
@@ -64,7 +64,7 @@ def cost(code, name):
 
 
 def floor(model, sensitivities, statistics):
-    """Two floors, s: accepted steps x right-hand sides (and Jacobians), and the same with the method's generated solves.
+    """Return two floors, s: accepted steps x right-hand sides (and Jacobians), and the same with the method's generated solves.
 
     A generated solve is the stage's whole linear system: sums, second derivatives and substitution.
     """
@@ -78,13 +78,13 @@ def floor(model, sensitivities, statistics):
 
 
 def smooth(link):
-    """The link with lags that take the fast modes out: 16 states, no unknowns."""
+    """Return the link with lags that remove the fast modes: 16 states, no algebraic unknowns."""
     lags = [(["Ir1", "Ii1", "Ir2", "Ii2"], 1.6e-3), (["Vdc1_m", "P2_m", "Q1_m", "Q2_m"], 1.5e-3), (["Idc"], 3e-3)]
     return apply_effects(link, [{"effect": "lag", "at": at, "parameters": {"T": T}} for at, T in lags])
 
 
 def casadi_run(model, sensitivities, rtol):
-    """A function that runs CasADi's cvodes or idas on the same equations from the same start, and its last output."""
+    """Return a function that runs CasADi's cvodes or idas on the same equations from the same start, and its last output."""
     import casadi as ca
 
     code = engine_of(model, ())
@@ -182,7 +182,7 @@ def _casadi(e, values, rules):
 
 
 def fresh_structure(slot):
-    """Seconds (CPU, wall) from a model definition nobody compiled yet to its first trajectory with sensitivities."""
+    """Return CPU and wall time, s, from the definition of a new structure to its first trajectory with sensitivities."""
     link = load_model("vsc-hvdc-link")
     kept = os.environ.get("NUMBA_CACHE_DIR")
     with tempfile.TemporaryDirectory() as empty:
@@ -217,7 +217,7 @@ HELP = "import sys; sys.argv = ['hvdc-ident', '--help']; from hvdc_ident.cli imp
 
 
 def fresh_process(*arguments):
-    """Seconds (CPU, wall) of a new process of Python from its start to its end."""
+    """Return CPU and wall time, s, of a new Python process from its start to its end."""
 
     def used():
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -229,7 +229,7 @@ def fresh_process(*arguments):
 
 
 def least(figures):
-    """The least CPU and the least wall time of several runs, as text."""
+    """Return the least CPU and the least wall time of several runs, as text."""
     cpu, wall = map(min, zip(*figures, strict=True))
     return f"{cpu:.2f} s CPU, {wall:.2f} s wall"
 
@@ -256,7 +256,7 @@ def main():
 
 
 def line(model, names, rtol, method, theirs):
-    """One run's time against its floors and the peer's time, as text."""
+    """Return one run's time against its floors and the peer's time, as text."""
     tolerance = Tolerance(rtol, rtol / 100)
 
     def run():
@@ -273,7 +273,7 @@ def line(model, names, rtol, method, theirs):
 
 
 def peer_time(model, names, rtol):
-    """CasADi's shortest time for the same run, s, after a check that it ends at the same place; None without CasADi."""
+    """Return CasADi's shortest time for the same run, s, after a check of its final state; None without CasADi."""
     try:
         peer = casadi_run(model, names, rtol)
     except ImportError:

@@ -1,14 +1,13 @@
-"""Side by side with other people's packages: the same model, data and machine, in one run; the figures are ratios.
+"""Comparison with other packages: the same model, data and machine, in one run; the figures are ratios.
 
-    python benchmarks/peers.py                     (needs the extra `bench`; puts its table into README.md of this folder)
+    python benchmarks/peers.py                     (needs the extra `bench`; writes its table into README.md of this folder)
     python benchmarks/peers.py --only simulation sensitivities linearisation fit profile     (prints)
 
-The smooth link (lags on currents, measurements and the dc line: 15 states, no fast mode), for every peer here can
-integrate it; the stiff link as it is, against CasADi, stands in engine.py. The peers get our compiled right-hand side and
-our start, so what is compared is the method and its way to work, not an interpreter; CasADi, libroadrunner and AMICI make
-their own machine code. Where a peer is handed something better than its users would write, the ratio is to its favour. A
-peer whose answer is not ours stops the run; one that is not installed is named and left out. Times are processor time,
-the least of several runs.
+The model is the smooth link (lags on currents, measurements and the dc line: 15 states, no fast mode), because every package
+can integrate it; engine.py compares the stiff link with CasADi. The packages get our compiled right-hand side and our initial
+state, so that the methods are compared and not an interpreter; CasADi, libroadrunner and AMICI generate their own machine
+code. Where a package gets better code than its users would write, the ratio is in its favour. A package with a different
+result stops the run; one that is not installed is named and left out. Times are processor time, the least of several runs.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ HEAD = "| what | peer | here, ms | there, ms | there / here | |\n|---|---|---|--
 
 
 def machine() -> str:
-    """The processor, its cores, how busy they are, and the system."""
+    """Return the processor, its cores, their load, and the system, as text."""
     names = [line.split(":", 1)[1].strip() for line in _text("/proc/cpuinfo") if line.startswith("model name")]
     load = ", ".join(f"{v:.1f}" for v in os.getloadavg()) if hasattr(os, "getloadavg") else "not known"
     return (
@@ -66,13 +65,13 @@ def _text(path: str) -> list[str]:
 
 
 def versions() -> str:
-    """The peers that are there, with their versions."""
+    """Return the installed packages with their versions, as text."""
     found = {d.metadata["Name"].lower(): d.version for d in metadata.distributions() if d.metadata["Name"]}
     return ", ".join(f"{name} {found[name]}" for name in PEERS if name in found)
 
 
 def pinned(readme: str, text: str) -> str:
-    """The readme with the text between its two marks. Raises ValueError where a mark is missing."""
+    """Return the README with the text between its two marks. Raises ValueError where a mark is missing."""
     begin, end = readme.index(BEGIN) + len(BEGIN), readme.index(END)
     return f"{readme[:begin]}\n{text}\n{readme[end:]}"
 

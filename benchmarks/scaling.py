@@ -5,7 +5,7 @@
 
 `sweep`: the phasor link, KPVDC and KIVDC on a grid, one experiment of 1.5 s, as `hvdc-ident sweep` does it, with a store
 in the folder. `states`: vsc-mtdc-N, three states a terminal. Every size has a process of its own, so that its memory is
-its own; times are processor time (the machine is shared), with the wall time beside. A size that takes over
+its own; times are processor time, with the wall time beside. A size that takes over
 `--limit` s of processor time ends the list.
 """
 

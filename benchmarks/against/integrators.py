@@ -1,4 +1,4 @@
-"""Other people's integrators, all called alike: solve(f, start, times) gives the states at the times, (n, states)."""
+"""Integrators of other packages behind one interface: solve(f, start, times) returns the states at the times, (n, states)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .plant import RTOL
 
 
 def installed(module: str, package: str = "") -> bool:
-    """Whether a peer is there; one that is not is named."""
+    """Return True if a package is installed; name one that is not."""
     if find_spec(module) is not None:
         return True
     print(f"{package or module} is not installed: left out")
@@ -21,7 +21,7 @@ def installed(module: str, package: str = "") -> bool:
 
 
 def scipy_way(method: str, rtol: float = RTOL) -> Callable[..., np.ndarray]:
-    """Scipy's integrator of that name."""
+    """Return scipy's integrator of that name."""
 
     def solve(f: Any, y: np.ndarray, times: np.ndarray) -> np.ndarray:
         done = solve_ivp(f, (times[0], times[-1]), y, method=method, t_eval=times, rtol=rtol, atol=rtol / 100)
@@ -32,7 +32,7 @@ def scipy_way(method: str, rtol: float = RTOL) -> Callable[..., np.ndarray]:
 
 
 def sundae_way(rtol: float = RTOL) -> Callable[..., np.ndarray]:
-    """CVODE by scikit-sundae."""
+    """Return CVODE of scikit-sundae."""
     from sksundae.cvode import CVODE
 
     def solve(f: Any, y: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ def sundae_way(rtol: float = RTOL) -> Callable[..., np.ndarray]:
 
 
 def ways(rtol: float = RTOL) -> Iterator[tuple[str, Callable[..., np.ndarray]]]:
-    """The integrators that are installed, by name."""
+    """Return the installed integrators by name."""
     for method in ("LSODA", "BDF", "Radau", "DOP853"):
         yield f"scipy {method}", scipy_way(method, rtol)
     if installed("sksundae", "scikit-sundae"):
