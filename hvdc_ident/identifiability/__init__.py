@@ -1,8 +1,7 @@
-"""What the data tell about the parameters, and the fit that obeys it."""
+"""Identifiability of parameters from given data, the next experiment to make, and the fit of the identifiable set alone."""
 
-from hvdc_ident.identifiability.assess import identifiability
+from hvdc_ident.identifiability.assess import identifiability, identifiability_by_group
 from hvdc_ident.identifiability.gate import Gate, gate, gated, gated_fit
-from hvdc_ident.identifiability.groups import identifiability_by_group
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.verdicts import Verdict
 

@@ -1,9 +1,10 @@
-"""The verb `identifiability`: structure, pilot fit, information and profiles, put together into verdicts."""
+"""The verb `identifiability`: structure, pilot fit, information and profiles, put together into verdicts; by groups too."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,24 +15,35 @@ from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.noise_model import unknown_noise
+from hvdc_ident.fit.partial_fits import Group, part_of
 from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.fit.simulator import inputs_of
-from hvdc_ident.identifiability import narrow, verdicts
-from hvdc_ident.identifiability.evidence import pair_of, thresholds, told_by_noise
-from hvdc_ident.identifiability.findings import Findings
-from hvdc_ident.identifiability.heterogeneity import Misspecification, heterogeneity, misspecification
-from hvdc_ident.identifiability.pilot import Optimum, pilot, unfitted
-from hvdc_ident.identifiability.recommend import Recommendation, recommend
+from hvdc_ident.identifiability.experiment_design import Recommendation, recommend
+from hvdc_ident.identifiability.likelihood_intervals import pair_of, thresholds
+from hvdc_ident.identifiability.misspecification import (
+    Misspecification,
+    heterogeneity,
+    misspecification,
+    noise_half_widths,
+)
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, at_given_values, pilot_fit
+from hvdc_ident.identifiability.practical import (
+    Assessment,
+    hold_structural,
+    profile_remaining,
+    without_insensitive,
+    without_null_directions,
+)
 from hvdc_ident.identifiability.report import IdentifiabilityReport
-from hvdc_ident.identifiability.structure import Structure
-from hvdc_ident.identifiability.structure import structure as structure_of
+from hvdc_ident.identifiability.structural import StructuralAnalysis, structural_analysis
+from hvdc_ident.identifiability.verdicts import COLLINEAR, WIDE, scale_of, unjudged_verdict, with_misfit_remark
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
 from hvdc_ident.simulate import ModelSimulator
 
 ENOUGH = 5
-"""From so many experiments on they are drawn anew: five give 126 different samples, four only 35."""
+"""From so many experiments on they are drawn anew: five give 126 tests samples, four only 35."""
 TELLING = 4.0
 """So many of them, counted by information, must tell of a parameter to draw experiments anew for it."""
 
@@ -49,7 +61,7 @@ def identifiability(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> IdentifiabilityReport:
-    """What the experiments tell about the candidates: a verdict on each, the set to fit, and what to measure next.
+    """Return a verdict on each candidate from what the experiments tell, the set to fit, and what to measure next.
 
     subject: a model, or anything that can be simulated (then the structure is judged by numbers, at random points).
     candidates: the parameters to judge, with start, bounds and the given values, at which those are held that these data
@@ -59,39 +71,35 @@ def identifiability(
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates), held=FrozenMap(held or {}))
-    so_far = Findings(problem, seed, profile_options or ProfileOptions(), progress)
-    _check(so_far)
-    so_far.tell("structure")
-    structure = structure_of(_equations(subject), problem, seed)
-    narrow.structural(so_far, structure)
-    free = tuple(f for f in problem.free if f.name not in so_far.held)
+    assessment = Assessment(problem, seed, profile_options or ProfileOptions(), progress)
+    _check(assessment)
+    assessment.report_stage("structure")
+    model = subject.model if isinstance(subject, WithResponses) else subject
+    structure = structural_analysis(model if isinstance(model, Model) else None, problem, seed)
+    hold_structural(assessment, structure)
+    free = tuple(f for f in problem.free if f.name not in assessment.held)
     if free:
-        first = replace(problem, free=free, held=problem.held | {n: so_far.free[n].given for n in so_far.held})
-        optimum, result = pilot(first, starts=starts, seed=seed, executor=executor, progress=progress)
+        given = {n: assessment.free[n].given for n in assessment.held}
+        admissible = replace(problem, free=free, held=problem.held | given)
+        first, result = pilot_fit(admissible, starts=starts, seed=seed, executor=executor, progress=progress)
     else:
-        optimum, result = unfitted(problem)
-    _data_notes(so_far, optimum, result)
-    so_far.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
-    so_far.thresholds = thresholds(optimum)
-    left = narrow.insensitive(so_far, optimum) if free else None
-    left = narrow.lost(so_far, left) if left else None
-    last = narrow.profiled(so_far, left, executor) if left else None
-    report = _assembled(so_far, structure, optimum, last, result, executor)
+        first, result = at_given_values(problem)
+    _data_notes(assessment, first, result)
+    assessment.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
+    assessment.thresholds = thresholds(first)
+    last = without_insensitive(assessment, first) if free else None
+    last = without_null_directions(assessment, last) if last else None
+    last = profile_remaining(assessment, last, executor) if last else None
+    report = _assembled(assessment, structure, first, last, result, executor)
     if pair and last is not None and set(pair) <= set(report.identifiable):
         return replace(report, pair=pair_of(last, report.parameters, pair))
     note = f"No common profile of {' and '.join(pair)}: not both are fitted." if pair else ""
     return replace(report, notes=(*report.notes, note)) if note else report
 
 
-def _equations(subject: Model | Simulator) -> Model | None:
-    """The model whose equations the structure can be asked of, where there is one."""
-    model = subject.model if isinstance(subject, WithResponses) else subject
-    return model if isinstance(model, Model) else None
-
-
-def _check(so_far: Findings) -> None:
-    """Notes that nothing moves, where nothing does. Raises StudyError where nothing was measured."""
-    experiments = so_far.problem.fitted_experiments
+def _check(assessment: Assessment) -> None:
+    """Note that no input moves, where none does. Raises StudyError where nothing was measured."""
+    experiments = assessment.problem.fitted_experiments
     for e in experiments:
         assert e.measured is not None
         if not any(np.isfinite(e.measured[o][e.compared]).any() for o in e.outputs):
@@ -99,74 +107,75 @@ def _check(so_far: Findings) -> None:
                 "nothing was measured", where=f"experiment '{e.name}'", expected="finite values in its window"
             )
     recordings = in_time(experiments)
-    so_far.quiet = len(recordings) == len(experiments) and all(
+    assessment.quiet = len(recordings) == len(experiments) and all(
         s.is_constant for e in recordings for s in e.inputs.values()
     )
-    if so_far.quiet and any(e.inputs for e in experiments):
-        so_far.notes.append("No input moves in any of the experiments: they show a steady state and nothing else.")
+    if assessment.quiet and any(e.inputs for e in experiments):
+        assessment.notes.append("No input moves in any of the experiments: they show a steady state and nothing else.")
 
 
-def _data_notes(so_far: Findings, optimum: Optimum, result: FitResult) -> None:
-    rows, unknowns = sum(b.residual.size for b in optimum.blocks), len(so_far.problem.unknowns)
+def _data_notes(assessment: Assessment, optimum: LocalAnalysis, result: FitResult) -> None:
+    """Note what the number of rows, the noise and the pilot fit say about the data."""
+    rows, unknowns = sum(b.residual.size for b in optimum.blocks), len(assessment.problem.unknowns)
     if rows < unknowns:
-        so_far.notes.append(f"{rows} measured values cannot determine {unknowns} unknowns.")
+        assessment.notes.append(f"{rows} measured values cannot determine {unknowns} unknowns.")
     elif rows == unknowns:
-        so_far.notes.append(f"{rows} measured values for as many unknowns leave nothing to tell a wrong model by.")
+        assessment.notes.append(f"{rows} measured values for as many unknowns leave nothing to tell a wrong model by.")
     if optimum.deterministic:
-        reasons = unknown_noise(so_far.problem.fitted_experiments, result.noise_source)
-        so_far.notes += [f"{o}: {why}; its standard deviation is that of the misfit." for o, why in reasons.items()]
-        so_far.remark = f"The noise is that of the misfit ({'; '.join(dict.fromkeys(reasons.values()))})."
+        reasons = unknown_noise(assessment.problem.fitted_experiments, result.noise_source)
+        assessment.notes += [f"{o}: {why}; its standard deviation is that of the misfit." for o, why in reasons.items()]
+        assessment.remark = f"The noise is that of the misfit ({'; '.join(dict.fromkeys(reasons.values()))})."
     if result.status in ("two-optima", "not-converged"):
-        so_far.notes.append(f"Pilot fit: {result.status}, {result.message}.")
+        assessment.notes.append(f"Pilot fit: {result.status}, {result.message}.")
 
 
 def _assembled(
-    so_far: Findings,
-    structure: Structure,
-    first: Optimum,
-    last: Optimum | None,
+    assessment: Assessment,
+    structure: StructuralAnalysis,
+    first: LocalAnalysis,
+    last: LocalAnalysis | None,
     result: FitResult,
     executor: Executor | None,
 ) -> IdentifiabilityReport:
-    """The report. first: the optimum of the pilot fit; last: that of the set that is fitted."""
-    bound = {n for n, v in so_far.found.items() if v.verdict == "at-bound"}
-    fitted = tuple(n for n in so_far.free if last is not None and n in last.names and n not in bound)
+    """Return the report. first: the optimum of the pilot fit; last: that of the set that is fitted."""
+    bound = {n for n, v in assessment.verdicts.items() if v.verdict == "at-bound"}
+    fitted = tuple(n for n in assessment.free if last is not None and n in last.names and n not in bound)
     held = {
-        n: (so_far.found[n].value, so_far.found[n].reason)
+        n: (assessment.verdicts[n].value, assessment.verdicts[n].reason)
         if n in bound
-        else (so_far.held_at.get(n, so_far.free[n].given), so_far.held[n])
-        for n in so_far.free
+        else (assessment.held_at.get(n, assessment.free[n].given), assessment.held[n])
+        for n in assessment.free
         if n not in fitted
     }
-    whole = _whole(so_far, last or first)
-    unjudged = _unjudged(so_far, whole, fitted, first)
-    held = {n: (v, so_far.found[n].reason if n in unjudged else why) for n, (v, why) in held.items()}
-    resampled = _resampled(so_far, last, executor)
+    whole = _whole(assessment, last or first)
+    unjudged = _unjudged(assessment, whole, fitted, first)
+    held = {n: (v, assessment.verdicts[n].reason if n in unjudged else why) for n, (v, why) in held.items()}
+    resampled = _resampled(assessment, last, executor)
     scatter = resampled.ci95() if resampled else {}
-    for n, verdict in so_far.found.items():
+    for n, verdict in assessment.verdicts.items():
         value = held[n][0] if n in held else verdict.value
         if last is not None and not np.isfinite(value):
             value = last.value(n)
-        scale = verdicts.scale_of(so_far.free[n], value)[0]
+        scale = scale_of(assessment.free[n], value)[0]
         norm = whole.information.norms[n]
-        verdict = replace(verdict.noted(so_far.remark), value=value, scale=scale, sensitivity_norm=norm)
-        so_far.found[n] = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict
+        verdict = replace(verdict.noted(assessment.remark), value=value, scale=scale, sensitivity_norm=norm)
+        assessment.verdicts[n] = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict
     several = last is not None and len(last.problem.fitted_experiments) > 1
-    different = heterogeneity(last) if last is not None and several else FrozenMap()
+    tests = heterogeneity(last) if last is not None and several else FrozenMap()
     matrix = first.information.matrix
     return IdentifiabilityReport(
-        parameters=FrozenMap({n: so_far.found[n] for n in so_far.free}),
+        parameters=FrozenMap({n: assessment.verdicts[n] for n in assessment.free}),
         identifiable=fitted,
         held=FrozenMap(held),
         structure=structure,
-        combinations=tuple(so_far.combinations),
+        combinations=tuple(assessment.combinations),
         collinear=collinear_subsets(matrix, first.names)[:200] if len(first.names) > 1 else (),
         correlation=last.uncertainty.correlation() if last is not None else {},
         shares=whole.information.shares(),
-        heterogeneity=different,
-        misspecification=misspecification(last, different, so_far.units) if last else Misspecification(False, ()),
-        recommended=_recommended(so_far, whole),
-        thresholds=FrozenMap(so_far.thresholds),
+        heterogeneity=tests,
+        misspecification=misspecification(last, tests, assessment.units) if last else Misspecification(False, ()),
+        recommended=_recommended(assessment, whole),
+        thresholds=FrozenMap(assessment.thresholds),
         pilot={
             "status": result.status,
             "message": result.message,
@@ -176,56 +185,54 @@ def _assembled(
             "effective_samples": dict(first.uncertainty.effective),
             "noise_source": dict(result.noise_source),
         },
-        notes=tuple(so_far.notes),
+        notes=tuple(assessment.notes),
         bootstrap=resampled,
-        sensitivities=_sensitivities(so_far, whole),
+        sensitivities=_sensitivities(assessment, whole),
         not_judged=unjudged,
-        optima=so_far.optima,
+        optima=assessment.optima,
     )
 
 
-def _unjudged(so_far: Findings, whole: Optimum, fitted: Sequence[str], at: Optimum) -> tuple[str, ...]:
-    """The held parameters that noise alone would tell, where the misfit is more than noise; their verdicts are taken back.
+def _unjudged(
+    assessment: Assessment, whole: LocalAnalysis, fitted: Sequence[str], at: LocalAnalysis
+) -> tuple[str, ...]:
+    """Return the held parameters that noise alone would tell, where the misfit is more than noise; their verdicts are taken back.
 
-    at: the optimum of the pilot fit. A misfit that comes only with holding one at its start value is not the model's.
+    The weak ones that noise alone would let be known within `WIDE` get a remark. at: the optimum of the pilot fit; a misfit
+    that comes only with holding one at its start value is not the model's.
     """
     if at.excess == 1.0:
         return ()
+    verdicts, ratio = assessment.verdicts, float(np.sqrt(at.excess))
     hidden = ("insensitive", "practically-unidentifiable", "at-bound")
-    others = [n for n in so_far.free if n not in fitted and so_far.found[n].verdict in hidden]
-    told = told_by_noise(whole, fitted, others) if others else {}
-    for n, half in told.items():
-        so_far.found[n] = verdicts.not_judged(so_far.found[n], float(np.sqrt(at.excess)), half)
-    _widened_by_misfit(so_far, whole, fitted, at)
-    return tuple(n for n in so_far.free if n in told)
-
-
-def _widened_by_misfit(so_far: Findings, whole: Optimum, fitted: Sequence[str], at: Optimum) -> None:
-    """Remark on the weak parameters that the noise alone would let be known within `WIDE`. at: as for `_unjudged`."""
-    weak = [n for n in fitted if so_far.found[n].verdict == "weak"]
-    halves = told_by_noise(whole, [n for n in fitted if n not in weak], weak) if weak else {}
+    others = [n for n in assessment.free if n not in fitted and verdicts[n].verdict in hidden]
+    unjudged = noise_half_widths(whole, fitted, others) if others else {}
+    for n, half in unjudged.items():
+        verdicts[n] = unjudged_verdict(verdicts[n], ratio, half)
+    weak = [n for n in fitted if verdicts[n].verdict == "weak"]
+    halves = noise_half_widths(whole, [n for n in fitted if n not in weak], weak) if weak else {}
     for n, half in halves.items():
-        judged = so_far.found[n]
-        scale = verdicts.scale_of(so_far.free[n], judged.value)[0]
-        if half <= verdicts.WIDE * scale and (judged.collinearity or 0.0) <= verdicts.COLLINEAR:
-            so_far.found[n] = verdicts.misfit_made(judged, float(np.sqrt(at.excess)), half)
+        scale = scale_of(assessment.free[n], verdicts[n].value)[0]
+        if half <= WIDE * scale and (verdicts[n].collinearity or 0.0) <= COLLINEAR:
+            verdicts[n] = with_misfit_remark(verdicts[n], ratio, half)
+    return tuple(n for n in assessment.free if n in unjudged)
 
 
-def _whole(so_far: Findings, at: Optimum) -> Optimum:
-    """All candidates free, at the values found or held."""
-    values = {**{n: f.given for n, f in so_far.free.items()}, **at.problem.values(at.theta)}
-    theta = [values[n] for n in so_far.free]
-    theta += [v for u, v in zip(at.problem.names, at.theta, strict=True) if u not in so_far.free]
-    return Optimum(replace(so_far.problem, weights=at.problem.weights), np.array(theta, dtype=float))
+def _whole(assessment: Assessment, at: LocalAnalysis) -> LocalAnalysis:
+    """Return the analysis with all candidates free, at the values found or held."""
+    values = {**{n: f.given for n, f in assessment.free.items()}, **at.problem.values(at.theta)}
+    theta = [values[n] for n in assessment.free]
+    theta += [v for u, v in zip(at.problem.names, at.theta, strict=True) if u not in assessment.free]
+    return LocalAnalysis(replace(assessment.problem, weights=at.problem.weights), np.array(theta, dtype=float))
 
 
-def _sensitivities(so_far: Findings, whole: Optimum) -> LocalSensitivities | None:
-    """The exact sensitivities of a model with equations, at the values found or held, between what moves and what is seen."""
-    subject = so_far.problem.simulator
+def _sensitivities(assessment: Assessment, whole: LocalAnalysis) -> LocalSensitivities | None:
+    """Return the exact sensitivities of a model with equations, at the values found or held, between what moves and what is seen."""
+    subject = assessment.problem.simulator
     subject = subject.simulator if isinstance(subject, WithResponses) else subject
     if not isinstance(subject, ModelSimulator) or not isinstance(subject.model, Model):
         return None
-    experiments = in_time(so_far.problem.fitted_experiments)
+    experiments = in_time(assessment.problem.fitted_experiments)
     if not experiments:
         return None
     moved = [n for n in subject.model.inputs if any(n in e.inputs and not e.inputs[n].is_constant for e in experiments)]
@@ -236,49 +243,151 @@ def _sensitivities(so_far: Findings, whole: Optimum) -> LocalSensitivities | Non
             whole.names,
             values=whole.problem.values(whole.theta),
             inputs=moved or None,
-            ranges={n: f.drawn for n, f in so_far.free.items() if not f.min > 0},
+            ranges={n: f.drawn for n, f in assessment.free.items() if not f.min > 0},
         )
     except (SimulationError, SteadyStateError) as error:
-        so_far.notes.append(f"No table of sensitivities: {error}.")
+        assessment.notes.append(f"No table of sensitivities: {error}.")
         return None
 
 
-def _resampled(so_far: Findings, last: Optimum | None, executor: Executor | None) -> Bootstrap | None:
-    """The estimates from experiments drawn anew, of those parameters that enough experiments tell of.
+def _resampled(assessment: Assessment, last: LocalAnalysis | None, executor: Executor | None) -> Bootstrap | None:
+    """Return the estimates from experiments drawn anew, of those parameters that enough experiments tell of.
 
     A parameter that one or two experiments determine would be lost in every sample without them: it stays where it is.
     """
     if last is None or len(last.problem.fitted_experiments) < ENOUGH:
         return None
     telling = last.information.telling()
-    told = [n for n in last.names if telling[n] >= TELLING]
-    others = [n for n in last.names if n not in told]
-    if not told:
-        so_far.notes.append("Experiments are not drawn anew: of every parameter only a few of them tell.")
+    resampled = [n for n in last.names if telling[n] >= TELLING]
+    others = [n for n in last.names if n not in resampled]
+    if not resampled:
+        assessment.notes.append("Experiments are not drawn anew: of every parameter only a few of them tell.")
         return None
     if others:
-        so_far.notes.append(f"While experiments are drawn anew {', '.join(others)} stay: only a few tell of them.")
-    so_far.tell("experiments drawn anew")
+        assessment.notes.append(f"While experiments are drawn anew {', '.join(others)} stay: only a few tell of them.")
+    assessment.report_stage("experiments drawn anew")
     fixed = {n: last.value(n) for n in others}
     places = [i for i, n in enumerate(last.problem.names) if n not in fixed]
     problem = replace(
         last.problem,
-        free=tuple(f for f in last.problem.free if f.name in told),
+        free=tuple(f for f in last.problem.free if f.name in resampled),
         held=last.problem.held | fixed,
     )
     try:
-        return bootstrap(problem, last.theta[places], seed=so_far.seed, executor=executor)
+        return bootstrap(problem, last.theta[places], seed=assessment.seed, executor=executor)
     except SimulationError as error:
-        so_far.notes.append(f"The bootstrap over experiments came to nothing: {error.what}.")
+        assessment.notes.append(f"The bootstrap over experiments came to nothing: {error.what}.")
         return None
 
 
-def _recommended(so_far: Findings, whole: Optimum) -> Recommendation | None:
-    """What to measure next, where there is an input to move."""
-    so_far.tell("what to measure next")
-    inputs = inputs_of(so_far.problem.simulator, so_far.problem.fitted_experiments)
+def _recommended(assessment: Assessment, whole: LocalAnalysis) -> Recommendation | None:
+    """Return what to measure next, where there is an input to move."""
+    assessment.report_stage("what to measure next")
+    inputs = inputs_of(assessment.problem.simulator, assessment.problem.fitted_experiments)
     try:
-        return recommend(whole, inputs, so_far.units, thresholds=so_far.thresholds)
+        return recommend(whole, inputs, assessment.units, thresholds=assessment.thresholds)
     except SimulationError as error:
-        so_far.notes.append(f"What to measure next cannot be told: {error.what}.")
+        assessment.notes.append(f"What to measure next cannot be told: {error.what}.")
         return None
+
+
+def identifiability_by_group(
+    subject: Model | Simulator,
+    experiments: Iterable[Experiment],
+    candidates: Iterable[FitParameter],
+    groups: Sequence[Group],
+    *,
+    pair: tuple[str, str] | None = None,
+    **options: Any,
+) -> IdentifiabilityReport:
+    """Return one report of what each group's outputs and experiments tell about its parameters while the others are held.
+
+    The groups follow each other as in the fit: a later one holds what the earlier ones found, and those to come at their
+    given value. Every verdict is its group's; the others' values are taken as known in it, and a note says so. Other arguments
+    as in `identifiability`. Raises StudyError where a candidate stands in no group, or in two.
+    """
+    simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
+    problem = Problem(simulator, tuple(experiments), tuple(candidates))
+    names = [f.name for f in problem.free]
+    listed = [n for g in groups for n in g.parameters]
+    if sorted(listed) != sorted(names):
+        expected, got = ", ".join(names), ", ".join(listed)
+        raise StudyError("groups must hold every candidate once", where="fit groups", expected=expected, got=got)
+    current = {f.name: f.given for f in problem.free}
+    reports = []
+    for group in groups:
+        part = part_of(problem, group, current)
+        both = pair if pair and set(pair) <= set(group.parameters) else None
+        report = identifiability(subject, part.experiments, part.free, held=part.held, pair=both, **options)
+        current |= {n: v.value for n, v in report.parameters.items()}
+        reports.append(_noted(report, group, part))
+    merged = _merged(reports, names)
+    if pair and merged.pair is None and not any(set(pair) <= set(g.parameters) for g in groups):
+        note = f"No common profile of {' and '.join(pair)}: they stand in two groups."
+        merged = replace(merged, notes=(*merged.notes, note))
+    return merged
+
+
+def _noted(report: IdentifiabilityReport, group: Group, part: Problem) -> IdentifiabilityReport:
+    """Return a group's report, each note begun with the group's parameters."""
+    mine = ", ".join(group.parameters)
+    data = f"{', '.join(part.outputs)} in {', '.join(e.name for e in part.fitted_experiments)}"
+    first = f"{mine}: judged alone, on {data}, the other candidates held."
+    notes = (first, *(f"{mine}: {n}" for n in report.notes))
+    signs = tuple(f"{mine}: {s}" for s in report.misspecification.signs)
+    pilot = {"groups": [{"parameters": list(group.parameters), **report.pilot}]}
+    return replace(report, notes=notes, misspecification=replace(report.misspecification, signs=signs), pilot=pilot)
+
+
+def _merged(reports: Sequence[IdentifiabilityReport], names: Sequence[str]) -> IdentifiabilityReport:
+    """Return the groups' reports as one, candidates in the order of `names`.
+
+    What to measure next is that of the first group that needs it; the notes say what the others would.
+    """
+
+    def joined(field: str) -> tuple[Any, ...]:
+        return tuple(item for r in reports for item in getattr(r, field))
+
+    def by_name(field: str) -> dict[str, Any]:
+        return {n: item for r in reports for n, item in getattr(r, field).items()}
+
+    parameters, held, identifiable = by_name("parameters"), by_name("held"), joined("identifiable")
+    shares = {e: {n: s for r in reports for n, s in r.shares.get(e, {}).items()} for e in by_name("shares")}
+    structures, signs = [r.structure for r in reports], [r.misspecification for r in reports]
+    settled = ("identifiable", "at-bound")
+    advised = next((r for r in reports if any(v.verdict not in settled for v in r.parameters.values())), reports[0])
+    advice = [
+        f"To measure next for {', '.join(r.parameters)}: {r.recommended.text}"
+        for r in reports
+        if r is not advised and r.recommended is not None
+    ]
+    return IdentifiabilityReport(
+        parameters=FrozenMap({n: parameters[n] for n in names}),
+        identifiable=tuple(n for n in names if n in identifiable),
+        held=FrozenMap({n: held[n] for n in names if n in held}),
+        structure=StructuralAnalysis(
+            "decided" if all(s.status == "decided" for s in structures) else "not decided",
+            "; ".join(dict.fromkeys(s.method for s in structures)),
+            tuple(n for s in structures for n in s.admissible),
+            tuple(c for s in structures for c in s.combinations),
+            "; ".join(s.note for s in structures if s.note),
+            tuple(n for s in structures for n in s.unmoved),
+        ),
+        combinations=joined("combinations"),
+        collinear=joined("collinear"),
+        correlation=by_name("correlation"),
+        shares=FrozenMap({e: FrozenMap({n: line.get(n, 0.0) for n in names}) for e, line in shares.items()}),
+        heterogeneity=FrozenMap(by_name("heterogeneity")),
+        misspecification=Misspecification(
+            any(s.flag for s in signs),
+            tuple(sign for s in signs for sign in s.signs),
+            next((s.pointer for s in signs if s.pointer), ""),
+        ),
+        recommended=advised.recommended,
+        thresholds=FrozenMap(by_name("thresholds")),
+        pilot={"groups": [group for r in reports for group in r.pilot["groups"]]},
+        notes=(*joined("notes"), *advice),
+        pair=next((r.pair for r in reports if r.pair is not None), None),
+        not_judged=joined("not_judged"),
+        optima=joined("optima"),
+    )

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from hvdc_ident.errors import unknown_name
+from hvdc_ident.errors import require_known
 from hvdc_ident.fit import Estimate, FitResult, Problem
 from hvdc_ident.immutable import FrozenMap
 
 
 @dataclass(frozen=True)
 class Gate:
-    """What a report lets a fit do.
+    """Selection of the parameters that a report lets a fit estimate.
 
     fitted: the parameters to fit, in the order of the candidates. held: value and reason of the others.
     conditional_on: of a fitted one, those held without which it could not be told. forced: fitted against the report.
@@ -26,38 +26,35 @@ class Gate:
 
 
 def gate(report: Mapping[str, Any], force: Sequence[str] = (), *, diagnosis: bool = False) -> Gate:
-    """The gate that a report, as its `to_dict` or its JSON, sets up; `force` names parameters to fit all the same.
+    """Return the gate that a report, as its `to_dict` or its JSON, sets up; `force` names parameters to fit all the same.
 
-    diagnosis: whether what is not judged for the misfit alone is free too: a parameter held at a wrong value is a gap of
+    diagnosis: free too what is not judged for the misfit alone: a parameter held at a wrong value is a gap of
     its own, and would be named as an effect.
     Raises UnknownNameError for a forced name that is no candidate.
     """
     parameters = report["parameters"]
-    for name in force:
-        if name not in parameters:
-            raise unknown_name("candidate", name, parameters, where="force")
-    open_set = {*report["identifiable"], *(report.get("not_judged", ()) if diagnosis else ())}
-    forced = tuple(n for n in parameters if n in force and n not in open_set)
-    fitted = tuple(n for n in parameters if n in open_set or n in forced)
-    held = {n: (float(h["value"]), _why(n, report)) for n, h in report["held"].items() if n not in fitted}
+    require_known("candidate", force, parameters, where="force")
+    selectable = {*report["identifiable"], *(report.get("not_judged", ()) if diagnosis else ())}
+    forced = tuple(n for n in parameters if n in force and n not in selectable)
+    fitted = tuple(n for n in parameters if n in selectable or n in forced)
+    held = {}
+    for n, h in report["held"].items():
+        unit = f" {parameters[n]['unit']}" if parameters[n].get("unit") else ""
+        if n not in fitted:
+            reason = f"{parameters[n]['verdict']}, held at {h['value']:.6g}{unit}: {h['reason']}"
+            held[n] = (float(h["value"]), reason)
     given = {n: tuple(c for c in parameters[n]["conditional_on"] if c in held) for n in fitted}
     return Gate(fitted, FrozenMap(held), FrozenMap({n: c for n, c in given.items() if c}), forced)
 
 
-def _why(name: str, report: Mapping[str, Any]) -> str:
-    line, held = report["parameters"][name], report["held"][name]
-    unit = f" {line['unit']}" if line.get("unit") else ""
-    return f"{line['verdict']}, held at {held['value']:.6g}{unit}: {held['reason']}"
-
-
-def gated(problem: Problem, through: Gate) -> Problem:
-    """The problem with only the fitted parameters free. Raises StudyError where none is left."""
+def gated(problem: Problem, selection: Gate) -> Problem:
+    """Return the problem with only the fitted parameters free. Raises StudyError where none is left."""
     return replace(
         problem,
-        free=tuple(f for f in problem.free if f.name in through.fitted),
-        held=problem.held | {n: v for n, (v, _) in through.held.items()},
-        why=problem.why | {n: why for n, (_, why) in through.held.items()},
-        conditional_on=problem.conditional_on | through.conditional_on,
+        free=tuple(f for f in problem.free if f.name in selection.fitted),
+        held=problem.held | {n: v for n, (v, _) in selection.held.items()},
+        why=problem.why | {n: why for n, (_, why) in selection.held.items()},
+        conditional_on=problem.conditional_on | selection.conditional_on,
     )
 
 
@@ -69,32 +66,32 @@ def gated_fit(
     force: Sequence[str] = (),
     whole: bool = True,
 ) -> FitResult:
-    """The fit of the identifiable set, its estimates as the report allows them to be stated.
+    """Return the fit of the identifiable set, its estimates as the report allows them to be stated.
 
     report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak and local parameters get the profile's
     interval and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
-    whole: whether the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
+    whole: the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
     Where nothing is left to fit the status is "failed" and the message says so. One that is held on a bound makes the
     status "at-bound", for that is where the fit of all would have ended.
     """
-    through = gate(report, force)
-    if not through.fitted:
-        reasons = FrozenMap({n: why for n, (_, why) in through.held.items()})
-        values = FrozenMap({n: v for n, (v, _) in through.held.items()})
+    selection = gate(report, force)
+    if not selection.fitted:
+        reasons = FrozenMap({n: why for n, (_, why) in selection.held.items()})
+        values = FrozenMap({n: v for n, (v, _) in selection.held.items()})
         return FitResult(
             "failed",
             _nothing_to_fit(report),
             (),
             reasons,
             values,
-            estimates=_at_bound(report, through),
+            estimates=_at_bound(report, selection),
             rmse_given=problem.rmse_given,
         )
-    result = fit(gated(problem, through))
+    result = fit(gated(problem, selection))
     if result.status == "failed":
         return result
-    estimates = {n: _stated(n, e, report, through, whole=whole) for n, e in result.estimates.items()}
-    on_bound = _at_bound(report, through)
+    estimates = {n: _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()}
+    on_bound = _at_bound(report, selection)
     ordered = {n: {**estimates, **on_bound}.get(n) for n in report["parameters"]}
     stated = FrozenMap({n: e for n, e in ordered.items() if e is not None})
     # What is held on a bound was given elsewhere: before the fit it stood there.
@@ -107,7 +104,7 @@ def gated_fit(
 
 
 def _nothing_to_fit(report: Mapping[str, Any]) -> str:
-    """Every candidate with its verdict, and what to do."""
+    """Return the message: every candidate with its verdict, and what to do."""
     said = ", ".join(f"{n} is {line['verdict']}" for n, line in report["parameters"].items())
     unjudged = report.get("not_judged", ())
     diagnose = (
@@ -121,14 +118,14 @@ def _nothing_to_fit(report: Mapping[str, Any]) -> str:
     )
 
 
-def _stated(name: str, e: Estimate, report: Mapping[str, Any], through: Gate, *, whole: bool) -> Estimate:
-    """An estimate in the form its verdict allows."""
+def _stated(name: str, e: Estimate, report: Mapping[str, Any], selection: Gate, *, whole: bool) -> Estimate:
+    """Return an estimate in the form its verdict allows."""
     line = report["parameters"][name]
-    if name in through.forced:
+    if name in selection.forced:
         return replace(e, reason=f"forced, against the report: {line['verdict']}. {line['reason']}")
     interval = _interval(line)
     weak = line["verdict"] == "weak" or (line.get("std") is None)
-    other_set = bool(through.forced) or not whole
+    other_set = bool(selection.forced) or not whole
     if interval is None or (other_set and not weak):
         return replace(e, std=None, std_raw=None) if weak else e
     if line["verdict"] == "locally-identifiable" and not interval[0] <= e.value <= interval[1]:
@@ -152,11 +149,11 @@ def _interval(line: Mapping[str, Any]) -> tuple[float, float] | None:
     return (float(ci[0]), float(ci[1])) if ci and ci[0] is not None and ci[1] is not None else None
 
 
-def _at_bound(report: Mapping[str, Any], through: Gate) -> FrozenMap[Estimate]:
-    """The held ones that stand on a bound, with their one-sided limit."""
+def _at_bound(report: Mapping[str, Any], selection: Gate) -> FrozenMap[Estimate]:
+    """Return the held ones that stand on a bound, with their one-sided limit."""
     found = {}
     for n, line in report["parameters"].items():
-        if line["verdict"] == "at-bound" and n in through.held:
+        if line["verdict"] == "at-bound" and n in selection.held:
             found[n] = Estimate(
                 float(line["value"]),
                 None,

@@ -14,15 +14,31 @@ from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.files import plain
 from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import PairProfile, Profile
-from hvdc_ident.identifiability.combinations import Combination
-from hvdc_ident.identifiability.heterogeneity import Heterogeneity, Misspecification
-from hvdc_ident.identifiability.optima import OtherOptimum
-from hvdc_ident.identifiability.recommend import Recommendation
-from hvdc_ident.identifiability.structure import Structure
+from hvdc_ident.identifiability.experiment_design import Recommendation
+from hvdc_ident.identifiability.likelihood_intervals import OtherOptimum
+from hvdc_ident.identifiability.misspecification import Heterogeneity, Misspecification
+from hvdc_ident.identifiability.structural import Combination, StructuralAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import Collinear, LocalSensitivities
 
+IN_JSON = (
+    "verdict",
+    "reason",
+    "value",
+    "unit",
+    "scale",
+    "ci95",
+    "ci95_experiments",
+    "std",
+    "relative_std",
+    "sensitivity_norm",
+    "collinearity",
+    "partner",
+    "conditional_on",
+    "optima",
+)
+"""Fields of a verdict in the JSON."""
 CONDITIONS = (
     "Every verdict holds for these outputs, experiments, noise and bounds, at the optimum of the pilot fit; with other "
     "data it may be another."
@@ -31,7 +47,7 @@ CONDITIONS = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiabilityReport(Shown):
-    """What the experiments tell about the candidates.
+    """Findings of the experiments about the candidates.
 
     parameters: the verdicts, in the order of the candidates. identifiable: the set a fit uses. held: the value and the
     reason of each other one. not_judged: those of the held that noise alone would tell, which only the misfit hides: a
@@ -47,7 +63,7 @@ class IdentifiabilityReport(Shown):
     parameters: FrozenMap[Verdict]
     identifiable: tuple[str, ...]
     held: FrozenMap[tuple[float, str]]
-    structure: Structure
+    structure: StructuralAnalysis
     combinations: tuple[Combination, ...] = ()
     collinear: tuple[Collinear, ...] = ()
     correlation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
@@ -71,9 +87,20 @@ class IdentifiabilityReport(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON takes it: full precision, None for what is not finite."""
-        s = self.structure
+        s, drawn = self.structure, self.bootstrap
+        bootstrap = (
+            None
+            if drawn is None
+            else {
+                "samples": len(drawn.values),
+                "failed": drawn.failed,
+                "experiments": drawn.experiments,
+                "ci95": {n: list(interval) for n, interval in drawn.ci95().items()},
+                "std": drawn.std(),
+            }
+        )
         found = {
-            "parameters": {n: _verdict(v) for n, v in self.parameters.items()},
+            "parameters": {n: {f: getattr(v, f) for f in IN_JSON} for n, v in self.parameters.items()},
             "identifiable": list(self.identifiable),
             "not_judged": list(self.not_judged),
             "optima": [{"values": dict(o.values), "cost_rise": o.rise} for o in self.optima],
@@ -108,7 +135,7 @@ class IdentifiabilityReport(Shown):
             "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
             "pair": self.pair,
-            "bootstrap": _bootstrap(self.bootstrap),
+            "bootstrap": bootstrap,
             "sensitivities": self.sensitivities.to_dict() if self.sensitivities else None,
             "pilot": self.pilot,
             "notes": [*self.notes, CONDITIONS],
@@ -182,37 +209,6 @@ def _interval(v: Verdict) -> str:
     if low is None or high is None:
         return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
     return f"{low:.6g} to {high:.6g}"
-
-
-def _bootstrap(b: Bootstrap | None) -> dict[str, Any] | None:
-    if b is None:
-        return None
-    return {
-        "samples": len(b.values),
-        "failed": b.failed,
-        "experiments": b.experiments,
-        "ci95": {n: list(interval) for n, interval in b.ci95().items()},
-        "std": b.std(),
-    }
-
-
-def _verdict(v: Verdict) -> dict[str, Any]:
-    return {
-        "verdict": v.verdict,
-        "reason": v.reason,
-        "value": v.value,
-        "unit": v.unit,
-        "scale": v.scale,
-        "ci95": v.ci95,
-        "ci95_experiments": v.ci95_experiments,
-        "std": v.std,
-        "relative_std": v.relative_std,
-        "sensitivity_norm": v.sensitivity_norm,
-        "collinearity": v.collinearity,
-        "partner": v.partner,
-        "conditional_on": v.conditional_on,
-        "optima": list(v.optima),
-    }
 
 
 def _profile(p: Profile) -> dict[str, Any]:

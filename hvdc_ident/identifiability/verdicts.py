@@ -32,7 +32,7 @@ COLLINEAR = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What can be said about one parameter, numbers in `unit`.
+    """Verdict on one parameter, with its evidence; numbers in `unit`.
 
     value: at the optimum; of a held one, what it is held at. ci95: from the profile; an end that is None is not known.
     std, relative_std: only of identifiable ones. sensitivity_norm: of its whitened, scaled column. collinearity: by how
@@ -60,11 +60,11 @@ class Verdict:
     optima: tuple[float, ...] = ()
 
     def noted(self, *notes: str) -> Verdict:
-        """The verdict with remarks added to its reason."""
+        """Return the verdict with remarks added to its reason."""
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
 
     def scattered(self, interval: tuple[float, float], over: Bootstrap) -> Verdict:
-        """The verdict with the interval from experiments drawn anew, and a remark where that is much the wider."""
+        """Return the verdict with the interval from experiments drawn anew, and a remark where that is much the wider."""
         found = replace(self, ci95_experiments=interval)
         low, high = self.ci95 or (None, None)
         if low is None or high is None or interval[1] - interval[0] < WIDER * (high - low):
@@ -74,7 +74,7 @@ class Verdict:
         return found.noted(f"Drawn anew, the {over.experiments} experiments scatter it wider: {span}.")
 
 
-def structural(
+def structural_verdict(
     name: str,
     words: str,
     held_at: float | None,
@@ -83,9 +83,9 @@ def structural(
     *,
     local: bool = False,
 ) -> Verdict:
-    """Only a combination shows, whatever the data. held_at: its given value where it is one of those held.
+    """Return the verdict where only a combination shows, whatever the data. held_at: its given value where it is one of those held.
 
-    local: whether that was found from numbers at a few points.
+    local: that was found from numbers at a few points.
     """
     text = f"{'At every point tried' if local else 'However good the data'}, {words}"
     if held_at is not None:
@@ -95,18 +95,24 @@ def structural(
     return Verdict(name, "structurally-unidentifiable", text, float("nan"), unit, conditional_on=tuple(conditional_on))
 
 
-def insensitive(
+def insensitive_verdict(
     free: FitParameter, ends: tuple[float, float], rise: float, threshold: float, unit: str, also: str = ""
 ) -> Verdict:
-    """Its whole range moves the outputs by less than noise may. rise: of the cost at the worse end. also: a remark."""
+    """Return the verdict where the whole range moves the outputs by less than noise may.
+
+    rise: of the cost at the worse end. also: a remark.
+    """
     span = f"Anywhere between {ends[0]:.4g} and {_with_unit(ends[1], unit)}"
     told = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
     return Verdict(free.name, "insensitive", f"{span} {told}{why}. {also}".rstrip(), free.given, unit)
 
 
-def practical(profile: Profile, words: str, unit: str) -> Verdict:
-    """Its profile is open inside the bounds, or flat where it is best. words: the combination it belongs to, if any."""
+def open_verdict(profile: Profile, words: str, unit: str) -> Verdict:
+    """Return the verdict where the profile is open inside the bounds, or flat at its best.
+
+    words: on the combination that the parameter belongs to, if any.
+    """
     low, high = profile.lower.crossing, profile.upper.crossing
     ends = (("below", low, profile.lower.reason), ("above", high, profile.upper.reason))
     text = (
@@ -119,8 +125,8 @@ def practical(profile: Profile, words: str, unit: str) -> Verdict:
     return Verdict(profile.name, "practically-unidentifiable", text, profile.value, unit, profile.ci95, profile=profile)
 
 
-def not_judged(judged: Verdict, times: float, half: float) -> Verdict:
-    """A verdict that only the misfit led to, taken back. times: the misfit over the noise. half: what noise alone leaves.
+def unjudged_verdict(judged: Verdict, times: float, half: float) -> Verdict:
+    """Return a verdict that only the misfit led to, taken back. times: the misfit over the noise. half: what noise alone leaves.
 
     One at a bound stands there all the same, with the remark.
     """
@@ -132,21 +138,21 @@ def not_judged(judged: Verdict, times: float, half: float) -> Verdict:
     return replace(judged, verdict="not-judged", reason=text)
 
 
-def misfit_made(judged: Verdict, times: float, half: float) -> Verdict:
-    """A weak verdict with the remark that only the misfit makes it so. times: the misfit over the noise. half: as above."""
+def with_misfit_remark(judged: Verdict, times: float, half: float) -> Verdict:
+    """Return a weak verdict with the remark that only the misfit makes it so. times: the misfit over the noise. half: as above."""
     return judged.noted(
         f"That is the misfit's doing, {times_text(times)} the noise: against the noise alone it would be known to "
         f"±{_with_unit(half, judged.unit)}; diagnose first."
     )
 
 
-def lost(name: str, words: str, value: float, unit: str) -> Verdict:
-    """Its sensitivity is that of the others together: in these data only a combination shows."""
+def null_direction_verdict(name: str, words: str, value: float, unit: str) -> Verdict:
+    """Return the verdict where the sensitivity is that of other parameters together: only a combination shows in these data."""
     return Verdict(name, "practically-unidentifiable", f"In these experiments {words}.", value, unit)
 
 
-def at_bound(profile: Profile, free: FitParameter, physical: bool, unit: str) -> Verdict:
-    """Its optimum lies on a bound; the other end is its one-sided limit."""
+def at_bound_verdict(profile: Profile, free: FitParameter, physical: bool, unit: str) -> Verdict:
+    """Return the verdict where the optimum lies on a bound; the other end is its one-sided limit."""
     low = profile.value <= free.min
     limit = profile.upper.limit if low else profile.lower.limit
     ci = (profile.value, limit) if low else (limit, profile.value)
@@ -161,10 +167,12 @@ def at_bound(profile: Profile, free: FitParameter, physical: bool, unit: str) ->
     return Verdict(profile.name, "at-bound", text, profile.value, unit, ci, profile=profile)
 
 
-def closed(
+def closed_verdict(
     profile: Profile, free: FitParameter, std: float, collinearity: float, partner: str, best: str, unit: str
 ) -> Verdict:
-    """Weak or identifiable: its interval is known. std: in its unit. best: the experiment that tells most about it."""
+    """Return the verdict weak or identifiable, where the interval is known. std: in its unit. best: the experiment that
+    tells most about it.
+    """
     low, high = profile.ci95
     assert low is not None and high is not None
     half = 0.5 * (high - low)
@@ -215,8 +223,8 @@ def scale_of(free: FitParameter, value: float) -> tuple[float, str]:
     return (free.scale, "of its typical size") if free.scale > abs(value) else (abs(value), "of its value")
 
 
-def local(judged: Verdict, others: Sequence[float], rise: float) -> Verdict:
-    """Known about each of several optima, and not which: others, their values; rise: of the cost at the next best."""
+def local_verdict(judged: Verdict, others: Sequence[float], rise: float) -> Verdict:
+    """Return the verdict where several optima are as good. others: its values there; rise: of the cost at the next best."""
     low, high = judged.ci95 or (None, None)
     assert low is not None and high is not None
     half = 0.5 * (high - low)
@@ -233,7 +241,7 @@ def local(judged: Verdict, others: Sequence[float], rise: float) -> Verdict:
 
 
 def _digits(value: float, half: float) -> str:
-    """The value with as many digits as its half-width has meaning for."""
+    """Return the value with as many digits as its half-width has meaning for."""
     if half <= 0 or not value:
         return f"{value:.6g}"
     return f"{value:.{max(2, min(12, int(math.log10(abs(value) / half)) + 3))}g}"

@@ -21,8 +21,8 @@ from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
-from hvdc_ident.identifiability.evidence import thresholds
-from hvdc_ident.identifiability.pilot import pilot
+from hvdc_ident.identifiability.likelihood_intervals import thresholds
+from hvdc_ident.identifiability.pilot_fit import pilot_fit
 from hvdc_ident.simulate import ModelSimulator
 
 TRUE = {"KPVDC": 24.0, "KIVDC": 734.7}
@@ -44,7 +44,7 @@ def one(seed: int) -> dict[str, tuple[float, float, float]]:
     simulator, asked, clean = plant()
     noisy = clean + NOISE * np.random.default_rng(seed).standard_normal(clean.size)
     data = asked.with_(measured=trajectory(TIME, {"Irorder1": noisy}), noise={"Irorder1": NOISE})
-    optimum, _ = pilot(Problem(simulator, (data,), FREE), starts=1)
+    optimum, _ = pilot_fit(Problem(simulator, (data,), FREE), starts=1)
     found = profiles(LeastSquares.of(optimum.problem), optimum.theta, threshold=thresholds(optimum))
     ends = {}
     for n, p in found.by_name.items():

@@ -16,7 +16,7 @@ from hvdc_ident.executor import Executor
 from hvdc_ident.fit import FitParameter, Problem, Simulator
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.identifiability.gate import gate, gated
-from hvdc_ident.identifiability.pilot import Optimum, pilot
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, null_directions
 
@@ -135,7 +135,7 @@ def nominal(
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
     quantised = {o: q for o, n in noise.items() if (q := n.quantised) is not None}
     problem = replace(problem, experiments=told, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
-    optimum, result = pilot(problem, starts=starts, seed=seed, executor=executor)
+    optimum, result = pilot_fit(problem, starts=starts, seed=seed, executor=executor)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
     )
@@ -179,7 +179,7 @@ def _stated(experiment: Experiment, output: str, noise: OutputNoise) -> float | 
     return experiment.noise.get(output) if noise.source == "given" else noise.std
 
 
-def _told_apart(optimum: Optimum) -> tuple[Optimum, dict[str, float]]:
+def _told_apart(optimum: LocalAnalysis) -> tuple[LocalAnalysis, dict[str, float]]:
     """The optimum without the parameters that these data do not tell apart from the others, held at their given values where it runs."""
     k = len(optimum.names)
     dead = [n for n, c in zip(optimum.names, optimum.columns.T, strict=False) if not np.any(c)]
@@ -189,5 +189,5 @@ def _told_apart(optimum: Optimum) -> tuple[Optimum, dict[str, float]]:
     if not lost or len(lost) == k:
         return optimum, {}
     given = {f.name: f.given for f in optimum.problem.free if f.name in lost}
-    fewer = optimum.held(dict.fromkeys(lost, "not told apart"), given)
+    fewer = optimum.with_held(dict.fromkeys(lost, "not told apart"), given)
     return fewer, {n: fewer.problem.held[n] for n in lost}

@@ -66,14 +66,14 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     from hvdc_ident.errors import SimulationError
     from hvdc_ident.fit import Problem
     from hvdc_ident.fit.frequency_data import with_responses
-    from hvdc_ident.identifiability.first_look import first_look
+    from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
     from hvdc_ident.study.study import candidate_lines
     from hvdc_ident.text import duration
 
     simulator, experiments = with_responses(study.model, study.experiments, study.responses)
     options.progress(0, 1, "first answer: the model and its derivatives at the given values")
     try:
-        first = first_look(Problem(simulator, experiments, tuple(study.candidates.values())))
+        first = cramer_rao_bounds(Problem(simulator, experiments, tuple(study.candidates.values())))
     except SimulationError as error:
         options.announce([f"There is no first answer at the given values: {error}"])
         return

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import hvdc_ident.identifiability as identifiability
 from hvdc_ident.cli import app
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.identifiability.first_look import first_look
+from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
 from hvdc_ident.study.stages import identify
 from tests.identifiability.cases import T, closed, measured, product
 
@@ -24,7 +24,7 @@ TRUTH, NOISE = {"a": 2.0, "b": 3.0, "c": 0.5}, 0.01
 def look(*names: str) -> Any:
     simulator = closed(product, **TRUTH)
     record = measured(simulator, TRUTH, NOISE)
-    return first_look(Problem(simulator, (record,), tuple(FitParameter(n, TRUTH[n], 0.1, 10.0) for n in names)))
+    return cramer_rao_bounds(Problem(simulator, (record,), tuple(FitParameter(n, TRUTH[n], 0.1, 10.0) for n in names)))
 
 
 def test_what_is_told_apart_has_the_standard_deviation_of_linear_regression() -> None:

@@ -14,9 +14,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.identifiability import identifiability
-from hvdc_ident.identifiability.combinations import held_of
-from hvdc_ident.identifiability.local_rank import local_rank
-from hvdc_ident.identifiability.structure import numerical_structure, structure
+from hvdc_ident.identifiability.structural import held_of, rank_analysis, structural_analysis
 from hvdc_ident.model import Delay, Model, Sampled
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import ModelSimulator
@@ -61,13 +59,13 @@ def problem_on(model, outputs):
 def test_delays_and_sampling_are_decided_by_numbers_and_labelled_local(make) -> None:
     model = make()
     problem = problem_on(model, ["y"])
-    found = structure(model, problem)
+    found = structural_analysis(model, problem)
     assert found.status == "decided" and found.method == "numerical, local" and found.local
     assert "delays or sampled parts" in found.note
     (combination,) = found.combinations
     assert set(combination.members) == {"b", "kp", "ki"} and set(combination.seen) == {"b*kp", "b*ki"}
     assert len(found.admissible) == len(problem.free) - 1 and "a" in found.admissible
-    assert structure(model, problem_on(model, ["y", "control"])).combinations == ()
+    assert structural_analysis(model, problem_on(model, ["y", "control"])).combinations == ()
 
 
 def test_the_report_says_local_where_it_is() -> None:
@@ -84,7 +82,7 @@ def test_the_report_says_local_where_it_is() -> None:
 def test_numbers_and_equations_agree() -> None:
     model = pi_loop()
     problem = problem_on(model, ["y"])
-    by_equations, by_numbers = structure(model, problem), numerical_structure(problem)
+    by_equations, by_numbers = structural_analysis(model, problem), rank_analysis(problem)
     assert by_equations.method == "prime field" and not by_equations.local
     assert by_equations.admissible == by_numbers.admissible and len(by_numbers.admissible) == 3
     assert {c.members for c in by_equations.combinations} == {c.members for c in by_numbers.combinations}
@@ -107,7 +105,7 @@ def test_both_routes_hold_the_last_listed_that_will_do(order) -> None:
     data = on_model(SPRING, "e", {"u": PUSH}, ["y"], 1e-3, rows=121)
     free = tuple(FitParameter(n, SPRING.values[n], SPRING.values[n] / 3, SPRING.values[n] * 3) for n in order)
     problem = Problem(ModelSimulator(SPRING), (data,), free)
-    by_equations, by_numbers = structure(SPRING, problem), numerical_structure(problem)
+    by_equations, by_numbers = structural_analysis(SPRING, problem), rank_analysis(problem)
     assert by_equations.method == "prime field" and by_numbers.method == "numerical, local"
     assert by_equations.admissible == by_numbers.admissible == order[:2]
 
@@ -154,11 +152,11 @@ def test_differences_with_their_error_stated_see_what_exact_sensitivities_see() 
     assert sensitivity_error(exact) == 1e-6 and sensitivity_error(rough) == 1e-4
     free = (FitParameter("a", 2, 0.5, 5), FitParameter("b", 3, 0.5, 5), FitParameter("c", 1, -5, 5))
     data = measured(exact, {"a": 2.5}, 0.01)
-    found = local_rank(Problem(rough, (data,), free))
-    assert found.points == 6 and found.independent == ("a", "c") and "good to 0.0001" in found.note
+    found = rank_analysis(Problem(rough, (data,), free))
+    assert found.points == 6 and found.admissible == ("a", "c") and "good to 0.0001" in found.note
     assert found.combinations[0].seen == ("a*b",)
     silent = Differences(exact, sensitivity_error=0.0)
-    assert local_rank(Problem(silent, (data,), free)).combinations == ()
+    assert rank_analysis(Problem(silent, (data,), free)).combinations == ()
     report = identifiability(rough, [data], free, starts=2)
     assert {n: v.verdict for n, v in report.parameters.items()} == {
         "a": "structurally-unidentifiable",
@@ -172,11 +170,11 @@ def test_points_that_cannot_be_simulated_are_counted() -> None:
     data = measured(exact, {"a": 2.5}, 0.01)
     free = (FitParameter("a", 2, 0.5, 5), FitParameter("b", 3, 0.5, 5), FitParameter("c", 1, -5, 5))
     exact.fails = lambda p: p["c"] > 0
-    found = local_rank(Problem(exact, (data,), free))
+    found = rank_analysis(Problem(exact, (data,), free))
     assert 0 < found.points < 5 and f"{5 - found.points} of 5 random points could not be simulated" in found.note
     assert found.combinations[0].seen == ("a*b",)
     exact.fails = lambda p: True
-    nothing = numerical_structure(Problem(exact, (data,), free))
+    nothing = rank_analysis(Problem(exact, (data,), free))
     assert nothing.status == "not decided" and nothing.admissible == ("a", "b", "c")
     with pytest.raises(SimulationError):
         identifiability(exact, [data], free, starts=1)
@@ -184,8 +182,8 @@ def test_points_that_cannot_be_simulated_are_counted() -> None:
 
 def test_time_is_not_taken_for_a_verdict(monkeypatch) -> None:
     """Where the equations' test runs out of time the numbers stand in, and the status says that nothing was decided."""
-    monkeypatch.setattr("hvdc_ident.identifiability.structure.SECONDS", 0.0)
+    monkeypatch.setattr("hvdc_ident.identifiability.structural.SECONDS", 0.0)
     model = pi_loop()
-    found = structure(model, problem_on(model, ["y"]))
+    found = structural_analysis(model, problem_on(model, ["y"]))
     assert found.status == "not decided" and "time limit" in found.note and found.method == "numerical, local"
     assert set(found.combinations[0].seen) == {"b*kp", "b*ki"}

@@ -1,10 +1,11 @@
-"""How far the data's word reaches: thresholds of profiles, refits at the ends of a range, limits at several bounds."""
+"""Ends of the parameters' intervals: thresholds of the cost, limits at several bounds, refits at the ends of a range; other optima."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy.special import stdtrit
@@ -13,33 +14,41 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
-from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
+from hvdc_ident.fit.objective import DescentResult, LeastSquares, bounded_step, descend
 from hvdc_ident.fit.profile import PairProfile, Profile, profile_pair
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
-from hvdc_ident.identifiability.pilot import Optimum
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import independent, pivoted_order, rise_over_range
+from hvdc_ident.sensitivity import rise_over_range
 
 DRAWS = 999
 SCATTER = 0.1
 """The 95 % quantile of so many draws scatters by 0.08 of itself (sqrt(p (1 - p)/n) over the density): less is no difference."""
+TRIED = 6
+"""At most so many exchanged points are begun from: about a third of what the profiles of as many parameters cost."""
+EVALUATIONS = 25
+"""A descent that has not come near by then is given up."""
+NEAR = 10.0
+"""Ends of the multistart whose cost is more than so many thresholds above the best are optima of their own, but no rivals."""
+SAME = 1e-3
+"""Points that differ by less in every scaled coordinate are one."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How well one parameter is known. std: in its unit. threshold: rise of the cost at the ends of its interval."""
+    """Uncertainty of one parameter. std: in its unit. threshold: rise of the cost at the ends of its interval."""
 
     std: float
     threshold: float
 
 
-def thresholds(optimum: Optimum) -> dict[str, float]:
+def thresholds(optimum: LocalAnalysis) -> dict[str, float]:
     """The rise of the cost at the ends of each parameter's 95 % interval: see `spreads`."""
     return {n: s.threshold for n, s in spreads(optimum).items()}
 
 
-def spreads(optimum: Optimum) -> dict[str, Spread]:
+def spreads(optimum: LocalAnalysis) -> dict[str, Spread]:
     """The standard deviation of each parameter, and the rise of the cost at the ends of its 95 % interval.
 
     The rise is 1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error
@@ -63,38 +72,6 @@ def spreads(optimum: Optimum) -> dict[str, Spread]:
     return {n: Spread(float(s), float(v)) for n, s, v in zip(optimum.names, stds, limits, strict=False)}
 
 
-def told_by_noise(whole: Optimum, kept: Sequence[str], others: Sequence[str]) -> dict[str, float]:
-    """By parameter of `others` the half-width, in its unit, of the 95 % interval that the noise alone would leave it.
-
-    whole: all candidates free. kept: those fitted anyway. Only those are in it that can be told beside them: the best
-    determined first, as long as no direction is lost and every interval is narrower than its bounds. The misfit has no
-    part in it, so this is what the records could tell of a model that explains them (Cramer and Rao's bound, at first order).
-    """
-    free = {f.name: f for f in whole.problem.free}
-    names = [n for n in whole.names if n in kept or n in others]
-    matrix = whole.information.select(names).matrix
-    slope = dict(zip(whole.problem.names, whole.slope.tolist(), strict=True))
-    order = [names[i] for i in pivoted_order(matrix)]
-    chosen, found = [n for n in order if n in kept], dict[str, float]()
-    for n in (n for n in order if n in others):
-        trial = [*chosen, n]
-        part = whole.information.select(trial).matrix
-        if len(independent(part, whole.error)) < len(trial):
-            continue
-        lengths = np.sqrt(np.diag(part))
-        inverse = np.linalg.inv(part / np.outer(lengths, lengths))
-        halves = np.sqrt(2.0 * TWO_SIDED * np.diag(inverse)) / lengths
-        if all(h * slope[m] < _room(free[m], whole.value(m)) for m, h in zip(trial, halves.tolist(), strict=True)):
-            chosen = trial
-            found[n] = float(halves[-1] * slope[n])
-    return found
-
-
-def _room(free: FitParameter, value: float) -> float:
-    """Half of the range between the bounds as the unknown is scaled, in its unit at `value`; infinite without bounds."""
-    return 0.5 * (value * math.log(free.max / free.min) if free.log else free.max - free.min)
-
-
 def range_of(free: FitParameter, value: float, reach: float) -> tuple[float, float]:
     """The range that a verdict speaks of: the bounds; where there is none, as far from the value as profiles are walked.
 
@@ -105,8 +82,8 @@ def range_of(free: FitParameter, value: float, reach: float) -> tuple[float, flo
     return low, high
 
 
-def rise_at_ends(optimum: Optimum, i: int, ends: tuple[float, float]) -> float | None:
-    """How much the cost rises at the worse end of the range, the others re-fitted; None where an end cannot be run."""
+def rise_at_ends(optimum: LocalAnalysis, i: int, ends: tuple[float, float]) -> float | None:
+    """Rise of the cost at the worse end of the range, the others re-fitted; None where an end cannot be run."""
     fixed = np.arange(optimum.theta.size) == i
     rises = []
     for end in ends:
@@ -120,13 +97,13 @@ def rise_at_ends(optimum: Optimum, i: int, ends: tuple[float, float]) -> float |
 
 
 def physical_bounds(problem: Problem) -> dict[str, tuple[bool, bool]]:
-    """By parameter whether its bounds are the model's own."""
-    own = problem.simulator.parameters
-    return {f.name: (f.min == own[f.name].min, f.max == own[f.name].max) for f in problem.free}
+    """By parameter two flags: its lower and its upper bound is the model's own."""
+    parameters = problem.simulator.parameters
+    return {f.name: (f.min == parameters[f.name].min, f.max == parameters[f.name].max) for f in problem.free}
 
 
-def undetermined(optimum: Optimum, p: Profile, ends: tuple[float, float]) -> bool:
-    """Return whether a profile has no crossing on a side and, at the optimum, no curvature: only a far limit is known.
+def undetermined(optimum: LocalAnalysis, p: Profile, ends: tuple[float, float]) -> bool:
+    """Return True where a profile has no crossing on a side and, at the optimum, no curvature: only a far limit is known.
 
     A level that no record reaches is one. By its curvature the whole range between the ends would then change nothing (the
     rule for insensitive parameters), so every value up to the bound is as good, and which one a search ended at is chance.
@@ -139,11 +116,11 @@ def undetermined(optimum: Optimum, p: Profile, ends: tuple[float, float]) -> boo
 
 
 def bounded(p: Profile) -> bool:
-    """Whether the interval is known: both ends, or the one that a parameter on its bound has."""
+    """Return True where the interval is known: both ends, or the one that a parameter on its bound has."""
     return p.closed or (p.one_sided and "closed" in (p.lower.status, p.upper.status))
 
 
-def partner(optimum: Optimum, i: int) -> str:
+def partner(optimum: LocalAnalysis, i: int) -> str:
     """The parameter whose column is most like the i-th."""
     matrix = optimum.information.matrix
     size = np.sqrt(np.diag(matrix))
@@ -154,8 +131,8 @@ def partner(optimum: Optimum, i: int) -> str:
 
 
 def joint_limits(
-    optimum: Optimum,
-    found: Mapping[str, Profile],
+    optimum: LocalAnalysis,
+    walked: Mapping[str, Profile],
     limits: Mapping[str, float],
     again: Callable[[Mapping[str, float]], Mapping[str, Profile]],
     *,
@@ -167,26 +144,26 @@ def joint_limits(
     linearised at the limit gives the rise that 95 % of the samples stay below. again: walks the profiles of some unknowns
     to other thresholds.
     """
-    on_bound = [n for n, p in found.items() if p.one_sided]
+    on_bound = [n for n, p in walked.items() if p.one_sided]
     if len(on_bound) < 2:
-        return FrozenMap(found)
+        return FrozenMap(walked)
     other: dict[str, float] = {}
     for n in on_bound:
-        crossing = next((c for c in (found[n].lower.crossing, found[n].upper.crossing) if c is not None), None)
+        crossing = next((c for c in (walked[n].lower.crossing, walked[n].upper.crossing) if c is not None), None)
         if crossing is None:
             continue
-        there = found[n].thetas[int(np.argmin(np.abs(found[n].values - crossing)))]
-        rise = bootstrap_rise(optimum, n, crossing, seed, there)
+        near = walked[n].thetas[int(np.argmin(np.abs(walked[n].values - crossing)))]
+        rise = bootstrap_rise(optimum, n, crossing, seed, near)
         if rise > 0 and abs(rise - ONE_SIDED) > SCATTER * ONE_SIDED:
             other[n] = limits[n] * rise / ONE_SIDED
-    return FrozenMap({**found, **again(other)} if other else found)
+    return FrozenMap({**walked, **again(other)} if other else walked)
 
 
-def bootstrap_rise(optimum: Optimum, name: str, value: float, seed: int = 0, near: Array | None = None) -> float:
-    """The 95 % quantile of the rise at the true value of `name`, where estimates stop at their bounds; 0 where it says nothing.
+def bootstrap_rise(optimum: LocalAnalysis, name: str, value: float, seed: int = 0, near: Array | None = None) -> float:
+    """The 95 % quantile of the rise at the true value of `name`, where estimates stop at their bounds; 0 without information.
 
     Noise is drawn for the problem linearised, in scaled coordinates, at the point of the profile where `name` has the
-    value: at the optimum a parameter on its bound may have no derivative left. near: (p,) where the search for it begins.
+    value: at the optimum a parameter on its bound may have no derivative left. near: (p,) where the search for it starts.
     Raises SimulationError.
     """
     problem, space = optimum.problem, optimum.problem.coordinates
@@ -216,7 +193,9 @@ def _cost(g: Array, h: Array, p: Array) -> float:
     return float(g @ p + 0.5 * p @ h @ p)
 
 
-def pair_of(optimum: Optimum, found: Mapping[str, Verdict], names: tuple[str, str], points: int = 13) -> PairProfile:
+def pair_of(
+    optimum: LocalAnalysis, verdicts: Mapping[str, Verdict], names: tuple[str, str], points: int = 13
+) -> PairProfile:
     """The common profile of two fitted parameters, over twice their intervals but within the bounds.
 
     Its rises are in units of the threshold for one parameter, so 95 % of both together lie within JOINT/1.92.
@@ -224,7 +203,7 @@ def pair_of(optimum: Optimum, found: Mapping[str, Verdict], names: tuple[str, st
     grids = []
     for n in names:
         u = optimum.problem.unknowns[optimum.problem.names.index(n)]
-        v = found[n]
+        v = verdicts[n]
         low, high = v.ci95 or (None, None)
         half = 0.5 * (high - low) if low is not None and high is not None else 0.25 * u.span
         centre = optimum.value(n)
@@ -232,3 +211,86 @@ def pair_of(optimum: Optimum, found: Mapping[str, Verdict], names: tuple[str, st
     limit = max(thresholds(optimum)[n] for n in names)
     pair = profile_pair(LeastSquares.of(optimum.problem), optimum.theta, names, *grids, enough=1e-3 * limit)
     return replace(pair, rises=pair.rises / limit)
+
+
+@dataclass(frozen=True)
+class OtherOptimum:
+    """An optimum as good as the best within the noise. values: by unknown, in its unit; rise: of the cost above the best."""
+
+    values: FrozenMap[float]
+    rise: float
+
+
+def other_optima(
+    best: LocalAnalysis, limits: Mapping[str, float], ends: Sequence[tuple[Mapping[str, float], float]]
+) -> tuple[OtherOptimum, ...]:
+    """The optima whose cost is less than the largest of the limits above the best one's, or below it, the lowest first.
+
+    limits: the rise of the cost at the ends of each parameter's interval. ends: where the starts of the multistart ended,
+    with their costs. The search starts from those, and from the best with two parameters of one unit exchanged, the most
+    alike in their effect first, or with a sign turned: that is where the usual second solutions lie.
+    """
+    objective, space = LeastSquares.of(best.problem), best.problem.coordinates
+    limit = max(limits.values())
+
+    def same_basin(theta: Array) -> bool:
+        """Return True where a point is the best one but for the roughness of the cost."""
+        return best.trend is not None and best.trend.holds(theta, limit)
+
+    known = [space.scaled(best.theta)]
+    starts: list[Array] = []
+    for theta in (*_ended(best, ends, limit), *_exchanged(best)):
+        if _new(space.scaled(theta), known) and not same_basin(theta):
+            known.append(space.scaled(theta))
+            starts.append(theta)
+    rivals: list[DescentResult] = []
+    reached = [space.scaled(best.theta)]
+    for theta in starts:
+        try:
+            end = descend(
+                objective, theta, np.zeros(theta.size, dtype=bool), enough=1e-4 * limit, max_evaluations=EVALUATIONS
+            )
+        except SimulationError:
+            continue
+        if end.at.cost - best.cost < limit and _new(space.scaled(end.theta), reached) and not same_basin(end.theta):
+            reached.append(space.scaled(end.theta))
+            rivals.append(end)
+    rivals.sort(key=lambda r: r.at.cost)
+    names = best.problem.names
+    return tuple(
+        OtherOptimum(FrozenMap(zip(names, map(float, r.theta), strict=True)), r.at.cost - best.cost) for r in rivals
+    )
+
+
+def _new(x: Array, known: Sequence[Array]) -> bool:
+    return not any((np.abs(x - k) <= SAME).all() for k in known)
+
+
+def _ended(best: LocalAnalysis, ends: Sequence[tuple[Mapping[str, float], float]], limit: float) -> Iterator[Array]:
+    for values, cost in ends:
+        if cost - best.cost < NEAR * limit:
+            theta = [values.get(n, best.value(n)) for n in best.problem.names]
+            yield np.array(theta, dtype=float)
+
+
+def _exchanged(best: LocalAnalysis) -> Iterator[Array]:
+    """The best point with two values exchanged, or a sign turned, where the bounds admit it."""
+    free, parameters = best.problem.free, best.problem.simulator.parameters
+    matrix = best.information.matrix
+    d = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
+    alike = np.abs(matrix / np.outer(d, d))
+    places: list[tuple[float, Array]] = []
+    for i, j in combinations(range(len(free)), 2):
+        a, b = best.theta[i], best.theta[j]
+        fits = free[i].min <= b <= free[i].max and free[j].min <= a <= free[j].max
+        if fits and parameters[free[i].name].unit == parameters[free[j].name].unit:
+            theta = best.theta.copy()
+            theta[i], theta[j] = b, a
+            places.append((float(alike[i, j]), theta))
+    for i, u in enumerate(free):
+        if u.min <= -best.theta[i] <= u.max:
+            theta = best.theta.copy()
+            theta[i] = -theta[i]
+            places.append((1.0, theta))
+    places.sort(key=lambda p: -p[0])
+    yield from (theta for _, theta in places[:TRIED])

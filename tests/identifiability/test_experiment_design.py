@@ -11,10 +11,16 @@ from hvdc_ident.data import InputSignal
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability import identifiability
-from hvdc_ident.identifiability.merit import half_widths, merit
-from hvdc_ident.identifiability.pilot import pilot
-from hvdc_ident.identifiability.recommend import recommend
-from hvdc_ident.identifiability.trial import Move, Trial, double_trials, single_trials
+from hvdc_ident.identifiability.experiment_design import (
+    ExperimentDesign,
+    Move,
+    half_widths,
+    optimality,
+    recommend,
+    single_input_designs,
+    two_step_designs,
+)
+from hvdc_ident.identifiability.pilot_fit import pilot_fit
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import ModelSimulator
 from tests.fit.simulators import line
@@ -41,8 +47,8 @@ def report_of(model, signals, outputs=("y",), free=FREE):
 def test_the_input_that_shows_what_is_not_seen_is_recommended() -> None:
     report = report_of(two_inputs(), {"u": InputSignal.step(1.0, 0.0, 1.0)})
     found = report.recommended
-    assert found is not None and "w" in found.best.trial.inputs
-    assert found.now.seen == 1 and found.best.then.seen == 2
+    assert found is not None and "w" in found.best.design.inputs
+    assert found.now.directions == 1 and found.best.criteria.directions == 2
     assert found.half_widths_now["k"] is None and found.half_widths["k"] is not None
     assert "k would be known to ±" in found.text and "(now not at all)" in found.text
 
@@ -53,8 +59,8 @@ def test_the_predicted_interval_is_what_the_experiment_gives() -> None:
     free = [FREE[0], FitParameter("k", 1.5, 0.1, 15)]
     first = on_model(model, "e", {"u": InputSignal.step(1.0, 0.0, 1.0)}, ["y"], 1e-3)
     report = identifiability(model, [first], free, starts=2)
-    trial = report.recommended.best.trial
-    made = trial.experiment(first)
+    design = report.recommended.best.design
+    made = design.experiment(first)
     second = on_model(model, "made", dict(made.inputs), list(report.recommended.best.record), 1e-3, seed=5)
     after = identifiability(model, [first, second], free, starts=2)
     for n in ("a", "k"):
@@ -66,40 +72,40 @@ def test_a_signal_is_recommended_where_only_it_tells_a_combination_apart() -> No
     model = pi_loop()
     free = [FitParameter(n, 1.3 * v, v / 10, v * 10) for n, v in model.values.items()]
     found = report_of(model, {"r": InputSignal.step(1.0, 0.0, 1.0)}, free=free).recommended
-    assert found.best.new == ("control",) and found.best.then.seen == 4 > found.now.seen
+    assert found.best.new == ("control",) and found.best.criteria.directions == 4 > found.now.directions
     assert "recording control besides" in found.text
     assert all(found.half_widths[n] is not None for n in model.values)
 
 
 def test_the_best_are_best_of_all_that_were_tried() -> None:
-    """Against every trial weighed anew by its eigenvalues, with sensitivities from the engine."""
+    """Against every design weighed anew by its eigenvalues, with sensitivities from the engine."""
     model = two_inputs()
     signals = {"u": InputSignal.step(1.0, 0.0, 1.0), "w": InputSignal.step(2.0, 0.0, 0.1)}
     data = on_model(model, "e", signals, ["y"], 1e-3)
     problem = Problem(ModelSimulator(model), (data,), tuple(FREE))
-    optimum, _ = pilot(problem, starts=1)
+    optimum, _ = pilot_fit(problem, starts=1)
     found = recommend(optimum, model.inputs, {}, thresholds={"a": 1.92, "k": 1.92})
     base = optimum.information.matrix
     units = dict.fromkeys(model.inputs, "")
-    singles = list(single_trials([data], {"u": 0.0, "w": 0.0}, units, data))
+    singles = list(single_input_designs([data], {"u": 0.0, "w": 0.0}, units, data))
     assert {t.kind for t in singles} == {"step", "ramp", "multisine"} and len(singles) == 10
     steps = [t for t in singles if t.kind == "step"]
-    trials = [*singles, *double_trials(steps, singles, data)]
+    designs = [*singles, *two_step_designs(steps, singles, data)]
     smallest, determinants = [], []
-    for trial in trials:
-        run = ModelSimulator(model).simulate(trial.experiment(data), problem.values(optimum.theta), optimum.names)
+    for design in designs:
+        run = ModelSimulator(model).simulate(design.experiment(data), problem.values(optimum.theta), optimum.names)
         j = run.gradient("y") * optimum.slope / 1e-3
         values = np.linalg.eigvalsh(base + j.T @ j)
         smallest.append(values[0])
         determinants.append(float(np.log(values).sum()))
-    assert found.best.then.smallest >= 0.99 * max(smallest)
-    assert found.by_determinant.then.determinant >= max(determinants) - 1e-6
-    orders = [r.then.smallest for r in found.others]
+    assert found.best.criteria.smallest_eigenvalue >= 0.99 * max(smallest)
+    assert found.by_determinant.criteria.log_determinant >= max(determinants) - 1e-6
+    orders = [r.criteria.smallest_eigenvalue for r in found.others]
     assert all(a >= 0.98 * b for a, b in pairwise(orders))
-    assert len({(r.trial.kind, frozenset(r.trial.inputs)) for r in found.others}) == len(found.others)
+    assert len({(r.design.kind, frozenset(r.design.inputs)) for r in found.others}) == len(found.others)
 
 
-def test_trials_are_the_signals_they_say() -> None:
+def test_designs_are_the_signals_they_say() -> None:
     data = on_model(two_inputs(), "e", {"u": InputSignal.step(1.0, 0.0, 0.5)}, ["y"], 1e-3).with_(event=1.0)
     ramp = Move("u", "ramp", 1.0, 1.5, 1.0, 2.0)
     assert float(ramp.signal(6.0)(np.array(2.0))) == pytest.approx(1.25)
@@ -110,12 +116,14 @@ def test_trials_are_the_signals_they_say() -> None:
     one = signal.values[1:][: 320 * 2].reshape(2, 320)  # two periods of the slowest
     spectrum = np.abs(np.fft.rfft(one[0] - 1.0))
     assert set(np.argsort(spectrum)[-5:]) == {1, 2, 4, 8, 16} and np.allclose(one[0], one[1], atol=1e-9)
-    both = Trial((Move("u", "step", 0.0, 0.5, 1.0), Move("w", "step", 0.0, -0.1, 3.5)))
+    both = ExperimentDesign((Move("u", "step", 0.0, 0.5, 1.0), Move("w", "step", 0.0, -0.1, 3.5)))
     assert both.kind == "step + step"
     assert both.text({"u": "V"}) == "Step u from 0 to 0.5 V and, 2.5 s later, step w from 0 to -0.1"
     made = both.experiment(data)
     assert made.event == 1.0 and not made.outputs and set(made.inputs) == {"u", "w"}
-    moved = {t.inputs[0]: t.moves[0].after for t in single_trials([data], {"u": 0.0, "w": 2.0, "v": 0.0}, {}, data)}
+    moved = {
+        t.inputs[0]: t.moves[0].after for t in single_input_designs([data], {"u": 0.0, "w": 2.0, "v": 0.0}, {}, data)
+    }
     assert moved["w"] == pytest.approx(2.1) and moved["v"] == pytest.approx(0.1)
 
 
@@ -132,9 +140,11 @@ def test_a_simulator_that_names_no_inputs_is_moved_where_experiments_moved_it() 
     assert {n: i.value for n, i in inputs_of(closed(line, a=0.0, b=0.0), [data]).items()} == {"u": 0.25}
 
 
-def test_merit_and_half_widths_of_a_known_matrix() -> None:
+def test_optimality_and_half_widths_of_a_known_matrix() -> None:
     m = np.diag([4.0, 100.0, 0.0])
-    found = merit(m, 1e-6)
-    assert (found.seen, found.smallest) == (2, 4.0) and found.determinant == pytest.approx(np.log(400))
+    found = optimality(m, 1e-6)
+    assert (found.directions, found.smallest_eigenvalue) == (2, 4.0) and found.log_determinant == pytest.approx(
+        np.log(400)
+    )
     widths = half_widths(m, np.array([1.0, 2.0, 3.0]), "abc", 1e-6)
     assert widths["a"] == pytest.approx(0.5) and widths["b"] == pytest.approx(0.2) and widths["c"] is None

@@ -15,10 +15,10 @@ from hvdc_ident.fit.bootstrap import bootstrap, cluster_sandwich
 from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import JOINT, profile_pair, profiles
 from hvdc_ident.identifiability import identifiability
-from hvdc_ident.identifiability.combinations import in_words
-from hvdc_ident.identifiability.evidence import bootstrap_rise, thresholds
-from hvdc_ident.identifiability.heterogeneity import heterogeneity
-from hvdc_ident.identifiability.pilot import Optimum, pilot
+from hvdc_ident.identifiability.likelihood_intervals import bootstrap_rise, thresholds
+from hvdc_ident.identifiability.misspecification import heterogeneity
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
+from hvdc_ident.identifiability.structural import in_words
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import coloured, decay, line, recorded
 from tests.identifiability.cases import T, closed, measured, saturating
@@ -42,7 +42,7 @@ def test_experiments_that_disagree_set_the_flag_with_their_spread() -> None:
 
 def test_q_is_chi_square_where_they_agree() -> None:
     q = [
-        heterogeneity(pilot(Problem(LINE, tuple(slopes([2.0] * 4, seed=10 * s)), FREE), starts=1)[0])["b"]
+        heterogeneity(pilot_fit(Problem(LINE, tuple(slopes([2.0] * 4, seed=10 * s)), FREE), starts=1)[0])["b"]
         for s in range(60)
     ]
     assert all(h.dof == 3 for h in q)
@@ -53,7 +53,7 @@ def test_bootstrap_and_sandwich_see_the_scatter_between_experiments() -> None:
     rng = np.random.default_rng(3)
     truth = 2 + 0.3 * rng.normal(size=12)
     problem = Problem(LINE, tuple(slopes(truth, 0.01)), FREE)
-    optimum, _ = pilot(problem, starts=1)
+    optimum, _ = pilot_fit(problem, starts=1)
     covariance, dof = cluster_sandwich(optimum.blocks)
     wanted = truth.std(ddof=1) / sqrt(12)
     assert dof == 11 and sqrt(covariance[1, 1]) == pytest.approx(wanted, rel=0.15)
@@ -96,7 +96,7 @@ def coverage(rho: float, given: bool, runs: int) -> dict[str, int]:
     for seed in range(runs):
         y = decay(T, truth)[0] + coloured(np.random.default_rng(seed), T.size, rho, 0.15)
         data = recorded("e", T, {"y": 0.15} if given else {}, y=y)
-        optimum, _ = pilot(Problem(plant, (data,), free), starts=1)
+        optimum, _ = pilot_fit(Problem(plant, (data,), free), starts=1)
         found = profiles(LeastSquares.of(optimum.problem), optimum.theta, threshold=thresholds(optimum))
         for n, v in truth.items():
             low, high = found.by_name[n].ci95
@@ -138,7 +138,7 @@ def test_two_on_their_bounds_together_get_limits_that_cover() -> None:
 def test_the_bootstrap_of_one_on_its_bound_is_the_known_quantile() -> None:
     plant = closed(line, a=0.0, b=Parameter(0.1, min=0.0))
     free = (FitParameter("a", 0.0, -9, 9), FitParameter("b", 0.1, 0.0, 9.0))
-    optimum, _ = pilot(Problem(plant, (measured(plant, {"a": 1, "b": 0.0}, 0.05),), free), starts=1)
+    optimum, _ = pilot_fit(Problem(plant, (measured(plant, {"a": 1, "b": 0.0}, 0.05),), free), starts=1)
     assert bootstrap_rise(optimum, "b", 5.0) == pytest.approx(1.353, rel=0.15)
 
 
@@ -178,6 +178,6 @@ def test_identify_and_fit_call_the_same_misfit_larger_than_the_noise(tone, flagg
     record = recorded("e", record.time, {"y": 0.01}, y=y)
     problem = Problem(simulator, (record,), (FitParameter("a", 2.0, 0.1, 10.0), FitParameter("k", 3.0, 0.1, 20.0)))
     result = fit(problem, starts=1)
-    at = Optimum(problem, np.array([result.values["a"], result.values["k"]]))
+    at = LocalAnalysis(problem, np.array([result.values["a"], result.values["k"]]))
     assert at.excess == pytest.approx(result.adequacy.widening)
     assert (at.excess > 1.0) == flagged

@@ -1,0 +1,473 @@
+"""The next experiment to make: designs of steps, ramps and multisines, ranked by the information that they would add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment, InputSignal
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.frequency_data import in_time
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.parameters import Input
+from hvdc_ident.sensitivity import independent
+from hvdc_ident.text import listed
+
+Shape = Literal["step", "ramp", "multisine"]
+FACTORS = (1.0, -1.0, 2.0)
+"""Levels of a step, in multiples of the largest move of that input so far."""
+UNMOVED = 0.05
+"""An input that was never moved is moved by this share of its value, or of what inputs of its unit usually are."""
+HARMONICS = (1, 2, 4, 8, 16)
+PER_PERIOD = 20
+"""Points of the fastest sine in a period."""
+HOPELESS = 1e3
+"""A half-width of more than so many units of the scaled coordinate is no knowledge."""
+WORTH = 0.9
+"""An interval that does not shrink below this share of what it is now is no gain to speak of."""
+NAMED = 3
+NEW_SIGNAL = 1.1
+"""Recording another signal is advised only where it raises the smallest eigenvalue by more than this factor."""
+EQUAL = 0.01
+"""Designs whose smallest eigenvalue is within this share of the best are equals: the larger determinant is taken."""
+ADDED = 0.1
+"""A second step that raises the logarithm of the determinant by less adds nothing."""
+BEGUN_WITH = 3
+"""So many of the best single steps are tried with a second step of every other input."""
+LISTED = 8
+
+
+@dataclass(frozen=True)
+class Move:
+    """Move of one input. before, after: in its unit (of a multisine the middle and the highest value); at: s;
+    seconds: duration of a ramp, or a multisine's slowest period."""
+
+    input: str
+    shape: Shape
+    before: float
+    after: float
+    at: float
+    seconds: float = 0.0
+
+    @property
+    def frequencies(self) -> tuple[float, ...]:
+        """Frequencies of a multisine, Hz; empty for the others."""
+        return tuple(k / self.seconds for k in HARMONICS) if self.shape == "multisine" else ()
+
+    def signal(self, end: float) -> InputSignal:
+        """The input up to `end`, s."""
+        if self.shape == "step":
+            return InputSignal.step(self.at, self.before, self.after)
+        if self.shape == "ramp":
+            return InputSignal.ramp(self.at, self.before, self.at + self.seconds, self.after)
+        time = np.arange(self.at, end, self.seconds / (HARMONICS[-1] * PER_PERIOD))
+        values = self.before + (self.after - self.before) * _multisine((time - self.at) / self.seconds)
+        return InputSignal(np.r_[self.at, time], np.r_[self.before, values], time)
+
+    def text(self, units: Mapping[str, str]) -> str:
+        """The move in words, to begin a sentence with."""
+        unit = f" {units[self.input]}" if units.get(self.input) else ""
+        if self.shape == "multisine":
+            hertz = ", ".join(f"{f:.3g}" for f in self.frequencies)
+            size = abs(self.after - self.before)
+            return f"superimpose on {self.input} ({self.before:g}{unit}) sines of {hertz} Hz together, peak {size:.4g}{unit}"
+        span = f"{self.input} from {self.before:g} to {self.after:g}{unit}"
+        return f"step {span}" if self.shape == "step" else f"ramp {span} in {self.seconds:.3g} s"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The move as JSON takes it."""
+        more: dict[str, Any] = {"seconds": self.seconds} if self.shape == "ramp" else {}
+        if self.shape == "multisine":
+            more = {"frequencies_hz": list(self.frequencies)}
+        return {"input": self.input, "shape": self.shape, "from": self.before, "to": self.after, "at": self.at, **more}
+
+
+def _multisine(phase: Array) -> Array:
+    """Sines of equal size with Schroeder's phases (doi 10.1109/TIT.1970.1054411), largest value 1, over so many periods."""
+    count = len(HARMONICS)
+    parts = [np.sin(2 * np.pi * k * phase - np.pi * i * (i + 1) / count) for i, k in enumerate(HARMONICS)]
+    whole = np.sum(parts, axis=0)
+    return np.asarray(whole / np.abs(whole).max())
+
+
+@dataclass(frozen=True)
+class ExperimentDesign:
+    """One experiment that could be made; of two moves the second comes when the first has had half of the time."""
+
+    moves: tuple[Move, ...]
+
+    @property
+    def kind(self) -> str:
+        """Step, ramp or multisine; "step + step" where a second input follows."""
+        return " + ".join(m.shape for m in self.moves)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The inputs that move."""
+        return tuple(m.input for m in self.moves)
+
+    def experiment(self, template: Experiment) -> Experiment:
+        """The experiment over the template's instants; nothing is recorded, so every output is given."""
+        end = float(template.time[-1])
+        signals = FrozenMap({m.input: m.signal(end) for m in self.moves})
+        return Experiment(template.time, self.kind, inputs=signals, event=self.moves[0].at)
+
+    def text(self, units: Mapping[str, str]) -> str:
+        """The design in words, without a full stop."""
+        words = self.moves[0].text(units)
+        if len(self.moves) > 1:
+            words += f" and, {self.moves[1].at - self.moves[0].at:.3g} s later, {self.moves[1].text(units)}"
+        return words[:1].upper() + words[1:]
+
+
+def single_input_designs(
+    experiments: Sequence[Experiment], inputs: Mapping[str, float], units: Mapping[str, str], template: Experiment
+) -> Iterator[ExperimentDesign]:
+    """Every input alone: three steps, a ramp and a multisine. inputs: start values; units: of the inputs."""
+    at, duration = _begin(template)
+    for name, value in inputs.items():
+        move = _move_size(name, experiments, inputs, units)
+        for factor in FACTORS:
+            yield ExperimentDesign((Move(name, "step", value, _rounded(value + factor * move), at),))
+        yield ExperimentDesign((Move(name, "ramp", value, _rounded(value + move), at, duration / 4.0),))
+        yield ExperimentDesign((Move(name, "multisine", value, _rounded(value + abs(move)), at, duration / 2.0),))
+
+
+def two_step_designs(
+    first: Sequence[ExperimentDesign], singles: Sequence[ExperimentDesign], template: Experiment
+) -> Iterator[ExperimentDesign]:
+    """Each of the given steps, followed half-way through the record by a step of another input at its first level."""
+    at, duration = _begin(template)
+    seconds: dict[str, Move] = {}
+    for design in singles:
+        if design.kind == "step":
+            seconds.setdefault(design.inputs[0], design.moves[0])
+    for design in first:
+        move = design.moves[0]
+        for name, other in seconds.items():
+            if name != move.input:
+                yield ExperimentDesign((move, Move(name, "step", other.before, other.after, at + duration / 2.0)))
+
+
+def _begin(template: Experiment) -> tuple[float, float]:
+    """Return when the design begins and how long it then lasts, s."""
+    time = template.time
+    at = template.event if template.event is not None else float(time[0] + 0.1 * np.ptp(time))
+    return at, max(float(time[-1]) - at, 1e-3 * float(np.ptp(time)))
+
+
+def _move_size(
+    name: str, experiments: Sequence[Experiment], inputs: Mapping[str, float], units: Mapping[str, str]
+) -> float:
+    """Return the largest move of the input made so far, with its sign; a usual one where it never moved."""
+    signals = [e.inputs[name] for e in experiments if name in e.inputs and name not in e.drive]
+    moves = [s.values - s.values[0] for s in signals]
+    largest = max((float(m[np.argmax(np.abs(m))]) for m in moves), key=abs, default=0.0)
+    if largest:
+        return largest
+    same_unit = [abs(v) for n, v in inputs.items() if v and units.get(n, "") == units.get(name, "")]
+    return UNMOVED * (abs(inputs[name]) or (float(np.median(same_unit)) if same_unit else 1.0))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.12g}")
+
+
+@dataclass(frozen=True)
+class OptimalityCriteria:
+    """Criteria of an information matrix: how many directions are seen, the smallest of their eigenvalues (E-optimality),
+    and the logarithm of the product of their eigenvalues (D-optimality)."""
+
+    directions: int
+    smallest_eigenvalue: float
+    log_determinant: float
+
+
+def optimality(matrix: Array, error: float) -> OptimalityCriteria:
+    """Return the criteria of a (p, p) matrix whose columns are known to a relative error."""
+    values = np.linalg.eigvalsh(matrix)
+    seen = values[values > error**2 * max(values[-1], 1e-300)]
+    if not seen.size:
+        return OptimalityCriteria(0, 0.0, -np.inf)
+    return OptimalityCriteria(int(seen.size), float(seen[0]), float(np.log(seen).sum()))
+
+
+def half_widths(matrix: Array, per_std: Array, names: Sequence[str], error: float) -> FrozenMap[float | None]:
+    """Half the first-order 95 % interval by parameter; None where it is not determined.
+
+    Where only combinations are seen, as few as possible are taken as known, and those have None. per_std: (p,) half-width
+    of a scaled coordinate whose standard deviation is 1, in the parameter's unit.
+    """
+    kept = sorted(independent(matrix, error))
+    found: dict[str, float | None] = dict.fromkeys(names)
+    if kept:
+        part = matrix[np.ix_(kept, kept)]
+        d = np.sqrt(np.diag(part))
+        std = np.sqrt(np.diag(np.linalg.inv(part / np.outer(d, d)))) / d
+        for i, s in zip(kept, std.tolist(), strict=True):
+            if s <= HOPELESS:
+                found[names[i]] = s * float(per_std[i])
+    return FrozenMap(found)
+
+
+@dataclass(frozen=True, eq=False)
+class RankedDesign:
+    """A design with the signals to record, and what would be known of the candidates with it added.
+
+    criteria: of the information with it added. gain: (p, p) the information it adds, in scaled coordinates.
+    """
+
+    design: ExperimentDesign
+    record: tuple[str, ...]
+    new: tuple[str, ...]
+    criteria: OptimalityCriteria
+    gain: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """The experiment that raises the smallest eigenvalue of the information most (E-optimal), of those tried.
+
+    best: the experiment. by_determinant: the one that raises the determinant most (D-optimal). now: the criteria of the
+    information without either. half_widths_now, half_widths: of the 95 % intervals by parameter, in its unit, to first
+    order, at the values found or held, only as good as the noise assumed; None where it stays open. values: the
+    parameters' values there. others: the best of each other kind and input, best first. tried: how many. failed: those
+    that cannot be simulated, with the reason. text: the advice in words.
+    """
+
+    best: RankedDesign
+    by_determinant: RankedDesign
+    now: OptimalityCriteria
+    half_widths_now: FrozenMap[float | None]
+    half_widths: FrozenMap[float | None]
+    values: FrozenMap[float]
+    others: tuple[RankedDesign, ...]
+    tried: int
+    failed: tuple[str, ...]
+    text: str
+
+    @property
+    def input(self) -> str:
+        """The input that moves first."""
+        return self.best.design.moves[0].input
+
+    def to_dict(self) -> dict[str, Any]:
+        """The recommendation as JSON takes it."""
+        first = self.best.design.moves[0]
+        intervals = {
+            n: None if h is None else [self.values[n] - h, self.values[n] + h] for n, h in self.half_widths.items()
+        }
+        return {
+            "input": first.input,
+            "from": first.before,
+            "to": first.after,
+            **self._line(self.best),
+            "criterion": "E-optimal: the largest smallest eigenvalue of the information in scaled coordinates",
+            "predicted_half_width": dict(self.half_widths),
+            "predicted_ci95": intervals,
+            "half_width_now": dict(self.half_widths_now),
+            "text": self.text,
+            "d_optimal": self._line(self.by_determinant),
+            "others": [self._line(r) for r in self.others],
+            "tried": self.tried,
+            "failed": list(self.failed),
+        }
+
+    def _line(self, r: RankedDesign) -> dict[str, Any]:
+        gain = r.criteria.log_determinant - self.now.log_determinant
+        return {
+            "kind": r.design.kind,
+            "moves": [m.to_dict() for m in r.design.moves],
+            "record": list(r.record),
+            "new_signals": list(r.new),
+            "smallest_eigenvalue": {"now": self.now.smallest_eigenvalue, "then": r.criteria.smallest_eigenvalue},
+            "directions_seen": {"now": self.now.directions, "then": r.criteria.directions},
+            "determinant_gain": gain if r.criteria.directions == self.now.directions else None,
+        }
+
+
+def recommend(
+    whole: LocalAnalysis, inputs: Mapping[str, Input], units: Mapping[str, str], *, thresholds: Mapping[str, float]
+) -> Recommendation | None:
+    """Return the best of the experiments that could be made; None where there is no input to move, or none can be run.
+
+    Tried are, for every input, steps at three levels, a ramp and a multisine; and the best steps followed by a step of
+    every other input; each with the signals recorded so far, and with one more. whole: all candidates free, at the
+    values of the optimum. inputs: the model's. units: of the parameters. thresholds: the rise of the cost at the ends of
+    a parameter's interval, which widens the predicted intervals too.
+    """
+    recordings = in_time(whole.problem.fitted_experiments)
+    if not recordings:
+        return None
+    template = max(recordings, key=lambda e: float(np.ptp(e.time)))
+    values, of_inputs = {n: i.value for n, i in inputs.items()}, {n: i.unit for n, i in inputs.items()}
+    tried = _Ranking(whole)
+    singles = list(single_input_designs(recordings, values, of_inputs, template))
+    ranked = list(tried.ranked(singles))
+    steps: dict[str, ExperimentDesign] = {}  # the best single steps, each of another input
+    for r in sorted(ranked, key=_order, reverse=True):
+        if r.design.kind == "step":
+            steps.setdefault(r.design.inputs[0], r.design)
+    ranked += tried.ranked(two_step_designs([*steps.values()][:BEGUN_WITH], singles, template))
+    if not ranked:
+        return None
+    base = whole.information.matrix
+    best = _e_optimal(ranked)
+    by_determinant = max(
+        ranked, key=lambda r: (r.criteria.directions, r.criteria.log_determinant, -len(r.design.moves))
+    )
+    usual = float(np.median(list(thresholds.values()))) if thresholds else 1.92
+    per_std = whole.slope[: len(whole.names)] * np.sqrt([2.0 * thresholds.get(n, usual) for n in whole.names])
+    now, then = (half_widths(m, per_std, whole.names, whole.error) for m in (base, base + best.gain))
+    at = FrozenMap({n: whole.value(n) for n in whole.names})
+    text = _text(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked))
+    if whole.deterministic:
+        text += " The misfit stands for the noise in these intervals."
+    others = tuple(_others(ranked, best))
+    count = len({r.design for r in ranked})
+    return Recommendation(best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text)
+
+
+class _Ranking:
+    """Designs run and weighed, each with the signals recorded so far and with one more."""
+
+    def __init__(self, whole: LocalAnalysis) -> None:
+        self.whole = whole
+        self.base = whole.information.matrix
+        self.recorded = whole.problem.outputs_in_time
+        self.now = optimality(self.base, whole.error)
+        self.failed: list[str] = []
+
+    def ranked(self, designs: Iterable[ExperimentDesign]) -> Iterator[RankedDesign]:
+        """Yield every way to record each design that can be run."""
+        for design in designs:
+            try:
+                gains = self._gains(design)
+            except SimulationError as error:
+                self.failed.append(f"{design.text({})}: {error.what}")
+                continue
+            plain = sum((gains[o] for o in self.recorded if o in gains), np.zeros_like(self.base))
+            first = optimality(self.base + plain, self.whole.error)
+            yield RankedDesign(design, self.recorded, (), first, plain)
+            for signal in gains:
+                if signal in self.recorded:
+                    continue
+                gain = plain + gains[signal]
+                more = optimality(self.base + gain, self.whole.error)
+                if (more.directions, more.smallest_eigenvalue) > (
+                    first.directions,
+                    first.smallest_eigenvalue * NEW_SIGNAL,
+                ):
+                    yield RankedDesign(design, (*self.recorded, signal), (signal,), more, gain)
+
+    def _gains(self, design: ExperimentDesign) -> dict[str, Array]:
+        """Return the information of each output of the run, in scaled coordinates."""
+        problem, names = self.whole.problem, self.whole.names
+        template = max(in_time(problem.fitted_experiments), key=lambda e: float(np.ptp(e.time)))
+        run = problem.simulator.simulate(design.experiment(template), problem.values(self.whole.theta), names)
+        found = {}
+        for output in run.trajectory.names:
+            gradient = run.gradient(output) * self.whole.slope[: len(names)]
+            if not np.isfinite(gradient).all():
+                raise SimulationError(f"the sensitivity of '{output}' is not finite")
+            gradient = gradient / self._sigma(output, run.trajectory[output], run.trajectory.unit(output))
+            found[output] = gradient.T @ gradient
+        return found
+
+    def _sigma(self, output: str, values: Array, unit: str) -> float:
+        """The noise expected on an output, in its unit: as recorded so far; of a new one, as on others of its unit, or
+        the same share of its largest value."""
+        problem = self.whole.problem
+        by_output = {o: s for table in problem.sigma.values() for o, s in table.items()}
+        if output in by_output:
+            return by_output[output]
+        typical = float(np.median(list(by_output.values())))
+        measured = [(e.measured, o) for e in problem.fitted_experiments for o in e.outputs if e.measured is not None]
+        if any(m.unit(o) == unit for m, o in measured):
+            return typical
+        size = float(np.median([np.nanmax(np.abs(m[o])) for m, o in measured]))
+        share = typical / size if size > 0 else 0.0
+        return share * float(np.abs(values).max()) or typical
+
+
+def _e_optimal(ranked: Sequence[RankedDesign]) -> RankedDesign:
+    """The one with most directions seen and the largest smallest eigenvalue; of equals the larger determinant."""
+    seen = max(r.criteria.directions for r in ranked)
+    most = [r for r in ranked if r.criteria.directions == seen]
+    largest = max(r.criteria.smallest_eigenvalue for r in most)
+    equals = [r for r in most if r.criteria.smallest_eigenvalue >= (1.0 - EQUAL) * largest]
+    return max(equals, key=lambda r: (r.criteria.log_determinant, -len(r.new), -len(r.design.moves)))
+
+
+def _others(ranked: Sequence[RankedDesign], best: RankedDesign) -> Iterator[RankedDesign]:
+    """Yield the best of each other kind and set of inputs, best first; pairs only where the second step adds something."""
+    shown = {(best.design.kind, frozenset(best.design.inputs))}
+    alone: dict[tuple[tuple[Move, ...], tuple[str, ...]], RankedDesign] = {
+        (r.design.moves, r.record): r for r in ranked if len(r.design.moves) == 1
+    }
+    for r in sorted(ranked, key=_order, reverse=True):
+        key = r.design.kind, frozenset(r.design.inputs)
+        single = alone.get((r.design.moves[:1], r.record))
+        if key in shown or (
+            len(r.design.moves) > 1
+            and single is not None
+            and r.criteria.directions <= single.criteria.directions
+            and r.criteria.log_determinant <= single.criteria.log_determinant + ADDED
+        ):
+            continue
+        shown.add(key)
+        yield r
+        if len(shown) > LISTED:
+            return
+
+
+def _order(r: RankedDesign) -> tuple[int, float, float]:
+    """Directions seen, smallest eigenvalue to a hundredth, determinant: larger is better."""
+    return (
+        r.criteria.directions,
+        round(float(np.log(max(r.criteria.smallest_eigenvalue, 1e-300))), 2),
+        r.criteria.log_determinant,
+    )
+
+
+def _text(
+    best: RankedDesign,
+    by_determinant: RankedDesign,
+    now: Mapping[str, float | None],
+    then: Mapping[str, float | None],
+    units: Mapping[str, str],
+    tried: int,
+) -> str:
+    """Return the advice, what it would give for the parameters that gain most, and what stays open all the same."""
+
+    def ratio(name: str) -> float:  # of the interval's width then to now; 0 where it was open
+        before, after = now[name], then[name]
+        return 1.0 if after is None else 0.0 if before is None else after / before if before else 1.0
+
+    def instruction(r: RankedDesign) -> str:
+        record = f"{listed(r.new)} besides the signals so far" if r.new else "the same signals"
+        return f"{r.design.text(units)}, recording {record}"
+
+    def gain(name: str) -> str:
+        before = "not at all" if now[name] is None else f"±{now[name]:.3g}"
+        return f"{name} would be known to ±{then[name]:.3g} {units.get(name, '')}".rstrip() + f" (now {before})"
+
+    gains = sorted((n for n in then if ratio(n) < WORTH), key=ratio)
+    if not gains:
+        return (
+            f"None of the {tried} experiments tried (steps, ramps, multisines and pairs of steps) would narrow an interval "
+            f"by a tenth; the most would come from: {instruction(best)}."
+        )
+    text = f"{instruction(best)}: {', '.join(map(gain, gains[:NAMED]))}."
+    if best.new:
+        text += f" That takes the noise of {listed(best.new)} to be like that of the signals recorded."
+    still_open = [n for n, half in then.items() if half is None]
+    if still_open:
+        text += f" {listed(still_open)} would stay open: only together with others, or not at all, do they show."
+    if by_determinant.design != best.design:
+        text += f" For all parameters taken together most would come from another: {instruction(by_determinant)}."
+    return text

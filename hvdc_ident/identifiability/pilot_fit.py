@@ -1,0 +1,306 @@
+"""The pilot fit, the local analysis at its optimum, and that at the given values before any search."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.errors import FitError, SimulationError
+from hvdc_ident.executor import Executor, Progress
+from hvdc_ident.fit import Problem, fit
+from hvdc_ident.fit.adequacy import adequacy
+from hvdc_ident.fit.multistart import misfit_weights
+from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit, source_of
+from hvdc_ident.fit.nonsmooth import Trend
+from hvdc_ident.fit.objective import LeastSquares, descend
+from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.simulator import sensitivity_error
+from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
+from hvdc_ident.identifiability.structural import combinations_of, parameter_directions
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.sensitivity import Information, independent, marginal
+from hvdc_ident.text import listed, quantity
+
+HALF_95 = 1.96
+"""Half the width of a normal distribution's central 95 %, in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalAnalysis:
+    """A problem at a point theta, (p,), each unknown in its unit: the optimum of a fit, or the given values.
+
+    All that follows from the residuals and their first derivatives there. trend: where the cost is rough, the trend of
+    which the point is the optimum.
+    """
+
+    problem: Problem
+    theta: Array
+    trend: Trend | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, without the nuisances."""
+        return tuple(f.name for f in self.problem.free)
+
+    @property
+    def error(self) -> float:
+        """Relative error of the sensitivities."""
+        return sensitivity_error(self.problem.simulator)
+
+    @cached_property
+    def blocks(self) -> tuple[ResidualBlock, ...]:
+        """Residuals and derivatives."""
+        return self.problem.blocks(self.theta)
+
+    @cached_property
+    def cost(self) -> float:
+        """Half the sum of squared residuals."""
+        return sum(0.5 * float(b.residual @ b.residual) for b in self.blocks)
+
+    @cached_property
+    def slope(self) -> Array:
+        """(p,): length of a scaled coordinate's unit: the value where a parameter is positive, else the range."""
+        rows = [v if u.min > 0 else u.span for u, v in zip(self.problem.unknowns, self.theta, strict=True)]
+        return np.array(rows, dtype=float)
+
+    @cached_property
+    def columns(self) -> Array:
+        """(n, p): whitened sensitivities in scaled coordinates, nuisances last."""
+        return np.vstack([b.jacobian for b in self.blocks]) * self.slope
+
+    @cached_property
+    def information(self) -> Information:
+        """Fisher information on the parameters, the nuisances of each experiment marginalised."""
+        k = len(self.problem.free)
+        matrices: dict[str, Array] = {}
+        for b in self.blocks:
+            scaled = b.jacobian * self.slope
+            matrices[b.experiment] = matrices.get(b.experiment, 0.0) + scaled.T @ scaled
+        kept = {e: marginal(f, range(k)) if f.shape[0] > k else f for e, f in matrices.items()}
+        return Information(self.names, FrozenMap(kept))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Covariance from the curvature, corrected for correlated samples."""
+        source = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
+        spans = np.array([u.span for u in self.problem.unknowns])
+        known = uncertainty(self.blocks, self.problem.names, spans, source, noise_dof=self.problem.noise_dof)
+        return known.on_trend(self.trend, self.problem.names)
+
+    @property
+    def deterministic(self) -> tuple[str, ...]:
+        """Outputs whose standard deviation is the misfit's, for their noise is not known."""
+        experiments = self.problem.fitted_experiments
+        return tuple(o for o in self.problem.outputs if source_of(experiments, o) == MISFIT)
+
+    @cached_property
+    def misfit(self) -> float:
+        """Mean squared residual per degree of freedom: 1 where the model explains the data down to given noise."""
+        n = sum(b.residual.size for b in self.blocks)
+        return 2.0 * self.cost / max(n - self.theta.size, 1)
+
+    @cached_property
+    def excess(self) -> float:
+        """The misfit where `fit.adequacy` calls it larger than the noise told, else 1; 1 without noise."""
+        known = self.uncertainty
+        sources = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
+        return adequacy(self.problem, self.blocks, sources, known.effective, known.rho).widening
+
+    def value(self, name: str) -> float:
+        """The value of an unknown, in its unit."""
+        return float(self.theta[self.problem.names.index(name)])
+
+    def with_held(self, why: Mapping[str, str], values: Mapping[str, float]) -> LocalAnalysis:
+        """Return the optimum with some parameters held, found from this one; its problem has the values they are held at.
+
+        why: the reason by parameter. values: what they are to be held at; where the model cannot be simulated so, they stay
+        at their best values.
+        Raises FitError where nothing is left to fit.
+        """
+        remaining = tuple(f for f in self.problem.free if f.name not in why)
+        if not remaining:
+            raise FitError("nothing is left to fit", got=f"{', '.join(why)} held")
+        theta = np.array([v for n, v in zip(self.problem.names, self.theta, strict=True) if n not in why])
+
+        def moved(to: Mapping[str, float]) -> LocalAnalysis:
+            reduced = replace(self.problem, free=remaining, held=self.problem.held | to, why=self.problem.why | why)
+            end = descend(LeastSquares.of(reduced), theta, np.zeros(theta.size, dtype=bool), enough=1e-6)
+            return LocalAnalysis(reduced, end.theta)
+
+        try:
+            return moved(values)
+        except SimulationError:
+            return moved({n: self.value(n) for n in why})
+
+
+def pilot_fit(
+    problem: Problem,
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> tuple[LocalAnalysis, FitResult]:
+    """Return the best optimum of a multistart over the whole set of unknowns, with the weights of the misfit where needed.
+
+    Raises SimulationError, with the experiment's name, where no start could be simulated.
+    """
+    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress, assess=False)
+    if result.status == "failed":
+        raise _failure(problem, result.message)
+    weights = {
+        o: next(s[o] for s in result.sigma.values() if o in s)
+        for o, source in result.noise_source.items()
+        if from_misfit(source)
+    }
+    weighted = problem.with_(weights={**problem.weights, **weights})
+    theta = [result.values[f.name] for f in problem.free]
+    theta += [result.nuisance[e.name][n].value for e in problem.fitted_experiments for n in e.nuisance]
+    assert len(theta) == len(weighted.names)
+    return LocalAnalysis(weighted, np.array(theta, dtype=float)), result
+
+
+def at_given_values(problem: Problem) -> tuple[LocalAnalysis, FitResult]:
+    """Return the analysis at the given values in place of an optimum, where the structure leaves no candidate to fit.
+
+    Standard deviations that are not given are the misfit's there. Raises SimulationError as `pilot_fit` does.
+    """
+    message = "no pilot fit, for the structure leaves no candidate to fit"
+    try:
+        unknown = [o for o in problem.outputs if source_of(problem.fitted_experiments, o) != GIVEN]
+        weights = misfit_weights(problem, problem.given, unknown)
+    except SimulationError as error:
+        raise _failure(problem, str(error)) from None
+    weighted = problem.with_(weights={**problem.weights, **weights})
+    source = FrozenMap({o: source_of(problem.fitted_experiments, o) for o in problem.outputs})
+    result = FitResult("failed", message, (), FrozenMap(), FrozenMap(problem.held), noise_source=source)
+    return LocalAnalysis(weighted, problem.given), result
+
+
+def failing_experiments(problem: Problem) -> dict[str, SimulationError]:
+    """Return the experiments that cannot be simulated at the start values, each with its error."""
+    found = {}
+    for e in problem.fitted_experiments:
+        alone = problem.with_(experiments=[e])
+        try:
+            alone.cost(alone.start)
+        except SimulationError as error:
+            found[e.name] = error
+    return found
+
+
+def _failure(problem: Problem, message: str) -> SimulationError:
+    """Return the error that says which experiments cannot be simulated, and why the first cannot."""
+    bad = failing_experiments(problem)
+    if not bad:
+        return SimulationError("nothing can be told: the pilot fit failed", got=message, hint="other starts or bounds")
+    first = next(iter(bad.values()))
+    names = ", ".join(f"'{n}'" for n in bad)
+    return SimulationError(
+        f"nothing can be told: {first.what}",
+        where=f"experiment{'s' if len(bad) > 1 else ''} {names}, at the start values",
+        expected=first.expected,
+        got=", ".join(t for t in (first.where.removeprefix(f"experiment '{next(iter(bad))}': "), first.got) if t),
+        hint=f"other start values or bounds, or leave {'them' if len(bad) > 1 else 'it'} out; {first.hint}".rstrip(
+            "; "
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class CramerRaoBounds:
+    """Cramer and Rao's bounds at the given values: valid as far as the model is linear.
+
+    values: where it was made. std: of each parameter in its unit beside the others, None where it is held, for these records do
+    not tell it apart from others there, or not at all. combinations: in words, what alone is seen of some. conditional_on: for
+    a member of one the members that are held. chi2_per_dof: of the misfit at the given values; None where no noise is
+    known. seconds: what one evaluation with derivatives took.
+    """
+
+    values: FrozenMap[float]
+    units: FrozenMap[str]
+    std: FrozenMap[float | None]
+    combinations: tuple[str, ...]
+    conditional_on: FrozenMap[tuple[str, ...]]
+    chi2_per_dof: float | None
+    seconds: float
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines of text."""
+        found = ["First answer, from the curvature at the given values; the search for the optimum follows."]
+        if self.chi2_per_dof is not None:
+            found.append(f"Misfit of the given values: chi2/dof {self.chi2_per_dof:.3g}.")
+        width = max(map(len, self.values), default=0)
+        for name, value in self.values.items():
+            std, unit = self.std[name], self.units[name]
+            at = f"{name:{width}}  {quantity(value, unit)}"
+            if std is None:
+                found.append(f"{at}: not told there, held")
+            else:
+                share = f" ({100.0 * HALF_95 * std / abs(value):.2g} %)" if value else ""
+                held = f" with {listed(self.conditional_on[name])} held" if name in self.conditional_on else ""
+                found.append(f"{at}: would be known to \u00b1{quantity(HALF_95 * std, unit, 2)}{share}{held}")
+        return [*found, *(f"{words[:1].upper()}{words[1:]}." for words in self.combinations)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The answer as it stands in the JSON under `first`."""
+        return {
+            "at": "given",
+            "chi2_per_dof": self.chi2_per_dof,
+            "parameters": {
+                n: {
+                    "value": v,
+                    "std": self.std[n],
+                    "unit": self.units[n],
+                    "conditional_on": list(self.conditional_on.get(n, ())),
+                }
+                for n, v in self.values.items()
+            },
+            "combinations": list(self.combinations),
+        }
+
+
+def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:
+    """Return the local analysis of a fit's parameters at their given values; one evaluation with derivatives.
+
+    Standard deviations that are not given are the misfit's there. Raises SimulationError where it cannot be made.
+    """
+    begun = time.perf_counter()
+    at, result = at_given_values(problem)
+    columns = at.columns
+    seconds = time.perf_counter() - begun
+    names, k = at.names, len(at.names)
+    null = parameter_directions(columns, k, at.error)
+    logs = [f.min > 0 for f in problem.free]
+    combos = combinations_of(null, names, logs, at.theta[:k].tolist(), "practical")
+    kept = independent(at.information.matrix, at.error)
+    held = [n for i, n in enumerate(names) if i not in kept]
+    std: dict[str, float | None] = dict.fromkeys(names)
+    if kept:
+        covariance = np.linalg.inv(at.information.select([names[i] for i in kept]).matrix)
+        widths = np.sqrt(np.diag(covariance)) * at.slope[list(kept)]
+        std |= {names[i]: float(s) for i, s in zip(kept, widths, strict=True)}
+    conditional = {
+        n: tuple(m for m in held if any(m in c.members and n in c.members for c in combos))
+        for n in names
+        if n not in held and any(n in c.members for c in combos)
+    }
+    known = not any(from_misfit(s) for s in result.noise_source.values())
+    units = {n: problem.simulator.parameters[n].unit for n in names}
+    return CramerRaoBounds(
+        FrozenMap({n: at.value(n) for n in names}),
+        FrozenMap(units),
+        FrozenMap(std),
+        tuple(c.words for c in combos),
+        FrozenMap(conditional),
+        at.misfit if known else None,
+        seconds,
+    )
