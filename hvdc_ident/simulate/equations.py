@@ -129,9 +129,9 @@ class ModelEquations:
         self.rests = [None if s.rest is None else node(s.rest) for s in m.states.values()]
         self.rhs = [*self.derivatives, *self.residuals]
 
-    def _observed(self, name: str, node: object) -> int:
+    def _observed(self, name: str, node: Callable[[sp.Expr], int]) -> int:
         if name in self.model.outputs:
-            return node(self.model.outputs[name].value)  # type: ignore[operator]
+            return node(self.model.outputs[name].value)
         if name in self.nodes:
             return self.nodes[name]
         raise unknown_name(
@@ -337,7 +337,7 @@ class _Key:
 
 
 def by_structure(make: Callable[..., T], room: int) -> Callable[..., T]:
-    """The maker, called with a model and hashable arguments, with its last `room` results kept."""
+    """Return the function `make` of a model and hashable arguments, its last `room` results kept by the model's structure."""
 
     @lru_cache(maxsize=room)
     def kept(key: _Key) -> T:

@@ -1,5 +1,8 @@
-"""Runs of experiments on the model that an experiment describes: insertion points driven by recorded columns, outputs seen
-through instruments, inputs with an unknown offset, and states with a start of their own."""
+"""Runs of experiments on a model, with what an experiment changes of it.
+
+An experiment may drive insertion points by recorded columns, see outputs through instruments, add an unknown constant to
+an input, and begin a state away from the steady state.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +10,22 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.effects import apply_effects
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, require_known, unknown_name
+from hvdc_ident.data import Experiment, InputSignal, Trajectory
+from hvdc_ident.effects import EffectUse, apply_effects
+from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, require_known
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
-from hvdc_ident.simulate.simulation import Simulation, Statistics
-
-if TYPE_CHECKING:
-    from hvdc_ident.effects import EffectUse
+from hvdc_ident.simulate.engine import Method, Tolerance, engine_of
+from hvdc_ident.simulate.simulation import Simulation
 
 
 def with_recording(model: Model, experiment: Experiment) -> Model:
-    """The model with the experiment's driven insertion points as inputs and its recording chains on the outputs."""
+    """Return the model with the experiment's driven insertion points as inputs and its recording chains on the outputs."""
     if not experiment.drive and not experiment.instrument:
         return model
     return _with_recording(model, experiment.drive, experiment.instrument)
@@ -38,9 +37,7 @@ def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[
 
 
 def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
-    """The recording chains as effects at the outputs: what the instrument does to the signal, in its order."""
-    from hvdc_ident.effects import EffectUse
-
+    """Return the recording chains as effects at the outputs, in the order in which an instrument acts on the signal."""
     chains = []
     for output, chain in instrument.items():
         for name in ("window-mean", "delay"):
@@ -49,17 +46,13 @@ def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
     return chains
 
 
-def with_own(model: Model, names: Sequence[str]) -> tuple[Model, FrozenMap[str]]:
-    """The model with what an experiment has for itself as parameters, and the parameter of each name.
+@lru_cache(maxsize=32)
+def _with_offsets_and_starts(model: Model, names: tuple[str, ...]) -> tuple[Model, FrozenMap[str]]:
+    """Return the model with an experiment's offsets and starts as parameters, and the parameter of each name.
 
     names: inputs, to which a constant is added all along, the steady start included (0 unless given); states, which
-    begin at a value instead of at rest. What the model calls free already is its own parameter.
+    begin at a value instead of at rest. A state that the model calls free has its parameter already.
     """
-    return _with_own(model, tuple(names)) if names else (model, FrozenMap())
-
-
-@lru_cache(maxsize=32)
-def _with_own(model: Model, names: tuple[str, ...]) -> tuple[Model, FrozenMap[str]]:
     found = {}
     for name in names:
         if name in model.states:
@@ -83,7 +76,7 @@ def _with_own(model: Model, names: tuple[str, ...]) -> tuple[Model, FrozenMap[st
 
 @dataclass(frozen=True, eq=False)
 class ModelSimulator:
-    """The model with its engine: parameters, and runs with sensitivities. It travels to other processes.
+    """Model as a simulator: parameters, and runs with exact sensitivities. It can be sent to other processes.
 
     tolerance: of every run (default: the engine's own).
     """
@@ -109,7 +102,7 @@ class ModelSimulator:
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
     ) -> Simulation:
-        """A run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
+        """Return a run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
         try:
             return simulate(
                 self.model, experiment, values, sensitivities,
@@ -136,7 +129,7 @@ def simulate(
     method: Method = "auto",
     partial: bool = False,
 ) -> Simulation:
-    """The model's outputs at the experiment's times and, exactly, their derivatives by the named parameters.
+    """Return the model's outputs at the experiment's times and, exactly, their derivatives by the named parameters.
 
     values: parameters (and constant inputs) that differ from the model's. outputs: names of outputs or signals (default:
     all outputs). The start is the steady state of the inputs' first values unless a state says otherwise; it depends on
@@ -156,15 +149,15 @@ def simulate(
         return found
     plant = with_recording(model, experiment)
     given = {**experiment.values, **(values or {})}
-    names = [*plant.parameters, *plant.inputs]
-    for name in (*given, *experiment.inputs):
-        if name not in plant.parameters and name not in plant.inputs:
-            raise unknown_name("parameter or input", name, names, where=f"experiment '{experiment.name}'")
-    require_known("input", experiment.offsets, plant.inputs, f"experiment '{experiment.name}'")
-    require_known("state", experiment.starts, plant.states, f"experiment '{experiment.name}'")
-    own = {**experiment.offsets, **experiment.starts}
-    plant, parameter = with_own(plant, [n for n in (*plant.inputs, *plant.states) if n in own or n in sensitivities])
-    given |= {parameter[n]: v for n, v in own.items()}
+    where = f"experiment '{experiment.name}'"
+    known = dict.fromkeys((*plant.parameters, *plant.inputs))
+    require_known("parameter or input", (*given, *experiment.inputs), known, where)
+    require_known("input", experiment.offsets, plant.inputs, where)
+    require_known("state", experiment.starts, plant.states, where)
+    shifts = {**experiment.offsets, **experiment.starts}
+    names = tuple(n for n in (*plant.inputs, *plant.states) if n in shifts or n in sensitivities)
+    plant, parameter = _with_offsets_and_starts(plant, names) if names else (plant, FrozenMap())
+    given |= {parameter[n]: v for n, v in shifts.items()}
     code = engine_of(plant, [parameter.get(n, n) for n in sensitivities], outputs)
     p = [float(given.get(n, q.value)) for n, q in plant.parameters.items()]
     if not all(map(math.isfinite, p)):
@@ -180,25 +173,12 @@ def simulate(
     try:
         out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale, model=plant)
     except (SimulationError, SteadyStateError) as e:
-        raise e.at(f"experiment '{experiment.name}'") from None
-    return _simulation(plant, code, experiment, out, statistics, tuple(sensitivities))
-
-
-def _simulation(
-    model: Model, code: Engine, experiment: Experiment, out: Array, statistics: Statistics, asked: tuple[str, ...]
-) -> Simulation:
-    s = code.structure.sizes
-    names = code.structure.outputs
-    units = tuple(model.outputs[n].unit if n in model.outputs else "" for n in names)
-    gradient = (
-        out[:, s.no :].reshape(experiment.time.size, s.no, s.width)[:, :, : s.np]
-        if s.width
-        else np.zeros((experiment.time.size, s.no, 0))
-    )
+        raise e.at(where) from None
+    s, rows = code.structure.sizes, experiment.time.size
+    units = tuple(plant.outputs[n].unit if n in plant.outputs else "" for n in code.structure.outputs)
     return Simulation(
-        Trajectory(experiment.time, out[:, : s.no], names, units),
-        asked,
-        gradient,
+        Trajectory(experiment.time, out[:, : s.no], code.structure.outputs, units),
+        tuple(sensitivities),
+        out[:, s.no :].reshape(rows, s.no, s.width)[:, :, : s.np] if s.width else np.zeros((rows, s.no, 0)),
         statistics,
-        FrozenMap(),
     )

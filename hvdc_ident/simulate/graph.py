@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 
 import sympy as sp
 
@@ -16,6 +16,7 @@ from hvdc_ident.errors import ModelError
 from hvdc_ident.expression import FUNCTIONS, elementary
 
 Key = tuple
+Convert = Callable[[sp.Basic], int]
 
 
 class Graph:
@@ -37,7 +38,7 @@ class Graph:
         return self._known[key]
 
     def constant(self, value: float) -> int:
-        """The node of a number."""
+        """Return the node of a number."""
         return self._node("const", float(value) + 0.0)
 
     def leaf(self, group: str, index: int) -> int:
@@ -177,7 +178,7 @@ class Graph:
         return self._node("switch", self._switch_of[a])
 
     def logic(self, op: str, *conditions: int) -> int:
-        """and, or, not of conditions."""
+        """Return the node of "and", "or" or "not" of conditions."""
         known = [self.nodes[c][1] if self.nodes[c][0] == "bool" else None for c in conditions]
         if op == "not":
             return self._node("bool", not known[0]) if known[0] is not None else self._node("not", conditions[0])
@@ -193,7 +194,7 @@ class Graph:
         return result
 
     def select(self, condition: int, a: int, b: int) -> int:
-        """a where the condition holds, else b."""
+        """Return a where the condition holds, else b."""
         key = self.nodes[condition]
         if key[0] == "bool":
             return a if key[1] else b
@@ -251,21 +252,21 @@ class Graph:
             hint="write it with the functions that `hvdc-ident` model cards know",
         )
 
-    def _sum(self, terms: Iterable[sp.Basic], sub: object) -> int:
+    def _sum(self, terms: Iterable[sp.Basic], sub: Convert) -> int:
         total = self.zero
         for term in terms:
-            total = self.add(total, sub(term))  # type: ignore[operator]
+            total = self.add(total, sub(term))
         return total
 
-    def _product(self, factors: Iterable[sp.Basic], sub: object) -> int:
+    def _product(self, factors: Iterable[sp.Basic], sub: Convert) -> int:
         top, bottom = self.one, self.one
         for f in factors:
             if f.is_Pow and f.exp.is_number and f.exp.is_negative:
-                bottom = self.mul(bottom, self.power(sub(f.base), self.constant(-float(f.exp))))  # type: ignore[operator]
+                bottom = self.mul(bottom, self.power(sub(f.base), self.constant(-float(f.exp))))
             elif f.is_Rational and not f.is_Integer:
                 top, bottom = self.mul(top, self.constant(f.p)), self.mul(bottom, self.constant(f.q))
             else:
-                top = self.mul(top, sub(f))  # type: ignore[operator]
+                top = self.mul(top, sub(f))
         return top if bottom == self.one else self.div(top, bottom)
 
     def _extremum(self, smallest: bool, values: list[int]) -> int:
@@ -275,14 +276,14 @@ class Graph:
             result = self.select(first, result, v) if smallest else self.select(first, v, result)
         return result
 
-    def _condition(self, c: sp.Basic, sub: object) -> int:
+    def _condition(self, c: sp.Basic, sub: Convert) -> int:
         if c in (True, False, sp.true, sp.false):
             return self._node("bool", bool(c))
         if isinstance(c, (sp.And, sp.Or)):
             return self.logic("and" if isinstance(c, sp.And) else "or", *(self._condition(a, sub) for a in c.args))
         if isinstance(c, sp.Not):
             return self.logic("not", self._condition(c.args[0], sub))
-        a, b = sub(c.args[0]), sub(c.args[1])  # type: ignore[operator]
+        a, b = sub(c.args[0]), sub(c.args[1])
         less, more = (lambda: self.negative(self.sub(a, b))), (lambda: self.negative(self.sub(b, a)))
         if isinstance(c, sp.StrictLessThan):
             return less()

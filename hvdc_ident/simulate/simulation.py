@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.display import Shown, Table
-from hvdc_ident.errors import unknown_name
+from hvdc_ident.errors import require_known
 from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
@@ -70,10 +70,8 @@ class Simulation(Shown):
 
     def gradient(self, output: str) -> Array:
         """(n_time, n_parameters) derivatives of one output."""
-        names = self.trajectory.names
-        if output not in names:
-            raise unknown_name("output", output, names)
-        return self.gradients[:, names.index(output), :]
+        require_known("output", [output], self.trajectory.names, "")
+        return self.gradients[:, self.trajectory.names.index(output), :]
 
     @property
     def sensitivities(self) -> xarray.DataArray:
