@@ -292,7 +292,7 @@ def sweep(
     from hvdc_ident.errors import StudyError
     from hvdc_ident.sensitivity import sweep as swept
     from hvdc_ident.study.assemble import model_of, names_of, study_of, values_of
-    from hvdc_ident.study.stages.sweep import sweep_axes, sweep_quantities, sweep_reference
+    from hvdc_ident.study.stages.sweep import sweep_axes, sweep_quantities, sweep_reference, swept_names
 
     study = study_of(model, data)
     tables = study.settings.sweep
@@ -306,8 +306,7 @@ def sweep(
         against = study.against or ("base" if said == "base" or not recorded else "data")
     elif against not in ("data", "base"):
         against = model_of(against)
-    chosen: Any = names_of(want, "quantity") or (sweep_quantities(tables) if tables and parameters is None else None)
-    linear = study.settings.linearize
+    chosen: Any = names_of(want, "quantity") or (swept_names(tables) if tables and parameters is None else None)
     with _open(executor) as pool, _told(progress) as told:
         return swept(
             study.model,
@@ -316,10 +315,7 @@ def sweep(
             against=against,
             outputs=names_of(outputs, "output"),
             values={**study.given, **values_of(values, study.model)},
-            want=chosen or (("rmse",) if study.experiments else ("poles",)),
-            linear=(linear.inputs or list(study.model.inputs), linear.outputs or list(study.model.outputs))
-            if linear
-            else None,
+            want=sweep_quantities(study, chosen or (("rmse",) if study.experiments else ("poles",))),
             executor=pool,
             progress=told,
         )

@@ -5,17 +5,7 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
-    from hvdc_ident.sensitivity.forward import (
-        LinearSensitivities,
-        LocalSensitivities,
-        Ranges,
-        Sensitivities,
-        SteadySensitivities,
-        linear_sensitivities,
-        sensitivities,
-        steady_sensitivities,
-        trajectory_sensitivities,
-    )
+    from hvdc_ident.sensitivity.global_screening import ScreeningResult, morris, sobol
     from hvdc_ident.sensitivity.information import (
         SENSITIVITY_ERROR,
         Collinear,
@@ -27,26 +17,36 @@ if TYPE_CHECKING:
         pivoted_order,
         rise_over_range,
     )
-    from hvdc_ident.sensitivity.screening import ScreeningResult, morris, sobol
+    from hvdc_ident.sensitivity.local_sensitivities import (
+        LinearSensitivities,
+        LocalSensitivities,
+        Ranges,
+        Sensitivities,
+        SteadySensitivities,
+        linear_sensitivities,
+        sensitivities,
+        steady_sensitivities,
+        trajectory_sensitivities,
+    )
     from hvdc_ident.sensitivity.structural import (
         StructuralCombination,
         StructuralResult,
         identifiable_subset,
         structural_identifiability,
     )
-    from hvdc_ident.sensitivity.sweep_points import Points, Samples, grid, latin_hypercube, listed, log_grid
+    from hvdc_ident.sensitivity.sweep_points import Points, Quantities, Samples, grid, latin_hypercube, listed, log_grid
     from hvdc_ident.sensitivity.sweep_run import SweepResult, sweep
 else:
     __getattr__ = offered(
         __name__,
         {
-            "forward": "LinearSensitivities LocalSensitivities Ranges Sensitivities SteadySensitivities "
+            "local_sensitivities": "LinearSensitivities LocalSensitivities Ranges Sensitivities SteadySensitivities "
             "linear_sensitivities sensitivities steady_sensitivities trajectory_sensitivities",
             "information": "SENSITIVITY_ERROR Collinear Information collinear_subsets independent marginal "
             "null_directions pivoted_order rise_over_range",
-            "screening": "ScreeningResult morris sobol",
+            "global_screening": "ScreeningResult morris sobol",
             "structural": "StructuralCombination StructuralResult identifiable_subset structural_identifiability",
-            "sweep_points": "Points Samples grid latin_hypercube listed log_grid",
+            "sweep_points": "Points Quantities Samples grid latin_hypercube listed log_grid",
             "sweep_run": "SweepResult sweep",
         },
     )
@@ -58,6 +58,7 @@ __all__ = [
     "LinearSensitivities",
     "LocalSensitivities",
     "Points",
+    "Quantities",
     "Ranges",
     "Samples",
     "ScreeningResult",

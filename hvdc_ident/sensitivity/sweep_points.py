@@ -20,7 +20,7 @@ from hvdc_ident.errors import (
     SimulationError,
     SteadyStateError,
     StudyError,
-    unknown_name,
+    require_known,
 )
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
@@ -308,19 +308,28 @@ def _exact(value: Any) -> str:
 
 
 Want = Literal["rmse", "poles", "bode"]
+Against = Literal["data", "base"] | AnyModel
+
+
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """Quantities computed at every point of a sweep: the RMSE, poles, or the frequency response ("bode").
+
+    inputs, outputs: of the linear model; default, all. omega: rad/s; default, 200 around the base's poles.
+    """
+
+    names: Sequence[Want]
+    inputs: Sequence[str] | None = None
+    outputs: Sequence[str] | None = None
+    omega: Array | None = None
 
 
 def check(
     model: AnyModel, experiments: Sequence[Experiment], points: Points, base: Mapping[str, float], want: Sequence[str]
 ) -> None:
     """Raise InputError for names, values, bounds or experiments that do not fit the sweep."""
-    known = [*model.parameters, *model.inputs]
-    for name in (*points.names, *base):
-        if name not in model.parameters and name not in model.inputs:
-            raise unknown_name("parameter or input", name, known, where="sweep")
-    for name in want:
-        if name not in ("rmse", "poles", "bode"):
-            raise unknown_name("result of a sweep", name, ("rmse", "poles", "bode"))
+    require_known("parameter or input", (*points.names, *base), {**model.parameters, **model.inputs}, "sweep")
+    require_known("result of a sweep", want, ("rmse", "poles", "bode"), "")
     names = [e.name for e in experiments]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
@@ -351,13 +360,12 @@ def task_of(
     experiments: tuple[Experiment, ...],
     names: tuple[str, ...],
     base: FrozenMap[float],
-    against: Literal["data", "base"] | AnyModel,
+    against: Against,
     outputs: Sequence[str] | None,
-    want: Sequence[str],
-    linear: tuple[Sequence[str], Sequence[str]] | None,
-    omega: Array | None,
+    quantities: Quantities,
 ) -> PointTask:
     """Return the work of every point, its references run once here. Raises ComputationError where a reference fails."""
+    want, omega = quantities.names, quantities.omega
     references: list[Reference] = []
     method: Method = "rosenbrock"
     if "rmse" in want:
@@ -383,12 +391,7 @@ def task_of(
             raise SteadyStateError(
                 e.what, where=f"sweep, {e.where}", expected=e.expected, got=e.got, hint=hint
             ) from None
-        at = linearize(
-            model,
-            point,
-            inputs=linear[0] if linear else None,
-            outputs=linear[1] if linear else None,
-        )
+        at = linearize(model, point, inputs=quantities.inputs, outputs=quantities.outputs)
         poles = int(np.size(at.poles())) if "poles" in want else 0
         channels = tuple(at.input_names), tuple(at.output_names)
         if "bode" in want:
@@ -401,9 +404,7 @@ def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMa
     first = experiments[0]
     try:
         found = simulate(model, first, base, outputs=first.outputs or None).statistics.method
-    except ComputationError:
-        return "rosenbrock"
-    except SteadyStateError:
+    except (ComputationError, SteadyStateError):
         return "rosenbrock"
     return "explicit" if found == "explicit" else "rosenbrock"
 
@@ -412,7 +413,7 @@ def _references(
     model: AnyModel,
     e: Experiment,
     base: FrozenMap[float],
-    against: Literal["data", "base"] | AnyModel,
+    against: Against,
     outputs: Sequence[str] | None,
     method: Method,
 ) -> list[Reference]:

@@ -9,19 +9,30 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.display import Shown, Table, data_frame
-from hvdc_ident.errors import ComputationError, unknown_name
+from hvdc_ident.display import Shown, Table, axes_of, data_frame
+from hvdc_ident.errors import ComputationError, require_known, unknown_name
 from hvdc_ident.executor import Executor, Progress, outcomes
 from hvdc_ident.files import csv_cell
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.sensitivity.sweep_points import AxesLike, Points, PointTask, Samples, Want, check, points_of, task_of
+from hvdc_ident.sensitivity.sweep_points import (
+    Against,
+    AxesLike,
+    Points,
+    PointTask,
+    Quantities,
+    Samples,
+    Want,
+    check,
+    points_of,
+    task_of,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -74,8 +85,7 @@ class SweepResult(Shown):
 
     def values(self, name: str) -> Array:
         """(n,): one parameter's value in each row, in its unit."""
-        if name not in self.parameters:
-            raise unknown_name("swept parameter", name, self.parameters)
+        require_known("swept parameter", [name], self.parameters, "")
         return self.points.rows(0, len(self))[:, self.parameters.index(name)]
 
     def error(self, output: str, experiment: str) -> Array:
@@ -198,9 +208,7 @@ class SweepResult(Shown):
 
     def plot(self, ax: Any = None) -> Any:
         """Axes with the RMSE over the first parameter: a curve a series, points where several parameters move."""
-        import matplotlib.pyplot as plt
-
-        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        axes = axes_of(ax)
         name = self.parameters[0]
         x = self.values(name)
         for k, (output, experiment) in enumerate(self.series):
@@ -247,7 +255,7 @@ class SweepResult(Shown):
 
 CHUNK = 2048  # points looked up, queued or written at a time
 PROBE, WORTH = 0.3, 2.0  # s: points run here first; work left that is worth starting other processes for
-TOLD = 0.1  # s between two reports of progress
+REPORTED = 0.1  # s between two reports of progress
 
 
 class Kept(Protocol):
@@ -259,7 +267,7 @@ class Kept(Protocol):
 
 @dataclass
 class _Table:
-    """The numbers as they come in; rows stand where their points stand."""
+    """Results as they come in; rows stand where their points stand."""
 
     task: PointTask
     points: Points
@@ -287,12 +295,10 @@ def sweep(
     experiments: Sequence[Experiment],
     axes: AxesLike,
     *,
-    against: Literal["data", "base"] | AnyModel = "data",
+    against: Against = "data",
     outputs: Sequence[str] | None = None,
     values: Mapping[str, float] | None = None,
-    want: Sequence[Want] = ("rmse",),
-    linear: tuple[Sequence[str], Sequence[str]] | None = None,
-    omega: Array | None = None,
+    want: Sequence[Want] | Quantities = ("rmse",),
     executor: Executor | None = None,
     kept: Callable[[str], Kept] | None = None,
     progress: Progress | None = None,
@@ -302,8 +308,8 @@ def sweep(
     axes: `grid`, `log_grid`, `listed`, `latin_hypercube`, several of them (their product, the last moves fastest), or
     {name: values}; parameters, or inputs that no experiment moves, in their units. against: the recordings, the run at
     the base values, or another model's run. outputs: default, the recorded ones (against data), else all the model's.
-    values: what the base is where it is not the model's. linear: (inputs, outputs) of the frequency response.
-    omega: its frequencies, rad/s (default: 200 around the base's poles). executor: where points run if there is work
+    values: of the base where they are not the model's. want: names of quantities; `Quantities` says of which frequency
+    response. executor: where points run if there is work
     for more than a few seconds; rows and digits do not depend on it. kept: given the task's fingerprint, where points
     are looked up and kept. A point that fails is a row with a reason and no number.
 
@@ -317,81 +323,85 @@ def sweep(
     """
     points = points_of(axes)
     base = FrozenMap(values or {})
-    check(model, experiments, points, base, want)
-    task = task_of(model, tuple(experiments), points.names, base, against, outputs, want, linear, omega)
+    quantities = want if isinstance(want, Quantities) else Quantities(want)
+    check(model, experiments, points, base, quantities.names)
+    task = task_of(model, tuple(experiments), points.names, base, against, outputs, quantities)
     shelf = kept(task.fingerprint) if kept else None
     table = _Table(task, points)
-    told = _Told(progress, len(points))
-    missing = _known(table, shelf, told)
-    _run(table, missing, shelf, executor, told)
-    told.close()
+    counter = _Counter(progress, len(points))
+    missing = _known(table, shelf, counter)
+    _run(table, missing, shelf, executor, counter)
+    counter.close()
+    known: dict[str, Any] = {**model.inputs, **model.parameters}
     return SweepResult(
         model=model.name,
         axes=points.axes,
-        units=FrozenMap({n: _unit(model, n) for n in points.names}),
+        units=FrozenMap({n: known[n].unit for n in points.names}),
         series=tuple((r.output, r.experiment) for r in task.references),
         series_units=tuple(model.outputs[r.output].unit if r.output in model.outputs else "" for r in task.references),
         against=against if isinstance(against, str) else against.name,
-        base=FrozenMap({n: _base_value(model, base, n) for n in points.names}),
+        base=FrozenMap({n: float(base.get(n, known[n].value)) for n in points.names}),
         rmse=table.rmse,
         poles=table.poles,
         omega=task.omega,
         response=table.response,
         channels=(task.inputs, task.outputs) if task.omega.size else ((), ()),
         failed=dict(sorted(table.failed.items())),
-        wanted=tuple(want),
+        wanted=tuple(quantities.names),
     )
 
 
-def _known(table: _Table, shelf: Kept | None, told: _Told) -> NDArray[np.intp]:
-    """The places of points that are not kept yet; those that are, are filled in."""
+def _known(table: _Table, shelf: Kept | None, counter: _Counter) -> NDArray[np.intp]:
+    """Return the places of the points that are not kept yet; those that are, are filled in."""
     n = len(table.points)
     if shelf is None:
         return np.arange(n)
-    open_ = []
+    missing = []
     for start in range(0, n, CHUNK):
         keys = [row.tobytes() for row in table.points.rows(start, start + CHUNK)]
         found = shelf.get(keys)
         for offset, key in enumerate(keys):
             packed = found.get(key)
             if packed is None:
-                open_.append(start + offset)
+                missing.append(start + offset)
             else:
                 table.fill(start + offset, packed)
-    told.done = n - len(open_)
-    return np.array(open_, dtype=np.intp)
+    counter.done = n - len(missing)
+    return np.array(missing, dtype=np.intp)
 
 
-def _run(table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor: Executor | None, told: _Told) -> None:
-    """Every missing point run: here while that is quick, in the executor where there is much left."""
+def _run(
+    table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor: Executor | None, counter: _Counter
+) -> None:
+    """Run every missing point: here while that is quick, in the executor where there is much left."""
     begin, count = time.perf_counter(), 0
     for count, (index, row) in enumerate(_rows(table.points, missing), start=1):
-        _finish(table, index, row, table.task(row), shelf, told)
+        _finish(table, index, row, table.task(row), shelf, counter)
         spent = time.perf_counter() - begin
         if executor is not None and spent > PROBE and spent / count * (missing.size - count) > WORTH:
             break
-    left = missing[count:]
-    if not left.size or executor is None:
+    remaining = missing[count:]
+    if not remaining.size or executor is None:
         return
-    for outcome in outcomes(executor, table.task, (row for _, row in _rows(table.points, left))):
-        index = int(left[outcome.index])
+    for outcome in outcomes(executor, table.task, (row for _, row in _rows(table.points, remaining))):
+        index = int(remaining[outcome.index])
         row = table.points.rows(index, index + 1)[0]
         if outcome.failure:
             table.failed[index] = outcome.failure
-            told.step()
+            counter.step()
         else:
-            _finish(table, index, row, outcome.value, shelf, told)
+            _finish(table, index, row, outcome.value, shelf, counter)
 
 
-def _finish(table: _Table, index: int, row: Array, packed: bytes, shelf: Kept | None, told: _Told) -> None:
+def _finish(table: _Table, index: int, row: Array, packed: bytes, shelf: Kept | None, counter: _Counter) -> None:
     table.fill(index, packed)
     if shelf is not None:
         shelf.put(row.tobytes(), packed)
-    told.step()
+    counter.step()
 
 
 def _rows(points: Points, indices: NDArray[np.intp]) -> Iterator[tuple[int, Array]]:
-    """(place, values) of each point, made a chunk at a time."""
+    """Yield (place, values) of each point, made a chunk at a time."""
     for start in range(0, indices.size, CHUNK):
         chosen = indices[start : start + CHUNK]
         first = int(chosen[0])
@@ -400,8 +410,8 @@ def _rows(points: Points, indices: NDArray[np.intp]) -> Iterator[tuple[int, Arra
             yield index, block[index - first] if block is not None else points.rows(index, index + 1)[0]
 
 
-class _Told:
-    """Progress, told now and then."""
+class _Counter:
+    """Count of the points done, reported as progress now and then."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
         self.progress, self.total, self.done, self.last = progress, total, 0, 0.0
@@ -409,19 +419,10 @@ class _Told:
     def step(self) -> None:
         self.done += 1
         now = time.perf_counter()
-        if self.progress and now - self.last > TOLD:
+        if self.progress and now - self.last > REPORTED:
             self.last = now
             self.progress(self.done, self.total, "points")
 
     def close(self) -> None:
         if self.progress:
             self.progress(self.total, self.total, "points")
-
-
-def _unit(model: AnyModel, name: str) -> str:
-    return model.parameters[name].unit if name in model.parameters else model.inputs[name].unit
-
-
-def _base_value(model: AnyModel, base: Mapping[str, float], name: str) -> float:
-    own = model.parameters[name].value if name in model.parameters else model.inputs[name].value
-    return float(base.get(name, own))

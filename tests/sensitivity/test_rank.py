@@ -67,8 +67,8 @@ def test_roots_of_polynomials() -> None:
     wanted = sorted(random.randrange(p) for _ in range(4))
     x = sp.Symbol("x")
     product = sp.Poly(sp.prod([x - w for w in wanted]) * (x**2 + 1), x)
-    assert roots([int(c) % p for c in reversed(product.all_coeffs())], p, random) == wanted
-    assert roots([1, 0, 1], p, random) == []
+    assert roots([int(c) % p for c in reversed(product.all_coeffs())], p) == wanted
+    assert roots([1, 0, 1], p) == []
 
 
 def test_the_numerator_of_a_function_known_by_values() -> None:
@@ -77,7 +77,7 @@ def test_the_numerator_of_a_function_known_by_values() -> None:
     def function(v: int) -> int:
         return (v - 5) * (v - 9) * FIELD.inverse((v * v * v + 2) % p) % p
 
-    assert roots(numerator(function, p, random), p, random) == [5, 9]
+    assert roots(numerator(function, p, random), p) == [5, 9]
 
 
 def _series(derivative: str, start: float, order: int, algebraic: dict[str, Algebraic] | None = None) -> Any:

@@ -15,7 +15,7 @@ from hvdc_ident.executor import Outcome
 from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
 from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
-from hvdc_ident.sensitivity import grid, latin_hypercube, listed, sweep
+from hvdc_ident.sensitivity import Quantities, grid, latin_hypercube, listed, sweep
 from tests.effort import calls
 
 CARD = """
@@ -79,7 +79,7 @@ def test_a_failed_point_is_a_row_with_a_reason_and_no_number():
 
 def test_poles_and_response_at_each_point():
     omega = np.array([0.1, 10.0])
-    found = sweep(MODEL, [], listed("k", [1, 5]), want=("poles", "bode"), linear=(["u"], ["y"]), omega=omega)
+    found = sweep(MODEL, [], listed("k", [1, 5]), want=Quantities(("poles", "bode"), ["u"], ["y"], omega))
     assert np.allclose(found.poles[:, 0], [-1, -5])
     assert np.allclose(found.response[:, :, 0, 0], [[1 / (1j * w + k) for w in omega] for k in (1, 5)])
     assert found.to_dict()["points"][0]["bode"]["y"]["u"][0] == pytest.approx([1 / 1.01, -0.1 / 1.01])

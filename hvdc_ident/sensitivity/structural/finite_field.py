@@ -15,6 +15,20 @@ from typing import Any, Protocol, TypeAlias
 
 import mpmath  # type: ignore[import-untyped]
 import numpy as np
+from sympy import ZZ
+from sympy.polys.galoistools import (
+    gf_add,
+    gf_div,
+    gf_edf_zassenhaus,
+    gf_eval,
+    gf_gcd,
+    gf_monic,
+    gf_mul,
+    gf_mul_ground,
+    gf_pow_mod,
+    gf_sub,
+    gf_trunc,
+)
 
 Array: TypeAlias = np.ndarray[Any, Any]
 
@@ -132,115 +146,52 @@ class PrimeField:
         return result
 
 
-# --- polynomials in one unknown, as coefficients from the constant upwards ---
+# --- polynomials in one unknown, as coefficients from the constant upwards; sympy has them from the highest downwards ---
 
 
-def _trim(a: Polynomial) -> Polynomial:
-    while a and a[-1] == 0:
-        a.pop()
-    return a
-
-
-def _times(a: Polynomial, b: Polynomial, p: int) -> Polynomial:
-    result = [0] * max(len(a) + len(b) - 1, 0)
-    for i, x in enumerate(a):
-        for j, y in enumerate(b):
-            result[i + j] = (result[i + j] + x * y) % p
-    return _trim(result)
-
-
-def _minus(a: Polynomial, b: Polynomial, p: int) -> Polynomial:
-    n = max(len(a), len(b))
-    return _trim([((a[i] if i < len(a) else 0) - (b[i] if i < len(b) else 0)) % p for i in range(n)])
-
-
-def _divide(a: Polynomial, b: Polynomial, p: int) -> tuple[Polynomial, Polynomial]:
-    rest, quotient = list(a), [0] * max(len(a) - len(b) + 1, 0)
-    lead = pow(b[-1], -1, p)
-    while len(rest) >= len(b):
-        shift, factor = len(rest) - len(b), rest[-1] * lead % p
-        quotient[shift] = factor
-        for i, x in enumerate(b):
-            rest[shift + i] = (rest[shift + i] - factor * x) % p
-        _trim(rest)
-    return _trim(quotient), rest
-
-
-def _gcd(a: Polynomial, b: Polynomial, p: int) -> Polynomial:
-    while b:
-        a, b = b, _divide(a, b, p)[1]
-    return a
-
-
-def _power(a: Polynomial, n: int, modulus: Polynomial, p: int) -> Polynomial:
-    result: Polynomial = [1]
-    while n:
-        if n & 1:
-            result = _divide(_times(result, a, p), modulus, p)[1]
-        n >>= 1
-        a = _divide(_times(a, a, p), modulus, p)[1]
-    return result
-
-
-def roots(a: Polynomial, p: int, random: Random) -> list[int]:
-    """The distinct roots of a polynomial modulo p (Cantor and Zassenhaus)."""
-    a = _trim([x % p for x in a])
-    if len(a) < 2:
+def roots(a: Polynomial, p: int) -> list[int]:
+    """Return the distinct roots of a polynomial modulo p (Cantor and Zassenhaus)."""
+    f = gf_trunc(a[::-1], p)
+    if len(f) < 2:
         return []
-    if len(a) > 2:
-        a = _gcd(a, _minus(_power([0, 1], p, a, p), [0, 1], p), p)
-    stack, found = [a], []
-    while stack:
-        f = stack.pop()
-        if len(f) < 2:
-            continue
-        if len(f) == 2:
-            found.append(-f[0] * pow(f[1], -1, p) % p)
-            continue
-        half = _gcd(f, _minus(_power([random.randrange(p), 1], (p - 1) // 2, f, p), [1], p), p)
-        stack += [half, _divide(f, half, p)[0]] if 1 < len(half) < len(f) else [f]
-    return sorted(found)
+    all_elements = gf_sub(gf_pow_mod([1, 0], p, f, p, ZZ), [1, 0], p, ZZ)  # x^p - x modulo f
+    linear_part = gf_gcd(f, all_elements, p, ZZ) if len(f) > 2 else gf_monic(f, p, ZZ)[1]
+    return (
+        sorted(int(-factor[1]) % p for factor in gf_edf_zassenhaus(linear_part, 1, p, ZZ)) if linear_part != [1] else []
+    )
 
 
 def numerator(function: Callable[[int], int], p: int, random: Random, samples: int = 40) -> Polynomial:
-    """The numerator of a rational function known by its values (Cauchy interpolation); NoSuchNumber above the degree bound."""
-    points: list[int] = []
-    values: list[int] = []
+    """Return the numerator of a rational function known by its values (Cauchy interpolation).
+
+    Raises NoSuchNumber where the degree is above samples/2.
+    """
+    points: dict[int, int] = {}
     for _ in range(2 * samples):
         x = random.randrange(p)
         try:
-            y = function(x)
+            points.setdefault(x, function(x))
         except NoSuchNumber:
             continue
-        if x not in points:
-            points.append(x)
-            values.append(y)
         if len(points) == samples + 2:
             break
     else:
         raise NoSuchNumber("the function has too few values")
     modulus: Polynomial = [1]
     interpolant: Polynomial = []
-    for x, y in zip(points[:samples], values[:samples], strict=True):
-        step = (y - _at(interpolant, x, p)) * pow(_at(modulus, x, p), -1, p) % p
-        interpolant = _minus(interpolant, [-step * c % p for c in modulus], p)
-        modulus = _times(modulus, [-x % p, 1], p)
+    for x, y in [*points.items()][:samples]:
+        step = (y - gf_eval(interpolant, x, p, ZZ)) * pow(int(gf_eval(modulus, x, p, ZZ)), -1, p) % p
+        interpolant = gf_add(interpolant, gf_mul_ground(modulus, step, p, ZZ), p, ZZ)
+        modulus = gf_mul(modulus, [1, -x % p], p, ZZ)
     a, b = modulus, interpolant
     s, t = [], [1]
     while len(b) > samples // 2:
-        q, rest = _divide(a, b, p)
-        a, b, s, t = b, rest, t, _minus(s, _times(q, t, p), p)
-    for x, y in zip(points[samples:], values[samples:], strict=True):
-        if (_at(b, x, p) - y * _at(t, x, p)) % p:
+        quotient, rest = gf_div(a, b, p, ZZ)
+        a, b, s, t = b, rest, t, gf_sub(s, gf_mul(quotient, t, p, ZZ), p, ZZ)
+    for x, y in [*points.items()][samples:]:
+        if (gf_eval(b, x, p, ZZ) - y * gf_eval(t, x, p, ZZ)) % p:
             raise NoSuchNumber("the degree is too high")
-    return b
-
-
-def _at(a: Polynomial, x: int, p: int) -> int:
-    value = 0
-    for c in reversed(a):
-        value = (value * x + c) % p
-    return value
+    return [int(c) for c in reversed(b)]
 
 
 DIGITS = 120

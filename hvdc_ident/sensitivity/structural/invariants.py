@@ -17,6 +17,7 @@ import numpy as np
 
 from hvdc_ident.sensitivity.structural.finite_field import Array, Ring
 from hvdc_ident.sensitivity.structural.observability import PointRows
+from hvdc_ident.text import listed
 
 
 @dataclass(frozen=True)
@@ -53,11 +54,6 @@ def tied(names: Sequence[str], free: int) -> str:
     k = len(names) - free
     number = "one combination" if k == 1 else f"{k} combinations"
     return f"only {number} of {listed(names)} {'is' if k == 1 else 'are'} seen"
-
-
-def listed(words: Sequence[str]) -> str:
-    """The words as a list in a sentence: a, b and c."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 MOST = 2000  # subsets tried when a simpler basis is looked for

@@ -26,7 +26,6 @@ from hvdc_ident.sensitivity.structural.invariants import (
     StructuralCombination,
     components,
     invariants,
-    listed,
     nulls,
     tied,
 )
@@ -39,6 +38,7 @@ from hvdc_ident.sensitivity.structural.observability import (
     Start,
 )
 from hvdc_ident.sensitivity.structural.random_points import FieldPoints
+from hvdc_ident.text import listed
 
 REAL_POINTS = 5
 LOW = 8  # Taylor order that often shows all there is to see
@@ -49,40 +49,29 @@ FEW = 8  # members of a combination up to which polynomials are looked for
 Drawn = tuple[list[PointRows], Callable[[], PointRows], str]
 
 
-class _Precise:
-    """Real points, each computed with all its digits."""
+@dataclass
+class _Analysis:
+    """One question put to a model: its points, and the answer in words."""
 
-    def __init__(self, points: RealPoints) -> None:
-        self.points = points
+    model: Model
+    names: tuple[str, ...]
+    outputs: tuple[str, ...]
+    moved: Mapping[str, InputClass]
+    starts: Mapping[str, Start]
+    regime: dict[str, str]
+    seed: int
+    deadline: float
 
-    def __call__(self) -> PointRows:
-        with context():
-            return self.points()
-
-
-class _Ask:
-    """One question, its points and the answer put together."""
-
-    def __init__(
-        self,
-        model: Model,
-        names: tuple[str, ...],
-        outputs: tuple[str, ...],
-        moved: Mapping[str, InputClass],
-        starts: Mapping[str, Start],
-        regime: dict[str, str],
-        seed: int,
-        deadline: float,
-    ) -> None:
-        self.model, self.names, self.outputs, self.moved = model, names, outputs, moved
-        self.starts, self.regime, self.seed, self.deadline = starts, regime, seed, deadline
-        self.regime_words: list[str] = [f"{n}: {mode}" for n, mode in regime.items()]
+    def __post_init__(self) -> None:
+        self.regime_words = [f"{n}: {mode}" for n, mode in self.regime.items()]
 
     def answer(self) -> dict[str, Any]:
         """Return the result's fields beside the question. Raises NotRational for a model outside the method, OutOfTime."""
         if self.model.delays or self.model.sampled:
             raise NotRational("it has delays or sampled parts")
-        source = EquationSource(self.model, self.outputs, self._known_starts())
+        asked = {n for n, s in self.model.states.items() if s.start == "free" and f"{n}_start" in self.names}
+        starts: dict[str, Start] = {n: "given" if n in asked else s for n, s in self.starts.items()}
+        source = EquationSource(self.model, self.outputs, starts)
         if source.graph.switches:
             self._operating(source)
         self.regime_words += [x for x in source.active() if x.split(":")[0] not in self.regime]
@@ -103,11 +92,6 @@ class _Ask:
         begun = time.thread_time()
         _ = source.point
         self.deadline += time.thread_time() - begun
-
-    def _known_starts(self) -> dict[str, Start]:
-        """A free start that is one of the parameters asked for is given by it."""
-        mine = {n for n in self.starts if f"{n}_start" in self.names and self.model.states[n].start == "free"}
-        return {n: "given" if n in mine else s for n, s in self.starts.items()}
 
     def _question(self, source: EquationSource, rest: Any, move: Any, moved: Mapping[str, Any]) -> Question:
         places = list(self.model.parameters)
@@ -135,7 +119,7 @@ class _Ask:
         except NotRational:
             pass
         self._operating(q.source)
-        make = _Precise(RealPoints(q, Random(self.seed), self.deadline))
+        make = RealPoints(q, Random(self.seed), self.deadline)
         points = [make() for _ in range(REAL_POINTS)]
         return (points if len({_pattern(r) for r in points}) == 1 else []), make, "numeric, local"
 
@@ -159,7 +143,7 @@ class _Ask:
         self._operating(q.source)
         now = time.thread_time()
         try:
-            real = _Precise(RealPoints(q, Random(self.seed), now + CHECK * (self.deadline - now)))()
+            real = RealPoints(q, Random(self.seed), now + CHECK * (self.deadline - now))()
         except (OutOfTime, NotRational, ArithmeticError):
             return True
         return _pattern(real) == _pattern(found)
@@ -323,9 +307,9 @@ def structural_identifiability(
     moved = _classes(model, inputs)
     starts = _starts(model, start)
     require_known("parameter", names, model.parameters, f"model '{model.name}'")
-    ask = _Ask(model, names, watched, moved, starts, dict(regime or {}), seed, begun + time_limit)
+    analysis = _Analysis(model, names, watched, moved, starts, dict(regime or {}), seed, begun + time_limit)
     try:
-        found = ask.answer()
+        found = analysis.answer()
     except OutOfTime:
         found = {"status": "not decided", "reason": f"the time limit of {time_limit:g} s was reached"}
     except NotRational as e:
@@ -336,7 +320,7 @@ def structural_identifiability(
         }
     seconds = time.thread_time() - begun
     return StructuralResult(
-        names, watched, FrozenMap(moved), FrozenMap(starts), tuple(ask.regime_words), seconds=seconds, **found
+        names, watched, FrozenMap(moved), FrozenMap(starts), tuple(analysis.regime_words), seconds=seconds, **found
     )
 
 

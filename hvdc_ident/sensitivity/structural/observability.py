@@ -22,7 +22,14 @@ import numpy as np
 from hvdc_ident.errors import InputError, SteadyStateError, unknown_name
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.model import Model
-from hvdc_ident.sensitivity.structural.finite_field import Array, HighPrecision, NoSuchNumber, NotRational, Ring
+from hvdc_ident.sensitivity.structural.finite_field import (
+    Array,
+    HighPrecision,
+    NoSuchNumber,
+    NotRational,
+    Ring,
+    context,
+)
 from hvdc_ident.sensitivity.structural.taylor_series import Equations, Taylor, inverse
 from hvdc_ident.simulate import Graph, ModelEquations, engine_of
 
@@ -34,7 +41,7 @@ JUMPS = 8  # step sizes tried from one start before another start is drawn
 class Question:
     """Question of structural identifiability: equations at rest and after the event, parameters, and moved inputs.
 
-    moved: (position in w, class). parameters: positions in p. rested: whether every state starts at rest. highest: the
+    moved: (position in w, class). parameters: positions in p. rested: every state starts at rest. highest: the
     Taylor order if it is not to be the usual one.
     """
 
@@ -167,18 +174,19 @@ def affected(q: Question, jumped: set[int]) -> set[int]:
 
 
 class RealPoints:
-    """Random points near the operating point, in real numbers of 120 decimals; use inside `context()`."""
+    """Random points near the operating point, in real numbers of 120 decimals."""
 
     def __init__(self, question: Question, random: Random, deadline: float) -> None:
         self.q, self.ring, self.random, self.deadline = question, HighPrecision(), random, deadline
 
     def __call__(self) -> PointRows:
-        """The rows at one more point."""
-        for spread in (0.2, 0.1, 0.05, 0.02, 0.01):
-            try:
-                return rows(self.q, self.ring, self._base(spread), self._jump, self.random, self.deadline)
-            except ArithmeticError:
-                continue
+        """Return the rows at one more point."""
+        with context():
+            for spread in (0.2, 0.1, 0.05, 0.02, 0.01):
+                try:
+                    return rows(self.q, self.ring, self._base(spread), self._jump, self.random, self.deadline)
+                except ArithmeticError:
+                    continue
         raise NotRational("no start was found near the operating point")
 
     def _near(self, value: float, spread: float) -> Decimal:

@@ -158,14 +158,11 @@ class Sparse:
         g, new = self.graph, {}
         for n in g.reachable([equation]):
             op, *a = g.nodes[n]
-            if n in self._products and g.nodes[n][0] == "mul" and not self._defines(equation, n):
+            if n in self._products and g.nodes[n][0] == "mul" and g.nodes[equation] != ("sub", self._products[n], n):
                 new[n] = self._products[n]
             else:
                 new[n] = n if op in ("leaf", "const") else getattr(g, op)(*(new[k] for k in a))
         return new[equation]
-
-    def _defines(self, equation: int, product: int) -> bool:
-        return self.graph.nodes[equation] == ("sub", self._products[product], product)
 
     def variables(self, equation: int) -> set[int]:
         """The variables an equation depends on."""
@@ -269,7 +266,7 @@ TRIES = 300
 class Values:
     """Values of the variables over a field, found step by step. roots: {("sqrt", x): root} already chosen elsewhere.
 
-    chose: whether one of several solutions was taken that may lie on different branches.
+    chose: True once one of several solutions was taken that may lie on different branches.
     """
 
     def __init__(
@@ -322,7 +319,7 @@ class Values:
         if not polynomial:  # the equation follows from the others: the variable is as free as it looked
             residual(self.ring.random(self.random))
             return
-        found = roots(polynomial, self.ring.p, self.random)
+        found = roots(polynomial, self.ring.p)
         for value in found:
             try:
                 if residual(value) == 0:
@@ -351,7 +348,7 @@ class Values:
 class FieldPoints:
     """Random points over one prime field; NotRational where they cannot be found.
 
-    chose: whether a point took one of several solutions that may lie on different branches.
+    chose: True once a point took one of several solutions that may lie on different branches.
     """
 
     def __init__(self, question: Question, ring: PrimeField, random: Random, deadline: float) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
-    from hvdc_ident.sensitivity import Samples
+    from hvdc_ident.sensitivity import Quantities, Samples
+    from hvdc_ident.sensitivity.sweep_points import Want
     from hvdc_ident.study import schema
     from hvdc_ident.study.study import Study
 
@@ -27,10 +28,9 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     if not tables:
         hint = '[[sweep]] with parameter = "NAME", min, max and points'
         raise StudyError("sweep needs a parameter and the study names none", where=study.path.name, hint=hint)
-    want = sweep_quantities(tables)
+    want = swept_names(tables)
     if "rmse" in want:
         need_experiments(study, "sweep")
-    linear = study.settings.linearize
     with (
         Store(options.folder) if options.folder is not None else nullcontext() as store,
         workers_of(options) as pool,
@@ -41,10 +41,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             sweep_axes(tables, options.seed),
             against=study.against or ("base" if sweep_reference(tables) == "base" else "data"),
             values=study.given,
-            want=want,
-            linear=(linear.inputs or list(study.model.inputs), linear.outputs or list(study.model.outputs))
-            if linear
-            else None,
+            want=sweep_quantities(study, want),
             executor=pool,
             kept=(lambda fingerprint: store.job("sweep", fingerprint)) if store is not None else None,
             progress=options.progress,
@@ -101,10 +98,20 @@ def sweep_reference(tables: Sequence[schema.SweepTable], where: str = "sweep") -
     return said.pop() if said else "data"
 
 
-def sweep_quantities(tables: Sequence[schema.SweepTable]) -> tuple[Literal["rmse", "poles", "bode"], ...]:
-    """What any of the tables wants at each point, in a fixed order."""
+def sweep_quantities(study: Study, names: Sequence[Want]) -> Quantities:
+    """Return the quantities of those names, linear ones between the inputs and outputs of [linearize]."""
+    from hvdc_ident.sensitivity import Quantities
+
+    table = study.settings.linearize
+    if table is None:
+        return Quantities(names)
+    return Quantities(names, table.inputs or list(study.model.inputs), table.outputs or list(study.model.outputs))
+
+
+def swept_names(tables: Sequence[schema.SweepTable]) -> tuple[Want, ...]:
+    """Return the names of the quantities that any of the tables wants at each point, in a fixed order."""
     asked = {w for t in tables for w in t.want}
-    kinds: tuple[Literal["rmse", "poles", "bode"], ...] = ("rmse", "poles", "bode")
+    kinds: tuple[Want, ...] = ("rmse", "poles", "bode")
     return tuple(k for k in kinds if k in asked)
 
 

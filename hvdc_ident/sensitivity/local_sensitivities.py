@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.errors import LinearizationError, StudyError, unknown_name
+from hvdc_ident.display import Shown, Table, axes_of
+from hvdc_ident.errors import LinearizationError, StudyError, require_known
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import xarray
 
 
+Complex = NDArray[np.complex128]
 Ranges = Mapping[str, tuple[float, float]]
 
 
@@ -31,15 +32,14 @@ def factors(
     """Return the parameters' values and the factors that normalise derivatives by them, both in the parameters' units.
 
     A factor is the width of a given range, else the magnitude of the value; where the value is 0, the width of the
-    model's own bounds or the parameter's size. Raises UnknownNameError, and StudyError for a range without a width.
+    model's parameter bounds or the parameter's size. Raises UnknownNameError, and StudyError for a range without a width.
     """
     at, found = {}, {}
+    require_known("parameter", names, model.parameters, f"model '{model.name}'")
     for name in names:
-        if name not in model.parameters:
-            raise unknown_name("parameter", name, model.parameters, where=f"model '{model.name}'")
-        own = model.parameters[name]
-        at[name] = float(values.get(name, own.value))
-        low, high = ranges.get(name, (own.min, own.max))
+        parameter = model.parameters[name]
+        at[name] = float(values.get(name, parameter.value))
+        low, high = ranges.get(name, (parameter.min, parameter.max))
         width = high - low
         if name in ranges and not (math.isfinite(width) and width > 0):
             raise StudyError(
@@ -48,19 +48,31 @@ def factors(
         if name in ranges or (at[name] == 0 and math.isfinite(width) and width > 0):
             found[name] = float(width)
         else:
-            found[name] = abs(at[name]) or own.size
+            found[name] = abs(at[name]) or parameter.size
     return FrozenMap(at), FrozenMap(found)
 
 
-def table_text(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a header and lines as text with aligned columns."""
-    rows = [tuple(header), *map(tuple, lines)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(header))]
-    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+def _labelled(values: Any, name: str, **axes: Any) -> xarray.DataArray:
+    """Return values with labelled axes, in the order given."""
+    import xarray
+
+    return xarray.DataArray(values, coords=axes, dims=tuple(axes), name=name)
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivities:
+def bars(
+    axes: Any, groups: Sequence[str], heights: Mapping[str, Array], errors: Mapping[str, Array] | None = None
+) -> None:
+    """Draw a bar of each series in every group. heights, errors: (groups,) by the series' label."""
+    width = 0.8 / len(heights)
+    for k, (label, values) in enumerate(heights.items()):
+        places = np.arange(len(groups)) + (k + 0.5) * width - 0.4
+        axes.bar(places, values, width, yerr=None if errors is None else errors[label], label=label)
+    axes.set_xticks(range(len(groups)), groups)
+    axes.legend(fontsize=8)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivities(Shown):
     """Derivatives of the outputs of some experiments by parameters.
 
     values: of the parameters. factors: what a derivative is multiplied by to be normalised, in the parameter's unit:
@@ -88,30 +100,25 @@ class Sensitivities:
         return found * self.factors[parameter] if normalised else found
 
     def _place(self, experiment: str, output: str, parameter: str) -> tuple[int, int]:
-        if experiment not in self.gradients:
-            raise unknown_name("experiment", experiment, self.gradients)
-        if output not in self.outputs[experiment]:
-            raise unknown_name("output", output, self.outputs[experiment])
-        if parameter not in self.parameters:
-            raise unknown_name("parameter", parameter, self.parameters)
+        require_known("experiment", [experiment], self.gradients, "")
+        require_known("output", [output], self.outputs[experiment], "")
+        require_known("parameter", [parameter], self.parameters, "")
         return self.outputs[experiment].index(output), self.parameters.index(parameter)
+
+    @property
+    def _scale(self) -> Array:
+        return np.array([self.factors[p] for p in self.parameters])
 
     def array(self, experiment: str, *, normalised: bool = False) -> xarray.DataArray:
         """One experiment's derivatives with labelled axes time, output, parameter."""
-        import xarray
-
-        if experiment not in self.gradients:
-            raise unknown_name("experiment", experiment, self.gradients)
-        values = self.gradients[experiment]
-        if normalised:
-            values = values * np.array([self.factors[p] for p in self.parameters])
-        axes = {
-            "time": self.times[experiment],
-            "output": list(self.outputs[experiment]),
-            "parameter": list(self.parameters),
-        }
-        return xarray.DataArray(
-            values, coords=axes, dims=tuple(axes), name="normalised sensitivity" if normalised else "sensitivity"
+        require_known("experiment", [experiment], self.gradients, "")
+        gradient = self.gradients[experiment]
+        return _labelled(
+            gradient * self._scale if normalised else gradient,
+            "normalised sensitivity" if normalised else "sensitivity",
+            time=self.times[experiment],
+            output=list(self.outputs[experiment]),
+            parameter=list(self.parameters),
         )
 
     @cached_property
@@ -119,7 +126,7 @@ class Sensitivities:
         """(rms, peak) of the normalised sensitivity over the compared rows, by experiment, output and parameter."""
         found = {}
         for e, gradient in self.gradients.items():
-            scaled = gradient[self.compared[e]] * np.array([self.factors[p] for p in self.parameters])
+            scaled = gradient[self.compared[e]] * self._scale
             rms, peak = np.sqrt((scaled**2).mean(axis=0)), np.abs(scaled).max(axis=0)
             found[e] = FrozenMap(
                 {
@@ -162,13 +169,10 @@ class Sensitivities:
 
     def plot(self, experiment: str | None = None, output: str | None = None, ax: Any = None) -> Any:
         """Axes with one output's normalised derivatives in one experiment (default: the first), a curve a parameter."""
-        import matplotlib.pyplot as plt
-
         name = next(iter(self.gradients)) if experiment is None else experiment
-        if name not in self.gradients:
-            raise unknown_name("experiment", name, self.gradients)
+        require_known("experiment", [name], self.gradients, "")
         shown = self.outputs[name][0] if output is None else output
-        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        axes = axes_of(ax)
         for p in self.parameters:
             axes.plot(self.times[name], self.of(name, shown, p, normalised=True), label=p)
         unit = self.output_units.get(shown, "")
@@ -178,19 +182,16 @@ class Sensitivities:
         axes.legend(fontsize=8)
         return axes
 
-    def __str__(self) -> str:
-        return table_text(("experiment", "output", "parameter", "rms", "peak"), self._lines())
-
-    def _repr_html_(self) -> str:
-        return "<pre>" + escape(str(self)) + "</pre>"
-
-    def _lines(self) -> list[tuple[str, ...]]:
-        return [
+    def _screen(self) -> Iterator[str | Table]:
+        count = len(self.gradients)
+        yield f"Trajectories of {self.model}: normalised sensitivities in {count} experiment{'s' if count > 1 else ''}"
+        lines = (
             (e, o, p, f"{rms:.4g}", f"{peak:.4g}")
-            for e, lines in self.table.items()
-            for o, line in lines.items()
+            for e, outputs in self.table.items()
+            for o, line in outputs.items()
             for p, (rms, peak) in line.items()
-        ]
+        )
+        yield Table(("experiment", "output", "parameter", "rms", "peak"), tuple(lines))
 
 
 def trajectory_sensitivities(
@@ -238,8 +239,8 @@ def trajectory_sensitivities(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class SteadySensitivities:
+@dataclass(frozen=True, eq=False, repr=False)
+class SteadySensitivities(Shown):
     """Derivatives of a steady state by parameters: state_values by name; gradients (outputs, parameters) in units."""
 
     model: str
@@ -251,11 +252,8 @@ class SteadySensitivities:
 
     def array(self, *, normalised: bool = False) -> xarray.DataArray:
         """The derivatives with labelled axes output, parameter; in units, or times the parameters' factors."""
-        import xarray
-
         values = self.gradients * np.array([self.factors[p] for p in self.parameters]) if normalised else self.gradients
-        axes = {"output": list(self.outputs), "parameter": list(self.parameters)}
-        return xarray.DataArray(values, coords=axes, dims=tuple(axes), name="steady sensitivity")
+        return _labelled(values, "steady sensitivity", output=list(self.outputs), parameter=list(self.parameters))
 
     def to_dict(self) -> dict[str, Any]:
         """The steady values and derivatives, in units, as plain numbers."""
@@ -267,28 +265,19 @@ class SteadySensitivities:
 
     def plot(self, ax: Any = None) -> Any:
         """Axes with a bar for every output and parameter: the derivative times the parameter's factor."""
-        import matplotlib.pyplot as plt
-
-        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
-        scaled = self.gradients * np.array([self.factors[p] for p in self.parameters])
-        width = 0.8 / len(self.parameters)
-        for k, p in enumerate(self.parameters):
-            axes.bar(np.arange(len(self.outputs)) + (k + 0.5) * width - 0.4, scaled[:, k], width, label=p)
-        axes.set_xticks(range(len(self.outputs)), self.outputs)
+        axes = axes_of(ax)
+        bars(axes, self.outputs, {p: self.gradients[:, k] * self.factors[p] for k, p in enumerate(self.parameters)})
         axes.set_ylabel("normalised derivative of the steady value")
-        axes.legend(fontsize=8)
         return axes
 
-    def __str__(self) -> str:
-        lines = [
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Steady state of {self.model}: sensitivities in the units of output and parameter"
+        lines = (
             (o, f"{self.steady[o]:.6g}", p, f"{slope:.4g}")
             for o, row in zip(self.outputs, self.gradients.tolist(), strict=True)
             for p, slope in zip(self.parameters, row, strict=True)
-        ]
-        return table_text(("output", "steady value", "parameter", "derivative"), lines)
-
-    def _repr_html_(self) -> str:
-        return "<pre>" + escape(str(self)) + "</pre>"
+        )
+        yield Table(("output", "steady value", "parameter", "derivative"), tuple(lines))
 
 
 def steady_sensitivities(
@@ -312,14 +301,8 @@ def steady_sensitivities(
     return SteadySensitivities(model.name, shown, names, FrozenMap(steady), scale, run.gradients[0])
 
 
-# --- eigenvalues and frequency response ---
-
-
-Complex = NDArray[np.complex128]
-
-
-@dataclass(frozen=True, eq=False)
-class LinearSensitivities:
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearSensitivities(Shown):
     """Derivatives of a linear model by k parameters, the shift of its operating point included.
 
     factors: what a derivative is multiplied by to be normalised, in the parameter's unit. eigenvalues: (m,) rad/s;
@@ -345,35 +328,27 @@ class LinearSensitivities:
 
     def eigenvalue_array(self, *, normalised: bool = False) -> xarray.DataArray:
         """d(lambda)/dp with labelled axes mode, parameter; modes in the order of `LinearModel.modes`."""
-        import xarray
-
         found = self.eigenvalue_gradients * self._scale if normalised else self.eigenvalue_gradients
-        axes: dict[str, Any] = {"mode": np.arange(self.eigenvalues.size), "parameter": list(self.parameters)}
-        array = xarray.DataArray(found, coords=axes, dims=tuple(axes), name="eigenvalue sensitivity")
+        modes = np.arange(self.eigenvalues.size)
+        array = _labelled(found, "eigenvalue sensitivity", mode=modes, parameter=list(self.parameters))
         return array.assign_coords(eigenvalue=("mode", self.eigenvalues))
 
     def response_array(self, *, normalised: bool = False) -> xarray.DataArray:
         """dG/dp with labelled axes omega, output, input, parameter."""
-        import xarray
-
-        found = self.response_gradients * self._scale if normalised else self.response_gradients
-        axes = {
-            "omega": self.omega,
-            "output": list(self.outputs),
-            "input": list(self.inputs),
-            "parameter": list(self.parameters),
-        }
-        return xarray.DataArray(found, coords=axes, dims=tuple(axes), name="response sensitivity")
+        return _labelled(
+            self.response_gradients * self._scale if normalised else self.response_gradients,
+            "response sensitivity",
+            omega=self.omega,
+            output=list(self.outputs),
+            input=list(self.inputs),
+            parameter=list(self.parameters),
+        )
 
     def channel(self, input: str, output: str, parameter: str, *, normalised: bool = False) -> Complex:
         """Return the derivative of one channel's response by one parameter, (n,)."""
-        for kind, name, known in (
-            ("input", input, self.inputs),
-            ("output", output, self.outputs),
-            ("parameter", parameter, self.parameters),
-        ):
-            if name not in known:
-                raise unknown_name(kind, name, known)
+        require_known("input", [input], self.inputs, "")
+        require_known("output", [output], self.outputs, "")
+        require_known("parameter", [parameter], self.parameters, "")
         places = self.outputs.index(output), self.inputs.index(input), self.parameters.index(parameter)
         found = self.response_gradients[(slice(None), *places)]
         return np.asarray(found * self.factors[parameter] if normalised else found)
@@ -404,10 +379,8 @@ class LinearSensitivities:
 
     def plot(self, input: str | None = None, output: str | None = None, ax: Any = None) -> Any:
         """Axes with one channel's normalised derivatives over frequency (default: the first), a curve a parameter."""
-        import matplotlib.pyplot as plt
-
         source, target = input or self.inputs[0], output or self.outputs[0]
-        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        axes = axes_of(ax)
         for p in self.parameters:
             axes.loglog(self.omega / (2 * np.pi), np.abs(self.channel(source, target, p, normalised=True)), label=p)
         axes.set_xlabel("frequency, Hz")
@@ -415,16 +388,14 @@ class LinearSensitivities:
         axes.legend(fontsize=8)
         return axes
 
-    def __str__(self) -> str:
-        lines = [
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Eigenvalues of {self.model}: sensitivities in rad/s per unit of the parameter"
+        lines = (
             (f"{value:.5g}", p, f"{slope:.4g}")
             for value, row in zip(self.eigenvalues.tolist(), self.eigenvalue_gradients.tolist(), strict=True)
             for p, slope in zip(self.parameters, row, strict=True)
-        ]
-        return table_text(("eigenvalue, rad/s", "parameter", "derivative"), lines)
-
-    def _repr_html_(self) -> str:
-        return "<pre>" + escape(str(self)) + "</pre>"
+        )
+        yield Table(("eigenvalue, rad/s", "parameter", "derivative"), tuple(lines))
 
 
 def linear_sensitivities(
@@ -468,8 +439,8 @@ def linear_sensitivities(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class LocalSensitivities:
+@dataclass(frozen=True, eq=False, repr=False)
+class LocalSensitivities(Shown):
     """Derivatives by the same parameters, in units and normalised by the same factors.
 
     trajectories: by experiment and output over time; None without an experiment. steady: of the steady state of the
@@ -494,12 +465,11 @@ class LocalSensitivities:
         """Axes with the first output's derivatives over time; of the steady state where there is no experiment."""
         return self.trajectories.plot(ax=ax) if self.trajectories is not None else self.steady.plot(ax)
 
-    def __str__(self) -> str:
-        parts = [p for p in (self.trajectories, self.steady, self.linear) if p is not None]
-        return "\n\n".join([*map(str, parts), *([self.why] if self.why else [])])
-
-    def _repr_html_(self) -> str:
-        return "<pre>" + escape(str(self)) + "</pre>"
+    def _screen(self) -> Iterator[str | Table]:
+        for part in (self.trajectories, self.steady, self.linear):
+            if part is not None:
+                yield from part._screen()
+        yield self.why
 
 
 def sensitivities(

@@ -7,28 +7,28 @@ SALib is an extra: pip install 'hvdc_ident[screening]'. Morris 1991, doi 10.1080
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
+from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.errors import ComputationError, InputError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.sensitivity.forward import table_text
-from hvdc_ident.sensitivity.sweep_points import Samples
+from hvdc_ident.model import AnyModel
+from hvdc_ident.sensitivity.local_sensitivities import bars
+from hvdc_ident.sensitivity.sweep_points import Against, Samples
 from hvdc_ident.sensitivity.sweep_run import sweep
 
 if TYPE_CHECKING:
     import xarray
 
 
-@dataclass(frozen=True, eq=False)
-class ScreeningResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class ScreeningResult(Shown):
     """Measures of a screening for the RMSE of each (output, experiment) of `series`.
 
     measures: (series, parameters) by name. Morris: mu_star, mu, sigma, mu_star_conf, in the output's unit over the
@@ -64,30 +64,26 @@ class ScreeningResult:
 
     def plot(self, ax: Any = None) -> Any:
         """Axes with a bar for every parameter and series: mu_star, or the total share of the variance."""
-        import matplotlib.pyplot as plt
-
-        axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
+        axes = axes_of(ax)
         name = "mu_star" if self.method == "morris" else "ST"
-        width = 0.8 / len(self.series)
-        for k, (o, e) in enumerate(self.series):
-            places = np.arange(len(self.parameters)) + (k + 0.5) * width - 0.4
-            spread = self.measures[f"{name}_conf"][k]
-            axes.bar(places, self.measures[name][k], width, yerr=spread, label=f"{o} in {e}")
-        axes.set_xticks(range(len(self.parameters)), self.parameters)
+        labels = [f"{o} in {e}" for o, e in self.series]
+        heights, errors = (dict(zip(labels, self.measures[n], strict=True)) for n in (name, f"{name}_conf"))
+        bars(axes, self.parameters, heights, errors)
         axes.set_ylabel(f"{name} of the RMSE")
-        axes.legend(fontsize=8)
         return axes
 
-    def __str__(self) -> str:
-        lines = [
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Screening by the method of {self.method.capitalize()}: {self.evaluations} runs, {self.failed} failed"
+        lines = (
             (o, e, p, *(f"{v[i, k]:.4g}" for v in self.measures.values()))
             for i, (o, e) in enumerate(self.series)
             for k, p in enumerate(self.parameters)
-        ]
-        return table_text(("output", "experiment", "parameter", *self.measures), lines)
+        )
+        yield Table(("output", "experiment", "parameter", *self.measures), tuple(lines))
 
-    def _repr_html_(self) -> str:
-        return "<pre>" + escape(str(self)) + "</pre>"
+
+LEVELS = 4
+"""Levels of Morris' grid."""
 
 
 def morris(
@@ -95,11 +91,10 @@ def morris(
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     *,
-    against: Literal["data", "base"] | Model = "data",
+    against: Against = "data",
     outputs: Sequence[str] | None = None,
     values: Mapping[str, float] | None = None,
     trajectories: int = 20,
-    levels: int = 4,
     seed: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -116,24 +111,30 @@ def morris(
     problem = _problem(ranges, trajectories)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        x = np.asarray(sample.sample(problem, trajectories, num_levels=levels, seed=seed), dtype=float)
-    rmse, series, reasons = _errors(model, experiments, ranges, x, against, outputs, values, executor, progress)
-    whole = np.isfinite(rmse).all(axis=1).reshape(trajectories, -1).all(axis=1)
+        x = np.asarray(sample.sample(problem, trajectories, num_levels=LEVELS, seed=seed), dtype=float)
+    swept = sweep(
+        model,
+        experiments,
+        Samples(tuple(ranges), x),
+        against=against,
+        outputs=outputs,
+        values=values,
+        executor=executor,
+        progress=progress,
+    )
+    good = np.isfinite(swept.rmse).all(axis=1)
+    whole = good.reshape(trajectories, -1).all(axis=1)
     if whole.sum() < 2:
-        raise ComputationError(
-            "too few Morris trajectories are whole", got=f"{whole.sum()} of {trajectories}; {reasons}"
-        )
+        got = f"{whole.sum()} of {trajectories}; {next(iter(swept.failed.values()), '')}"
+        raise ComputationError("too few Morris trajectories are whole", got=got)
     rows = np.repeat(whole, len(ranges) + 1)
-    names = ("mu_star", "mu", "sigma", "mu_star_conf")
-    found: dict[str, list[Any]] = {n: [] for n in names}
-    for column in range(len(series)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            line = analyse.analyze(problem, x[rows], rmse[rows, column], num_levels=levels, seed=seed)
-        for n in names:
-            found[n].append(np.asarray(line[n], dtype=float))
-    bad, dropped = int((~np.isfinite(rmse).all(axis=1)).sum()), int((~whole).sum())
-    return ScreeningResult("morris", tuple(ranges), series, _measures(found), x.shape[0], bad, dropped)
+
+    def effects(rmse: Array) -> Mapping[str, Any]:
+        return analyse.analyze(problem, x[rows], rmse[rows], num_levels=LEVELS, seed=seed)
+
+    measures = _measures(("mu_star", "mu", "sigma", "mu_star_conf"), effects, swept.rmse)
+    failed, dropped = int((~good).sum()), int((~whole).sum())
+    return ScreeningResult("morris", tuple(ranges), swept.series, measures, x.shape[0], failed, dropped)
 
 
 def sobol(
@@ -141,7 +142,7 @@ def sobol(
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     *,
-    against: Literal["data", "base"] | Model = "data",
+    against: Against = "data",
     outputs: Sequence[str] | None = None,
     values: Mapping[str, float] | None = None,
     samples: int = 256,
@@ -164,23 +165,29 @@ def sobol(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         x = np.asarray(sample.sample(problem, samples, calc_second_order=False, seed=seed), dtype=float)
-    rmse, series, reasons = _errors(model, experiments, ranges, x, against, outputs, values, executor, progress)
-    bad = int((~np.isfinite(rmse).all(axis=1)).sum())
-    if bad:
+    swept = sweep(
+        model,
+        experiments,
+        Samples(tuple(ranges), x),
+        against=against,
+        outputs=outputs,
+        values=values,
+        executor=executor,
+        progress=progress,
+    )
+    failed = int((~np.isfinite(swept.rmse).all(axis=1)).sum())
+    if failed:
         raise ComputationError(
             "Sobol's indices need every run",
-            got=f"{bad} of {x.shape[0]} failed; {reasons}",
+            got=f"{failed} of {x.shape[0]} failed; {next(iter(swept.failed.values()), '')}",
             hint="narrower ranges, or morris",
         )
-    names = ("S1", "ST", "S1_conf", "ST_conf")
-    found: dict[str, list[Any]] = {n: [] for n in names}
-    for column in range(len(series)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            line = analyse.analyze(problem, rmse[:, column], calc_second_order=False, seed=seed)
-        for n in names:
-            found[n].append(np.asarray(line[n], dtype=float))
-    return ScreeningResult("sobol", tuple(ranges), series, _measures(found), x.shape[0])
+
+    def indices(rmse: Array) -> Mapping[str, Any]:
+        return analyse.analyze(problem, rmse, calc_second_order=False, seed=seed)
+
+    measures = _measures(("S1", "ST", "S1_conf", "ST_conf"), indices, swept.rmse)
+    return ScreeningResult("sobol", tuple(ranges), swept.series, measures, x.shape[0])
 
 
 def _installed() -> None:
@@ -194,6 +201,7 @@ def _installed() -> None:
 
 
 def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str, Any]:
+    """Return the ranges as SALib takes them. Raises StudyError for wrong ones, or too few samples."""
     wrong = [n for n, (low, high) in ranges.items() if not (np.isfinite([low, high]).all() and low < high)]
     if not ranges or wrong or count < 2:
         raise StudyError(
@@ -204,30 +212,9 @@ def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str,
     return {"num_vars": len(ranges), "names": list(ranges), "bounds": [list(map(float, r)) for r in ranges.values()]}
 
 
-def _errors(
-    model: AnyModel,
-    experiments: Sequence[Experiment],
-    ranges: Mapping[str, tuple[float, float]],
-    x: Array,
-    against: Literal["data", "base"] | Model,
-    outputs: Sequence[str] | None,
-    values: Mapping[str, float] | None,
-    executor: Executor | None,
-    progress: Progress | None,
-) -> tuple[Array, tuple[tuple[str, str], ...], str]:
-    """Return the RMSE, (runs, series), nan where a run failed; the series of the columns; the first reason of a failure."""
-    found = sweep(
-        model,
-        experiments,
-        Samples(tuple(ranges), x),
-        against=against,
-        outputs=outputs,
-        values=values,
-        executor=executor,
-        progress=progress,
-    )
-    return found.rmse, found.series, next(iter(found.failed.values()), "")
-
-
-def _measures(found: Mapping[str, list[Any]]) -> FrozenMap[Array]:
-    return FrozenMap({n: np.vstack(v) for n, v in found.items()})
+def _measures(names: Sequence[str], analyse: Callable[[Array], Mapping[str, Any]], rmse: Array) -> FrozenMap[Array]:
+    """Return the measures of every series, (series, parameters) by name. rmse: (runs, series)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lines = [analyse(column) for column in rmse.T]
+    return FrozenMap({n: np.array([np.asarray(line[n], dtype=float) for line in lines]) for n in names})
