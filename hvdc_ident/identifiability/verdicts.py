@@ -103,9 +103,9 @@ def insensitive_verdict(
     rise: of the cost at the worse end. also: a remark.
     """
     span = f"Anywhere between {ends[0]:.4g} and {_with_unit(ends[1], unit)}"
-    told = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
+    effect = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
-    return Verdict(free.name, "insensitive", f"{span} {told}{why}. {also}".rstrip(), free.given, unit)
+    return Verdict(free.name, "insensitive", f"{span} {effect}{why}. {also}".rstrip(), free.given, unit)
 
 
 def open_verdict(profile: Profile, words: str, unit: str) -> Verdict:
@@ -182,17 +182,17 @@ def closed_verdict(
     judged = replace(judged, collinearity=collinearity, partner=partner)
     span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
     if share > WIDE or collinearity > COLLINEAR:
-        told = _where(profile, span, share)
+        text = _where(profile, span, share)
         ends = (profile.lower.crossing, profile.upper.crossing)
         if ends == (None, None):
             pass  # the width of the bounds is no result
         elif share <= 1.0 or math.isfinite(free.max - free.min) or free.min > 0:
-            told += f", ±{100 * share:.3g} % {of}"
+            text += f", ±{100 * share:.3g} % {of}"
         else:
-            told += ", wider than its value; it has no bounds, and its card no typical size, to compare that with"
+            text += ", wider than its value; it has no bounds, and its card no typical size, to compare that with"
         if collinearity > COLLINEAR:
-            told += f", {'but' if share <= WIDE else 'and'} {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
-        return replace(judged, reason=f"{told}.")
+            text += f", {'but' if share <= WIDE else 'and'} {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
+        return replace(judged, reason=f"{text}.")
     text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
     if collinearity > 0.5 * COLLINEAR:
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"

@@ -91,15 +91,15 @@ def information(names: Sequence[str], jacobians: Mapping[str, Array], slope: Arr
     return Information(tuple(names), FrozenMap({e: (j * slope).T @ (j * slope) for e, j in jacobians.items()}))
 
 
-def marginal(matrix: Array, keep: Sequence[int]) -> Array:
+def marginal(matrix: Array, kept: Sequence[int]) -> Array:
     """The information on the kept unknowns when the others have to be estimated too: the Schur complement."""
-    keep = list(keep)
-    rest = [i for i in range(matrix.shape[0]) if i not in keep]
-    inner = matrix[np.ix_(keep, keep)]
-    if not rest:
+    kept = list(kept)
+    nuisances = [i for i in range(matrix.shape[0]) if i not in kept]
+    inner = matrix[np.ix_(kept, kept)]
+    if not nuisances:
         return inner
-    cross = matrix[np.ix_(keep, rest)]
-    return inner - cross @ np.linalg.pinv(matrix[np.ix_(rest, rest)], hermitian=True) @ cross.T
+    cross = matrix[np.ix_(kept, nuisances)]
+    return inner - cross @ np.linalg.pinv(matrix[np.ix_(nuisances, nuisances)], hermitian=True) @ cross.T
 
 
 def rise_over_range(information_of_one: float, width: float) -> float:
@@ -179,31 +179,31 @@ def pivoted_order(matrix: Array) -> tuple[int, ...]:
 
     Works on J'J through its Cholesky steps; equals (TIE) are taken in the order they are listed.
     """
-    left = matrix.copy()
-    rest, order = list(range(matrix.shape[0])), []
-    while rest:
-        remaining = np.array([left[i, i] for i in rest])
-        best = rest[
+    residual = matrix.copy()
+    candidates, order = list(range(matrix.shape[0])), []
+    while candidates:
+        remaining = np.array([residual[i, i] for i in candidates])
+        best = candidates[
             int(np.argmax(remaining >= remaining.max() * (1.0 - TIE) if remaining.max() > 0 else remaining == 0))
         ]
         order.append(best)
-        rest.remove(best)
-        if left[best, best] > 0:
-            left = left - np.outer(left[:, best], left[best]) / left[best, best]
-            np.fill_diagonal(left, np.clip(np.diag(left), 0.0, None))
+        candidates.remove(best)
+        if residual[best, best] > 0:
+            residual = residual - np.outer(residual[:, best], residual[best]) / residual[best, best]
+            np.fill_diagonal(residual, np.clip(np.diag(residual), 0.0, None))
     return tuple(order)
 
 
 def independent(matrix: Array, error: float = SENSITIVITY_ERROR) -> tuple[int, ...]:
     """The most parameters that are determined together, earlier listed ones first where there is a choice."""
     scaled, seen = _normalised(matrix)
-    kept: list[int] = []
+    selected: list[int] = []
     for i in pivoted_order(scaled):
-        trial = sorted([*kept, i])
-        part = np.linalg.eigvalsh(scaled[np.ix_(trial, trial)])
+        proposal = sorted([*selected, i])
+        part = np.linalg.eigvalsh(scaled[np.ix_(proposal, proposal)])
         if seen[i] and part[0] > (error**2) * max(part[-1], 1.0):
-            kept = trial
-    return tuple(kept)
+            selected = proposal
+    return tuple(selected)
 
 
 def null_directions(columns: Array, error: float = SENSITIVITY_ERROR) -> Array:

@@ -295,8 +295,8 @@ def steady_sensitivities(
     names = tuple(model.parameters if parameters is None else parameters)
     _, scale = factors(model, names, values or {}, ranges or {})
     shown = tuple(outputs or model.outputs)
-    rest = Experiment(np.zeros(1), "rest")
-    run = simulate(model, rest, values, names, outputs=shown)
+    at_rest = Experiment(np.zeros(1), "rest")
+    run = simulate(model, at_rest, values, names, outputs=shown)
     steady = dict(zip(shown, run.trajectory.values[0].tolist(), strict=True))
     return SteadySensitivities(model.name, shown, names, FrozenMap(steady), scale, run.gradients[0])
 

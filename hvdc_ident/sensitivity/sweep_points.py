@@ -228,11 +228,11 @@ class PointTask:
         """Return the RMSE of each reference, (references,), in the outputs' units."""
         found = np.empty(len(self.references))
         for experiment in self.experiments:
-            chosen = [(i, r) for i, r in enumerate(self.references) if r.experiment == experiment.name]
-            if not chosen:
+            columns = [(i, r) for i, r in enumerate(self.references) if r.experiment == experiment.name]
+            if not columns:
                 continue
-            run = simulated(self.model, experiment, given, tuple(r.output for _, r in chosen), self.method)
-            for column, (i, r) in enumerate(chosen):
+            run = simulated(self.model, experiment, given, tuple(r.output for _, r in columns), self.method)
+            for column, (i, r) in enumerate(columns):
                 difference = run[r.rows, column] - r.values
                 found[i] = np.sqrt(np.mean(difference * difference))
         return found
@@ -345,12 +345,12 @@ def _check_values(model: AnyModel, experiments: Sequence[Experiment], name: str,
     for e in experiments:
         if name in e.inputs:
             raise StudyError(f"'{name}' is moved by experiment '{e.name}' and cannot be swept", where="sweep")
-    own = model.parameters.get(name)
-    if own is not None and not (own.min <= values.min() and values.max() <= own.max):
+    parameter = model.parameters.get(name)
+    if parameter is not None and not (parameter.min <= values.min() and values.max() <= parameter.max):
         raise StudyError(
-            f"a value of '{name}' lies outside the model's own bounds",
+            f"a value of '{name}' lies outside the model's parameter bounds",
             where=f"sweep of {name}",
-            expected=f"values in [{own.min:g}, {own.max:g}]",
+            expected=f"values in [{parameter.min:g}, {parameter.max:g}]",
             got=f"{values.min():g} to {values.max():g}",
         )
 
@@ -429,17 +429,17 @@ def _references(
                 raise StudyError(f"no row of '{o}' can be compared", where=f"experiment '{e.name}'", hint=hint)
             found.append(Reference(e.name, o, rows, np.array(e.measured[o][rows])))
         return found
-    chosen = tuple(outputs if outputs is not None else (e.outputs or model.outputs))
+    compared = tuple(outputs if outputs is not None else (e.outputs or model.outputs))
     rows = np.flatnonzero(e.compared)
     if not isinstance(against, str) and hasattr(against, "outputs"):
-        missing = [o for o in chosen if o not in against.outputs and o not in against.names]
+        missing = [o for o in compared if o not in against.outputs and o not in against.names]
         if missing and outputs is None:
-            chosen = tuple(o for o in chosen if o not in missing)
-        run = simulate(against, e.with_(measured=None), {}, outputs=chosen).trajectory.values
+            compared = tuple(o for o in compared if o not in missing)
+        run = simulate(against, e.with_(measured=None), {}, outputs=compared).trajectory.values
     elif against == "base":
-        run = simulated(model, e, base, chosen, method)
+        run = simulated(model, e, base, compared, method)
     else:
         raise StudyError(
             "what a sweep is compared with is unknown", expected='"data", "base" or a Model', got=repr(against)[:60]
         )
-    return [Reference(e.name, o, rows, np.array(run[rows, k])) for k, o in enumerate(chosen)]
+    return [Reference(e.name, o, rows, np.array(run[rows, k])) for k, o in enumerate(compared)]

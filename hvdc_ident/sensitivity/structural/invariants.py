@@ -157,24 +157,24 @@ def invariants(points: Sequence[PointRows], members: Sequence[int]) -> tuple[Inv
     directions = [nulls(r)[:, list(members)] for r in points]
     directions = [d[np.any(d != 0, axis=1)] for d in directions]
     needed = len(members) - len(directions[-1])
-    chosen: list[Invariant] = []
+    selected: list[Invariant] = []
     for candidates in (_products, _sums, _polynomials):
         found = sorted(candidates(points, members, directions), key=lambda i: i.cost)
-        chosen = _independent([*chosen, *found], theta, ring)
-        if len(chosen) == needed:
-            return tuple(sorted(chosen, key=lambda i: (i.cost[0], *(-c for c in reversed(i.cost[2:])))))
+        selected = _independent([*selected, *found], theta, ring)
+        if len(selected) == needed:
+            return tuple(sorted(selected, key=lambda i: (i.cost[0], *(-c for c in reversed(i.cost[2:])))))
     return None
 
 
 def _independent(found: Iterable[Invariant], theta: Sequence[Any], ring: Ring) -> list[Invariant]:
-    chosen: list[Invariant] = []
+    selected: list[Invariant] = []
     gradients: list[list[Any]] = []
     for i in found:
         row = i.gradient(theta, ring)
         if len(ring.rref(np.array([*gradients, row]))[1]) > len(gradients):
-            chosen.append(i)
+            selected.append(i)
             gradients.append(row)
-    return chosen
+    return selected
 
 
 def _products(points: Sequence[PointRows], members: Sequence[int], directions: Sequence[Array]) -> list[Invariant]:

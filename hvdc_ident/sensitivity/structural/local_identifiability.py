@@ -77,13 +77,13 @@ class _Analysis:
         self.regime_words += [x for x in source.active() if x.split(":")[0] not in self.regime]
         rest = source.equations({})
         move = source.equations(self.regime) if self.regime else rest
-        own = self._question(source, rest, move, self.moved)
-        result = self._decide(own)
+        question = self._question(source, rest, move, self.moved)
+        result = self._decide(question)
         wide = dict.fromkeys(self.moved, "free")
-        if own.rested or not result.get("unidentifiable") or all(k == "free" for k in self.moved.values()):
+        if question.rested or not result.get("unidentifiable") or all(k == "free" for k in self.moved.values()):
             return result
-        most = self._decide(self._question(source, rest, move, wide))
-        if most.get("rank") == result["rank"]:
+        general = self._decide(self._question(source, rest, move, wide))
+        if general.get("rank") == result["rank"]:
             return result
         return {"status": "not decided", "reason": "from this start one move of the inputs may show less than several"}
 
@@ -364,16 +364,16 @@ def _classes(model: Model, inputs: Mapping[str, InputClass] | None) -> dict[str,
 
 
 def _starts(model: Model, start: Start | Mapping[str, Start] | None) -> dict[str, Start]:
-    own: dict[str, Start] = {
+    by_model: dict[str, Start] = {
         n: "steady" if s.start is None else "free" if s.start == "free" else "given" for n, s in model.states.items()
     }
-    given = dict.fromkeys(own, start) if isinstance(start, str) else dict(start or {})
+    given = dict.fromkeys(by_model, start) if isinstance(start, str) else dict(start or {})
     for name, kind in given.items():
-        if name not in own:
-            raise unknown_name("state", name, own, where=f"model '{model.name}'")
-        if kind not in ("steady", "free", "given") or (kind == "given" and own[name] == "steady"):
+        if name not in by_model:
+            raise unknown_name("state", name, by_model, where=f"model '{model.name}'")
+        if kind not in ("steady", "free", "given") or (kind == "given" and by_model[name] == "steady"):
             expected = "steady or free" + (
-                ", for the model gives it no start" if own[name] == "steady" else " or given"
+                ", for the model gives it no start" if by_model[name] == "steady" else " or given"
             )
             raise InputError(f"state '{name}' cannot start '{kind}'", where=f"model '{model.name}'", expected=expected)
-    return own | given
+    return by_model | given

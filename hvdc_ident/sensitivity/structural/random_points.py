@@ -185,72 +185,77 @@ def plan(s: Sparse, drawable: set[int], first: set[int], random: Random | None =
     """
     steps: list[Step] = [Draw(v) for v in sorted(first)]
     last: list[Step] = []
-    known, left = set(first), list(s.equations)
-    while left:
-        done = _forward(s, left, known, steps)
-        if not left or done or _peel(s, left, known, last):
+    known, unsolved = set(first), list(s.equations)
+    while unsolved:
+        done = _forward(s, unsolved, known, steps)
+        if not unsolved or done or _peel(s, unsolved, known, last):
             continue
-        _tear(s, left, known, steps, drawable, random)
+        _tear(s, unsolved, known, steps, drawable, random)
     unknown = (
         {v for e in s.equations for v in s.variables(e)} - known - {x.variable for x in last if isinstance(x, Solve)}
     )
     return [*steps, *(Draw(v) for v in sorted(unknown)), *reversed(last)]
 
 
-def _forward(s: Sparse, left: list[int], known: set[int], steps: list[Step], highest: int = 2) -> bool:
+def _forward(s: Sparse, unsolved: list[int], known: set[int], steps: list[Step], highest: int = 2) -> bool:
     """Solve the first equation that has one variable left."""
-    for e in left:
+    for e in unsolved:
         rest = s.variables(e) - known
         if len(rest) == 1:
             v = rest.pop()
             if s.degree(e, v) <= highest:
                 steps.append(Solve(e, v, s.degree(e, v)))
                 known.add(v)
-                left.remove(e)
+                unsolved.remove(e)
                 return True
     return False
 
 
-def _peel(s: Sparse, left: list[int], known: set[int], last: list[Step]) -> bool:
+def _peel(s: Sparse, unsolved: list[int], known: set[int], last: list[Step]) -> bool:
     """Put aside the equation of a variable that no other equation has."""
     where: dict[int, list[int]] = {}
-    for e in left:
+    for e in unsolved:
         for v in s.variables(e) - known:
             where.setdefault(v, []).append(e)
     alone = [(s.degree(es[0], v), v, es[0]) for v, es in where.items() if len(es) == 1]
     for degree, v, e in sorted(alone):
         if degree <= 2:
             last.append(Solve(e, v, degree))
-            left.remove(e)
+            unsolved.remove(e)
             return True
     return False
 
 
 def _tear(
-    s: Sparse, left: list[int], known: set[int], steps: list[Step], drawable: set[int], random: Random | None
+    s: Sparse,
+    unsolved: list[int],
+    known: set[int],
+    steps: list[Step],
+    drawable: set[int],
+    random: Random | None,
 ) -> None:
     counts: dict[int, int] = {}
-    for e in left:
+    for e in unsolved:
         for v in s.variables(e) - known:
             counts[v] = counts.get(v, 0) + 1
     if not counts:
-        steps.extend(Check(e) for e in left)
-        left.clear()
+        steps.extend(Check(e) for e in unsolved)
+        unsolved.clear()
         return
-    surplus = len(counts) > len(left)
+    surplus = len(counts) > len(unsolved)
     order = sorted(counts, key=lambda v: (-counts[v], v))
     if random is not None:
         random.shuffle(order)
     for v in order:
         inner: list[Step] = []
-        tried, remaining = known | {v}, list(left)
+        tried, remaining = known | {v}, list(unsolved)
         while _forward(s, remaining, tried, inner, highest=1):
             closing = next((e for e in remaining if not s.variables(e) - tried), None)
             if closing is not None:
                 remaining.remove(closing)
                 steps.append(Tear(v, tuple(x for x in inner if isinstance(x, Solve)), closing))
                 known |= tried
-                left[:] = remaining
+                unsolved[:] = remaining
                 return
     if surplus:
         chosen = next((v for v in order if v in drawable), order[0])

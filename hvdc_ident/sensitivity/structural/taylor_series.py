@@ -211,10 +211,10 @@ class Coefficients:
     def _circle(self, n: int, k: int, a: int, name: str, other: str, sign: int) -> Array:
         partner = self._helper(n)
         if k == 0:
-            own, its = (self._value(f, self.c[a][0, 0]) for f in (name, other))
-            out = self.ring.reduce(sign * self.c[a][0] * its)
-            partner[0] = self.ring.reduce(-sign * self.c[a][0] * own)
-            out[0], partner[0, 0] = own, its
+            value, partner_value = (self._value(f, self.c[a][0, 0]) for f in (name, other))
+            out = self.ring.reduce(sign * self.c[a][0] * partner_value)
+            partner[0] = self.ring.reduce(-sign * self.c[a][0] * value)
+            out[0], partner[0, 0] = value, partner_value
             return out
         out = self.ring.reduce(sign * self._integrate(partner, a, k))
         partner[k] = self.ring.reduce(-sign * self._integrate(self.c[n], a, k))
