@@ -32,7 +32,7 @@ def factors(
     """Return the parameters' values and the factors that normalise derivatives by them, both in the parameters' units.
 
     A factor is the width of a given range, else the magnitude of the value; where the value is 0, the width of the
-    model's parameter bounds or the parameter's size. Raises UnknownNameError, and StudyError for a range without a width.
+    model's own bounds or the parameter's size. Raises UnknownNameError, and StudyError for a range without a width.
     """
     at, found = {}, {}
     require_known("parameter", names, model.parameters, f"model '{model.name}'")

@@ -348,7 +348,7 @@ def _check_values(model: AnyModel, experiments: Sequence[Experiment], name: str,
     parameter = model.parameters.get(name)
     if parameter is not None and not (parameter.min <= values.min() and values.max() <= parameter.max):
         raise StudyError(
-            f"a value of '{name}' lies outside the model's parameter bounds",
+            f"a value of '{name}' lies outside the model's own bounds",
             where=f"sweep of {name}",
             expected=f"values in [{parameter.min:g}, {parameter.max:g}]",
             got=f"{values.min():g} to {values.max():g}",
