@@ -14,7 +14,7 @@ from hvdc_ident.fit.frequency_data import in_time
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Input
-from hvdc_ident.sensitivity import independent
+from hvdc_ident.sensitivity import independent, standard_deviations
 from hvdc_ident.text import listed
 
 Shape = Literal["step", "ramp", "multisine"]
@@ -205,9 +205,7 @@ def half_widths(matrix: Array, per_std: Array, names: Sequence[str], error: floa
     kept = sorted(independent(matrix, error))
     found: dict[str, float | None] = dict.fromkeys(names)
     if kept:
-        part = matrix[np.ix_(kept, kept)]
-        d = np.sqrt(np.diag(part))
-        std = np.sqrt(np.diag(np.linalg.inv(part / np.outer(d, d)))) / d
+        std = standard_deviations(matrix[np.ix_(kept, kept)])
         for i, s in zip(kept, std.tolist(), strict=True):
             if s <= HOPELESS:
                 found[names[i]] = s * float(per_std[i])

@@ -18,7 +18,7 @@ from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import independent, pivoted_order
+from hvdc_ident.sensitivity import independent, pivoted_order, standard_deviations
 
 LEVEL = 0.01
 """Level of the test of all parameters together (Bonferroni)."""
@@ -146,9 +146,7 @@ def noise_half_widths(whole: LocalAnalysis, fitted: Sequence[str], others: Seque
         part = whole.information.select(proposal).matrix
         if len(independent(part, whole.error)) < len(proposal):
             continue
-        lengths = np.sqrt(np.diag(part))
-        inverse = np.linalg.inv(part / np.outer(lengths, lengths))
-        halves = np.sqrt(2.0 * TWO_SIDED * np.diag(inverse)) / lengths
+        halves = np.sqrt(2.0 * TWO_SIDED) * standard_deviations(part)
         if all(h * slope[m] < _room(free[m], whole.value(m)) for m, h in zip(proposal, halves.tolist(), strict=True)):
             selected = proposal
             found[n] = float(halves[-1] * slope[n])

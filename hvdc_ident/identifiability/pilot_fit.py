@@ -25,7 +25,7 @@ from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.identifiability.structural import combinations_of, parameter_directions
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import Information, independent, marginal
+from hvdc_ident.sensitivity import Information, independent, marginal, standard_deviations
 from hvdc_ident.text import listed, quantity
 
 HALF_95 = 1.96
@@ -285,8 +285,7 @@ def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:
     held = [n for i, n in enumerate(names) if i not in kept]
     std: dict[str, float | None] = dict.fromkeys(names)
     if kept:
-        covariance = np.linalg.inv(at.information.select([names[i] for i in kept]).matrix)
-        widths = np.sqrt(np.diag(covariance)) * at.slope[list(kept)]
+        widths = standard_deviations(at.information.select([names[i] for i in kept]).matrix) * at.slope[list(kept)]
         std |= {names[i]: float(s) for i, s in zip(kept, widths, strict=True)}
     conditional = {
         n: tuple(m for m in held if any(m in c.members and n in c.members for c in combos))

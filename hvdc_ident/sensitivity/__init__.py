@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         null_directions,
         pivoted_order,
         rise_over_range,
+        standard_deviations,
     )
     from hvdc_ident.sensitivity.local_sensitivities import (
         LinearSensitivities,
@@ -43,7 +44,7 @@ else:
             "local_sensitivities": "LinearSensitivities LocalSensitivities Ranges Sensitivities SteadySensitivities "
             "linear_sensitivities sensitivities steady_sensitivities trajectory_sensitivities",
             "information": "SENSITIVITY_ERROR Collinear Information collinear_subsets independent marginal "
-            "null_directions pivoted_order rise_over_range",
+            "null_directions pivoted_order rise_over_range standard_deviations",
             "global_screening": "ScreeningResult morris sobol",
             "structural": "StructuralCombination StructuralResult identifiable_subset structural_identifiability",
             "sweep_points": "Points Quantities Samples grid latin_hypercube listed log_grid",
@@ -82,6 +83,7 @@ __all__ = [
     "rise_over_range",
     "sensitivities",
     "sobol",
+    "standard_deviations",
     "steady_sensitivities",
     "structural_identifiability",
     "sweep",

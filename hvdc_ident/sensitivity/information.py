@@ -102,6 +102,12 @@ def marginal(matrix: Array, kept: Sequence[int]) -> Array:
     return inner - cross @ np.linalg.pinv(matrix[np.ix_(nuisances, nuisances)], hermitian=True) @ cross.T
 
 
+def standard_deviations(matrix: Array) -> Array:
+    """Return the standard deviations, (p,), that a regular information matrix bounds from below (Cramer and Rao)."""
+    lengths = np.sqrt(np.diag(matrix))
+    return np.sqrt(np.diag(np.linalg.inv(matrix / np.outer(lengths, lengths)))) / lengths
+
+
 def rise_over_range(information_of_one: float, width: float) -> float:
     """F_ii (max - min)^2/2: what moving one parameter over its whole range adds to the cost, to second order.
 

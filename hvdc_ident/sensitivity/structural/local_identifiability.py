@@ -250,10 +250,6 @@ class StructuralResult:
     seconds: float = 0.0
     out_of_reach: bool = False
 
-    def combination_of(self, parameter: str) -> StructuralCombination | None:
-        """The combination a parameter is a member of, or None."""
-        return next((c for c in self.combinations if parameter in c.members), None)
-
     def to_dict(self) -> dict[str, Any]:
         """The result as plain values, without the time it took."""
         return {
