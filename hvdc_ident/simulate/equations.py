@@ -168,11 +168,16 @@ class ModelEquations:
         entries = [(i, j, d) for i, n in enumerate(self.rhs) for j, d in self.partial(n, "y").items()]
         return [(i, j, d) for i, j, d in entries if self.graph.gradient(d)] if self.sensitivities else []
 
+    @cached_property
+    def _columns(self) -> dict[int, int]:
+        """{place in p: column} of the sensitivity parameters."""
+        places = {n: k for k, n in enumerate(self.model.parameters)}
+        return {places[n]: k for k, n in enumerate(self.sensitivities)}
+
     def _row(self, node: int, with_rates: bool = False) -> Row:
         """The total derivative of a node over the sensitivity parameters, as a row of the product with S and W."""
-        m = self.model
-        position = {list(m.parameters).index(n): k for k, n in enumerate(self.sensitivities)}
-        scalars = {position[i]: d for i, d in self.partial(node, "p").items() if i in position}
+        m, column = self.model, self._columns
+        scalars = {column[i]: d for i, d in self.partial(node, "p").items() if i in column}
         size = len(self.states) + len(self.unknowns)
         width = self.sizes.width
         products = [(d, "y", size + j * width) for j, d in sorted(self.partial(node, "y").items())]
@@ -220,14 +225,14 @@ class ModelEquations:
 
         jacobian = [(i * n + j, d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()]
         by_time = [self.rate(v, False) for v in self.rhs]
-        modes = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
+        modes = self._modes()
         result = [
             plain("f", self.rhs, hot=not width),
             Function("jac", jacobian, hot=True),
             both("ft", by_time),
             plain("sw", list(g.switches), hot=True),
             plain("swd", [self.rate(v, True) for v in g.switches]),
-            plain("modes", modes, live=True),
+            modes,
             plain("out", self.observed, hot=not width),
             plain("src", self.sources),
             plain("srcd", [self.rate(v, True) for v in self.sources]),
@@ -250,6 +255,13 @@ class ModelEquations:
             raise AssertionError("a derivative made a new condition")
         return result
 
+    def _modes(self) -> Function:
+        """One value a switch: 1 where it is negative, else 0."""
+        g = self.graph
+        return Function(
+            "modes", [(k, g.select(g.negative(v), g.one, g.zero)) for k, v in enumerate(list(g.switches))], live=True
+        )
+
     def _rest(self) -> list[Function]:
         """Residual of the steady state over [x, z, delays, sampled], its Jacobian and its derivative by the sensitivity parameters.
 
@@ -269,12 +281,12 @@ class ModelEquations:
         for i, v in enumerate(residual):
             entries += [(i * n + j, d) for j, d in self.partial(v, "y").items()]
             entries += [(i * n + inner + j - first, d) for j, d in self.partial(v, "w").items() if j >= first]
-        position = {list(self.model.parameters).index(name): k for k, name in enumerate(self.sensitivities)}
+        column = self._columns
         by_p = [
-            (i * s.width + position[k], d)
+            (i * s.width + column[k], d)
             for i, v in enumerate(residual)
             for k, d in self.partial(v, "p").items()
-            if k in position
+            if k in column
         ]
         return [Function("rest", list(enumerate(residual))), Function("rest_jac", entries), Function("rest_p", by_p)]
 
@@ -293,18 +305,9 @@ class ModelEquations:
 
     def compile_rest(self) -> Code:
         """The machine code of the steady state alone."""
-        g = self.graph
-        rest = self._rest()
-        modes = [g.select(g.negative(v), g.one, g.zero) for v in list(g.switches)]
-        return Code(
-            g,
-            [
-                Function("modes", list(enumerate(modes)), live=True),
-                Function("src", list(enumerate(self.sources))),
-                *rest,
-            ],
-            max(self.sizes.width, 1),
-        )
+        rest = self._rest()  # before the modes: its derivatives stand first in the graph
+        functions = [self._modes(), Function("src", list(enumerate(self.sources))), *rest]
+        return Code(self.graph, functions, max(self.sizes.width, 1))
 
     def compile_late(self) -> Code:
         """Compile what only the Rosenbrock method needs: second derivatives and elimination, most of the code of a large model."""
