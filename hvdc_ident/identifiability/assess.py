@@ -1,4 +1,8 @@
-"""The verb `identifiability`: structure, pilot fit, information and profiles, put together into verdicts; by groups too."""
+"""The verb `identifiability`: structure, pilot fit, information and profiles, put together into a report.
+
+Each stage takes parameters out of the fit and gives its verdict on them (`practical`); what is left is fitted. By groups
+the stages run once a group, the other groups held, and the reports are joined.
+"""
 
 from __future__ import annotations
 

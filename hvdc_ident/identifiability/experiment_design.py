@@ -1,4 +1,8 @@
-"""The next experiment to make: designs of steps, ramps and multisines, ranked by the information that they would add."""
+"""The next experiment to make: designs of steps, ramps and multisines, ranked by the information that they would add.
+
+Best is the design with the largest smallest eigenvalue of the information matrix in scaled coordinates (E-optimal); the one
+with the largest determinant (D-optimal) is named beside it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The gated fit: only what the report calls identifiable is fitted, the rest is held, each with value and reason."""
+"""The gated fit: only what the report calls identifiable is fitted, the rest is held, each with value and reason.
+
+The estimates are stated as the verdicts allow: weak and locally identifiable ones with the profile's interval and without a
+standard deviation, those on a bound with a one-sided limit.
+"""
 
 from __future__ import annotations
 

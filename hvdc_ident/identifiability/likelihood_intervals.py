@@ -1,4 +1,8 @@
-"""Ends of the parameters' intervals: thresholds of the cost, limits at several bounds, refits at the ends of a range; other optima."""
+"""Ends of the parameters' intervals by the rise of the cost, and other optima that explain the records as well.
+
+The rise at the ends of a 95 % interval is half a quantile of chi-square, widened by correlated samples and by misfit
+(`spreads`); of several parameters on bounds together it is bootstrapped (`joint_limits`).
+"""
 
 from __future__ import annotations
 

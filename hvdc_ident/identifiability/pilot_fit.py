@@ -1,4 +1,8 @@
-"""The pilot fit, the local analysis at its optimum, and that at the given values before any search."""
+"""The pilot fit, and the local analysis of a problem at a point: its optimum, or the given values before any search.
+
+The analysis holds what follows from the residuals and their first derivatives: information, uncertainty, misfit. At the given
+values it bounds the standard deviations from below (Cramer and Rao).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Practical identifiability: the stages that take parameters out of the fit, one after the other, each with its verdicts."""
+"""Practical identifiability: the stages that take parameters out of the fit, one after the other, each with its verdicts.
+
+In order: those that no data could tell apart, those whose range changes nothing, those of which only a combination shows in
+these data, and those whose profile stays open. An `Assessment` carries the state from stage to stage.
+"""
 
 from __future__ import annotations
 

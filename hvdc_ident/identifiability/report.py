@@ -1,4 +1,7 @@
-"""The report on identifiability, frozen; `to_dict` is its JSON."""
+"""The report on identifiability: verdicts, the set to fit, and the evidence.
+
+It prints one screen, plots profiles and verdicts, and `to_dict` is its JSON.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The verdict on each parameter, with one sentence of reason."""
+"""The verdict on each parameter, with one sentence of reason.
+
+Every function makes the verdict of one case and writes its sentence; the numbers come from the stages in `practical`.
+"""
 
 from __future__ import annotations
 

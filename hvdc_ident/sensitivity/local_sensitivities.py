@@ -1,4 +1,8 @@
-"""Exact local sensitivities: of trajectories, steady states, eigenvalues and frequency responses, in units and normalised."""
+"""Exact local sensitivities: of trajectories, steady states, eigenvalues and frequency responses.
+
+All are derivatives in the units of output and parameter. Normalised they are multiplied by the parameter's factor: its value,
+or its range where one is given or the value is 0.
+"""
 
 from __future__ import annotations
 

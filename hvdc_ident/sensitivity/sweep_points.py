@@ -1,4 +1,7 @@
-"""Points of a sweep (grids, lists, Latin hypercubes and their products), and the work of one of them."""
+"""Points of a sweep (grids, lists, Latin hypercubes and their products), and the work of one of them.
+
+The work is a value that any process can be given: from the parameters' values to RMSE, poles and frequency response as bytes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Sweeps: a model run at many points of its parameters, compared with data, another model or itself; and the result."""
+"""Sweeps: a model run at many points of its parameters, compared with data, another model or itself; and the result.
+
+Points run in this process while that is quick, then in an executor; finished ones can be kept and looked up.
+"""
 
 from __future__ import annotations
 
