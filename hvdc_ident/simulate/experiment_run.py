@@ -10,11 +10,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hvdc_ident.data import Experiment, InputSignal, Trajectory
-from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, require_known
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
@@ -22,6 +22,9 @@ from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Method, Tolerance, engine_of
 from hvdc_ident.simulate.simulation import Simulation
+
+if TYPE_CHECKING:
+    from hvdc_ident.effects import EffectUse
 
 
 def with_recording(model: Model, experiment: Experiment) -> Model:
@@ -33,11 +36,15 @@ def with_recording(model: Model, experiment: Experiment) -> Model:
 
 @lru_cache(maxsize=32)
 def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[FrozenMap[float]]) -> Model:
+    from hvdc_ident.effects import apply_effects  # only runs that see instruments load the effects
+
     return apply_effects(model.driven(drive), chains_of(instrument))
 
 
 def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
     """Return the recording chains as effects at the outputs, in the order in which an instrument acts on the signal."""
+    from hvdc_ident.effects import EffectUse
+
     chains = []
     for output, chain in instrument.items():
         for name in ("window-mean", "delay"):
