@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 # The rooms are there before the package binds the verbs of the same names: an import of a room would replace them later.
@@ -403,9 +404,10 @@ def fit(
         study = _asked(study_of(model, data, parameters, fit=settings), "fit")
         fitting.need(study, "fit")
         found = report or judged(study, seed=seed, executor=pool, progress=told)
-        return fitting.estimated(
+        result = fitting.estimated(
             study, found.to_dict(), force=names_of(force, "parameter") or (), seed=seed, executor=pool, progress=told
         )
+        return replace(result, message=_in_python(result.message))
 
 
 def diagnose(
@@ -426,6 +428,19 @@ def diagnose(
     settings: keys of a study's [diagnose]: material, most, thorough. executor, progress: as in `fit`.
 
     Raises StudyError where data or parameters are missing, ComputationError where the data identify no parameter.
+
+    >>> import numpy as np, hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> plant = hi.apply_effects(lag, [{"effect": "delay", "at": "u", "parameters": {"T": 0.3}}])
+    >>> t, noise = np.linspace(0.0, 5.0, 201), np.random.default_rng(1)
+    >>> def record(name, after):
+    ...     step = {"u": hi.step(0.0, after, at=1.0)}
+    ...     y = hi.simulate(plant, t, inputs=step)["y"] + 0.005 * noise.standard_normal(t.size)
+    ...     return hi.Experiment(t, name, inputs=step, outputs={"y": y})
+    >>> records = [record("up", 1.0), record("down", -0.5)]
+    >>> found = hi.diagnose(lag, records, {"T": (0.1, 10.0), "k": (0.1, 10.0)}, effects=["delay", "gain"])
+    >>> found.verdict, found.effects[0].effect  # at u or at y, which these two records cannot tell apart
+    ('ambiguous', 'delay')
     """
     from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.fitting import need
@@ -492,6 +507,17 @@ def export(
 
         found = linear_model(found)
     return write(found, path, linear, fmu, values, folder)
+
+
+def _in_python(message: str) -> str:
+    """Return a message of the command line with what to try in Python's words."""
+    for command, call in (
+        ("`hvdc-ident identify STUDY`", "`hi.identify(...)`"),
+        ("`hvdc-ident diagnose STUDY`", "`hi.diagnose(...)`"),
+        ("--force NAME", 'force=["NAME"]'),
+    ):
+        message = message.replace(command, call)
+    return message
 
 
 def _are_times(data: Any) -> bool:

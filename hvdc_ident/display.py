@@ -1,4 +1,4 @@
-"""How results are displayed: one screen of text, a table in a notebook, a figure, a data frame."""
+"""Display of results: one screen of text, a table in a notebook, a figure, a data frame."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ class Table:
     @property
     def html(self) -> str:
         """The table as HTML."""
-        return _html_table(self.header, self.rows)
+        head = "".join(f"<th>{escape(h)}</th>" for h in self.header)
+        body = "".join("<tr>" + "".join(f"<td>{escape(_text(c))}</td>" for c in row) + "</tr>" for row in self.rows)
+        return f"<table><tr>{head}</tr>{body}</table>"
 
 
 class Shown:
@@ -84,17 +86,6 @@ def data_frame(columns: Mapping[str, Any], index: Any = None, index_name: str | 
     return frame
 
 
-def table_html(title: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """An HTML table with a title; numbers with six digits, text escaped."""
-    return f"<p>{escape(title)}</p>{_html_table(header, rows)}"
-
-
-def _html_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    head = "".join(f"<th>{escape(h)}</th>" for h in header)
-    body = "".join("<tr>" + "".join(f"<td>{_cell(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
 def axes_of(ax: Any, width: float = 7.0, height: float = 5.0, *, rows: int = 1) -> Any:
     """The axes given; else those of a new figure, sizes in inches: one, or an array of so many above each other."""
     if ax is not None:
@@ -102,10 +93,6 @@ def axes_of(ax: Any, width: float = 7.0, height: float = 5.0, *, rows: int = 1) 
     import matplotlib.pyplot as plt
 
     return plt.subplots(rows, 1, sharex=rows > 1, figsize=(width, height), layout="constrained")[1]
-
-
-def _cell(value: Any) -> str:
-    return escape(_text(value))
 
 
 def _text(value: Any) -> str:

@@ -131,6 +131,9 @@ def test_every_result_is_one_screen_a_table_and_a_figure(report: Any, fit: Any) 
         "insensitive": report,
         "0.5": fit,
         "y": run,
+        "smallest": run.trajectory,
+        "largest gain": linear.bode(),
+        "no limit is active": hi.find_operating_point(LAG),
         "stable": linear,
         "RMSE": table,
         "step": RECORD,
@@ -207,3 +210,11 @@ def test_an_experiment_is_copied_with_all_it_has() -> None:
     for f in dataclasses.fields(full):
         ours, theirs = getattr(copy, f.name), getattr(full, f.name)
         assert ours is theirs or np.all(ours == theirs)
+
+
+def test_a_fit_with_nothing_to_estimate_says_what_to_try_in_python() -> None:
+    still = hi.Experiment(
+        TIME, inputs={"u": 0.0}, outputs={"y": NOISE * np.random.default_rng(2).standard_normal(TIME.size)}
+    )
+    message = hi.fit(LAG, still, {"k": (0.1, 10.0)}).message
+    assert 'force=["NAME"]' in message and "`hi.identify(...)`" in message and "--" not in message

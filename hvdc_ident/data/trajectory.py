@@ -1,28 +1,30 @@
-"""Named signals over one time axis."""
+"""Named signals over one time axis, and how they came out of a file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.display import axes_of, data_frame, library, table_html
+from hvdc_ident.display import Shown, Table, axes_of, data_frame, library
 from hvdc_ident.errors import WaveformError, unknown_name
 
 Array = NDArray[np.float64]
+ROWS_SHOWN = 40
+"""Signals listed on the screen of a trajectory."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """How the rows of a trajectory came out of a file.
+    """Origin of the rows of a trajectory in a file.
 
-    rows: in the file; 0 where there is none. dropped: those left out, third and later rows of an instant and what only
-    some records of several rates cover. time_unit: the time's as the file says it, "" where it does not; times are in s
-    in any case. time_column: the name of the column that the time came from, where it was not the first. converted: the
-    signals whose unit was changed to the model's, in words.
+    rows: number in the file; 0 where there is none. dropped: number left out, the third and later rows of an instant and
+    those that only some records of several rates cover. time_unit: as the file states it, "" where it does not; times are in
+    s in any case. time_column: the column that the time came from, where it was not the first. converted: the signals whose
+    unit was changed to the model's, in words.
     """
 
     rows: int = 0
@@ -32,8 +34,8 @@ class Origin:
     converted: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Shown):
     """Signals sampled at the same instants.
 
     time: (n,) in s, non-decreasing; a time that stands twice is a jump, the first row before it and the second after.
@@ -64,7 +66,7 @@ class Trajectory:
             object.__setattr__(self, name, value)
 
     def __getitem__(self, name: str) -> Array:
-        """The signal's samples, (n,)."""
+        """Return the samples of a signal, (n,)."""
         return self.values[:, self._column(name)]
 
     def __contains__(self, name: object) -> bool:
@@ -74,11 +76,11 @@ class Trajectory:
         return int(self.time.size)
 
     def unit(self, name: str) -> str:
-        """The signal's unit."""
+        """Return the unit of a signal."""
         return self.units[self._column(name)]
 
     def select(self, names: Iterable[str]) -> Trajectory:
-        """The named signals alone, in the order given."""
+        """Return the named signals only, in the order given."""
         columns = [self._column(n) for n in names]
         return Trajectory(
             self.time,
@@ -89,15 +91,15 @@ class Trajectory:
         )
 
     def rows(self, mask: NDArray[np.bool_]) -> Trajectory:
-        """The rows where the mask holds."""
+        """Return the rows where the mask holds."""
         return Trajectory(self.time[mask], self.values[mask], self.names, self.units, self.origin)
 
     def gaps(self, name: str) -> int:
-        """The number of rows at which the signal was not recorded."""
+        """Return the number of rows at which the signal was not recorded."""
         return int(np.count_nonzero(np.isnan(self[name])))
 
     def plot(self, names: str | Iterable[str] | None = None, ax: Any = None) -> Any:
-        """Axes with the signals over time, all or those named."""
+        """Return axes with the signals over time, all or those named."""
         axes = axes_of(ax)
         for name in self.names if names is None else [names] if isinstance(names, str) else names:
             unit = self.unit(name)
@@ -115,20 +117,21 @@ class Trajectory:
         columns = {n: ("time", self[n], {"units": u}) for n, u in zip(self.names, self.units, strict=True)}
         return library("xarray", "to_xarray").Dataset(columns, coords={"time": ("time", self.time, {"units": "s"})})
 
-    def _repr_html_(self) -> str:
-        span = f"{self.time[0]:g} to {self.time[-1]:g} s" if len(self) else "no rows"
-        rows = (
-            [
-                (n, u, float(np.fmin.reduce(v)), float(np.fmax.reduce(v)))
-                for n, u, v in zip(self.names, self.units, self.values.T, strict=True)
-            ]
-            if len(self)
-            else []
-        )
-        return table_html(f"{len(self)} rows, {span}", ("signal", "unit", "smallest", "largest"), rows)
+    def _screen(self) -> Iterator[str | Table]:
+        if not len(self):
+            yield f"Trajectory: no rows of {', '.join(self.names)}"
+            return
+        yield f"Trajectory: {len(self)} rows, {self.time[0]:g} to {self.time[-1]:g} s"
+        columns = zip(self.names, self.units, self.values.T, strict=True)
+        rows = [
+            (n, u, float(v[0]), float(v[-1]), float(np.fmin.reduce(v)), float(np.fmax.reduce(v))) for n, u, v in columns
+        ]
+        shown = tuple(rows[:ROWS_SHOWN])
+        yield Table(("signal", "unit", "first", "last", "smallest", "largest"), shown)
+        yield f"and {len(rows) - ROWS_SHOWN} more signals" if len(rows) > ROWS_SHOWN else ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Time, signals and units as plain lists."""
+        """Return time, signals and units as plain lists."""
         return {
             "time": self.time.tolist(),
             "signals": {n: self[n].tolist() for n in self.names},
@@ -145,7 +148,7 @@ class Trajectory:
 def trajectory(
     time: Sequence[float] | Array, signals: dict[str, Any], units: dict[str, str] | None = None
 ) -> Trajectory:
-    """A trajectory from a time axis and a dict of columns."""
+    """Return a trajectory from a time axis and a dict of columns."""
     columns = [np.asarray(v, dtype=float) for v in signals.values()]
     values = np.column_stack(columns) if columns else np.empty((len(time), 0))
     return Trajectory(

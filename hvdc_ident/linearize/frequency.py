@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.display import data_frame
+from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.linearize.system import Array
 
@@ -17,9 +17,12 @@ if TYPE_CHECKING:
 
     from hvdc_ident.linearize.linear_model import LinearModel
 
+ROWS_SHOWN = 40
+"""Channels listed on the screen of a response."""
 
-@dataclass(frozen=True, eq=False)
-class FrequencyResponse:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrequencyResponse(Shown):
     """A frequency response. omega: (n,) rad/s; values: (n, outputs, inputs) complex, in output unit per input unit.
 
     std: (n, outputs, inputs) standard deviation of the error's modulus, where one is known. coherence: of a recording.
@@ -86,6 +89,21 @@ class FrequencyResponse:
 
         axes = {"omega": self.omega, "output": list(self.output_names), "input": list(self.input_names)}
         return xarray.DataArray(self.values, coords=axes, dims=tuple(axes), name="response")
+
+    def _screen(self) -> Iterator[str | Table]:
+        f = self.frequency_hz
+        yield f"Frequency response ({self.source}): {f.size} frequencies, {f.min():.4g} to {f.max():.4g} Hz"
+        rows = []
+        for j, output in enumerate(self.output_names):
+            for k, input in enumerate(self.input_names):
+                gain, phase = self.magnitude[:, j, k], self.phase_deg[:, j, k]
+                peak = int(np.argmax(gain))
+                rows.append(
+                    (f"{input} to {output}", *map(float, (gain[0], phase[0], gain[peak], f[peak], gain[-1], phase[-1])))
+                )
+        header = ("channel", "first gain", "phase, deg", "largest gain", "at, Hz", "last gain", "phase, deg")
+        yield Table(header, tuple(rows[:ROWS_SHOWN]))
+        yield f"and {len(rows) - ROWS_SHOWN} more channels" if len(rows) > ROWS_SHOWN else ""
 
     def plot(self, ax: Any = None) -> Any:
         """The two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""

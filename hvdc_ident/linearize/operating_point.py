@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.display import table_html
+from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, homotopy, newton, weights
@@ -24,10 +24,12 @@ Side = Literal["here", "below", "above"]
 Branch = Literal["own", "unconnected", "other", "trimmed"]
 ZERO = 1e-8
 """An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
+ROWS_SHOWN = 40
+"""Values listed on the screen of a point."""
 
 
-@dataclass(frozen=True, eq=False)
-class OperatingPoint:
+@dataclass(frozen=True, eq=False, repr=False)
+class OperatingPoint(Shown):
     """A point of a model: values by name, in the model's units.
 
     extras: values of delays and sampled blocks. residual: the largest scaled residual of the equations that define it.
@@ -54,10 +56,14 @@ class OperatingPoint:
     search: EquilibriumSearch | None = field(default=None, repr=False)
     branch: Branch = "own"
 
-    def _repr_html_(self) -> str:
-        rows = [(n, v) for part in (self.states, self.inputs, self.outputs) for n, v in part.items()]
-        title = f"Operating point ({self.at}), residual {self.residual:.2g}, {len(self.active_limits)} limits active"
-        return table_html(title, ("state, input or output", "value"), rows)
+    def _screen(self) -> Iterator[str | Table]:
+        yield f"Operating point of {self.model.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
+        parts = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
+        rows = tuple((n, kind, v) for kind, values in parts for n, v in values.items())
+        yield Table(("name", "kind", "value"), rows[:ROWS_SHOWN])
+        yield f"and {len(rows) - ROWS_SHOWN} more" if len(rows) > ROWS_SHOWN else ""
+        yield "\n".join([x.text for x in self.active_limits] or ["no limit is active"])
+        yield "\n".join(self.notes)
 
     @property
     def active_limits(self) -> tuple[Limit, ...]:
@@ -107,13 +113,6 @@ class OperatingPoint:
             "stable": self.stable,
             "notes": list(self.notes),
         }
-
-    def __str__(self) -> str:
-        lines = [f"{n} = {v:.6g}" for n, v in (*self.states.items(), *self.inputs.items(), *self.outputs.items())]
-        held = [x.text for x in self.active_limits] or ["no limit is active"]
-        return "\n".join(
-            [f"operating point of '{self.model.name}' ({self.at}, {self.method})", *lines, *held, *self.notes]
-        )
 
 
 def find_operating_point(
