@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,17 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.reduction import Peak, hankel, linf_norm, on_axis, refined, visible, without_sliding_means
+from hvdc_ident.linearize.reduction import (
+    Peak,
+    hankel,
+    linf_norm,
+    on_axis,
+    peak_over,
+    visible,
+    without_sliding_means,
+)
 from hvdc_ident.linearize.system import Array
 
 Complex = NDArray[np.complex128]
@@ -285,12 +291,11 @@ def _four_blocks(plant: LinearModel, controller: LinearModel) -> LinearModel:
     rates[:n1, :n1] += a1
     rates[n1:, n1 : n1 + n2] += a2
     n = n1 + n2
-    return replace(
-        plant, A=rates[:, :n], B=rates[:, n:], C=seen[:, :n], D=seen[:, n:], E=np.eye(n),
-        state_names=tuple(f"x{k + 1}" for k in range(n)), state_units=(), x0=(0.0,) * n,
+    return plant.with_matrices(
+        rates[:, :n], rates[:, n:], seen[:, :n], seen[:, n:],
         input_names=tuple(f"w{k + 1}" for k in range(p + m)), input_units=(), u0=(0.0,) * (p + m),
         output_names=tuple(f"z{k + 1}" for k in range(p + m)), output_units=(), y0=(0.0,) * (p + m),
-        point=None, gradients=FrozenMap(), delay_free=None, name=f"loop of {plant.name} and {controller.name}",
+        point=None, name=f"loop of {plant.name} and {controller.name}",
     )  # fmt: skip
 
 
@@ -304,13 +309,6 @@ def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
         return np.linalg.svd(np.concatenate([middle, c @ middle], axis=1), compute_uv=False)[:, 0]
 
     return peak_over(blocks, np.unique(np.concatenate([default_omega(m, 4000) for m in (plant, controller)])))
-
-
-def peak_over(values: Callable[[Array], Array], grid: Array) -> Peak:
-    """Return the largest of some positive values over the frequencies of a grid, refined beside the largest."""
-    found = values(grid)
-    k = int(np.argmax(found))
-    return refined(lambda w: float(values(np.array([w]))[0]), float(found[k]), float(grid[k]))
 
 
 @dataclass(frozen=True)
@@ -399,25 +397,11 @@ def difference(first: LinearModel, second: LinearModel) -> LinearModel:
     same_channels(first, second)
     a1, b1, c1, d1 = without_sliding_means(first)
     a2, b2, c2, d2 = without_sliding_means(second)
-    names = (*_names("1", first, a1.shape[0]), *_names("2", second, a2.shape[0]))
-    return replace(
-        first,
-        A=scipy.linalg.block_diag(a1, a2) if names else np.zeros((0, 0)),
-        B=np.concatenate([b1, b2]),
-        C=np.concatenate([c1, -c2], axis=1),
-        D=d1 - d2,
-        E=np.eye(len(names)),
-        state_names=names,
-        state_units=(),
-        x0=(0.0,) * len(names),
+    return first.with_matrices(
+        scipy.linalg.block_diag(a1, a2) if a1.size or a2.size else np.zeros((0, 0)),
+        np.concatenate([b1, b2]),
+        np.concatenate([c1, -c2], axis=1),
+        d1 - d2,
         point=None,
-        gradients=FrozenMap(),
-        delay_free=None,
         name=f"{first.name} - {second.name}",
     )
-
-
-def _names(prefix: str, model: LinearModel, count: int) -> tuple[str, ...]:
-    """The states' names; numbers where some states have been projected out."""
-    known = model.state_names if count == len(model.state_names) else [f"x{k + 1}" for k in range(count)]
-    return tuple(f"{prefix}.{n}" for n in known)

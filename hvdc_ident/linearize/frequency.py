@@ -67,8 +67,11 @@ class FrequencyResponse(Shown):
         return np.asarray(self.values[:, self.output_names.index(output), self.input_names.index(input)])
 
     def to_xarray(self) -> xarray.DataArray:
-        """Return the response with labelled axes; the same as `array`."""
-        return self.array
+        """Return the response with labelled axes omega, output, input."""
+        import xarray
+
+        axes = {"omega": self.omega, "output": list(self.output_names), "input": list(self.input_names)}
+        return xarray.DataArray(self.values, coords=axes, dims=tuple(axes), name="response")
 
     def to_dataframe(self) -> Any:
         """Return gain and phase of every channel as a pandas DataFrame over frequency in Hz.
@@ -81,14 +84,6 @@ class FrequencyResponse(Shown):
                 columns[f"{o}/{i} gain"] = self.magnitude[:, j, k]
                 columns[f"{o}/{i} phase, degrees"] = self.phase_deg[:, j, k]
         return data_frame(columns, self.frequency_hz, "frequency, Hz")
-
-    @property
-    def array(self) -> xarray.DataArray:
-        """The response with labelled axes omega, output, input."""
-        import xarray
-
-        axes = {"omega": self.omega, "output": list(self.output_names), "input": list(self.input_names)}
-        return xarray.DataArray(self.values, coords=axes, dims=tuple(axes), name="response")
 
     def _screen(self) -> Iterator[str | Table]:
         f = self.frequency_hz

@@ -59,14 +59,7 @@ def linearize(
     s = system(model, outputs)
     chosen = _chosen(s, inputs, model.name)
     require_known("parameter", sensitivities, s.parameters, f"model '{model.name}'")
-    y, w, p = at.y, at.w, at.p
-    modes = modes_at(s, y, w, p, side)
-    jac = s.jacobian(y, w, p, modes)[: s.layout.main]
-    if not np.isfinite(jac).all():
-        raise _not_finite(s, jac, model.name)
-    _refuse_flat_roots(s, y, w, p, modes, model.name)
-    parts = Blocks(s, channels(model, s, p), pade_order)
-    reduced = eliminate(parts.matrix(jac), parts.rows, parts.columns)
+    modes, jac, parts, reduced = _eliminated(model, s, at.y, at.w, at.p, side, pade_order)
     keep = descriptor or reduced.condition > WELL_POSED
     if keep and parts.channels:
         raise LinearizationError(
@@ -79,15 +72,25 @@ def linearize(
     return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side)
 
 
-def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
-    """A alone at a point given by its vectors: what `linearize` gives, without the rest. Raises as it does."""
-    modes = modes_at(s, y, w, p, "refuse")
+def _eliminated(
+    model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, side: Side, pade_order: int
+) -> tuple[Array, Array, Blocks, Eliminated]:
+    """Return the switches' modes, the Jacobian, its blocks with delays, and these without the algebraic unknowns.
+
+    Raises LinearizationError on a kink, and where an entry of the Jacobian is not finite.
+    """
+    modes = modes_at(s, y, w, p, side)
     jac = s.jacobian(y, w, p, modes)[: s.layout.main]
     if not np.isfinite(jac).all():
         raise _not_finite(s, jac, model.name)
     _refuse_flat_roots(s, y, w, p, modes, model.name)
     parts = Blocks(s, channels(model, s, p), pade_order)
-    reduced = eliminate(parts.matrix(jac), parts.rows, parts.columns)
+    return modes, jac, parts, eliminate(parts.matrix(jac), parts.rows, parts.columns)
+
+
+def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
+    """Return A, (states, states), at a point given by its vectors. Raises as `linearize` does."""
+    _, _, parts, reduced = _eliminated(model, s, y, w, p, "refuse", pade_order)
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
             "the algebraic part is ill-conditioned",
@@ -144,7 +147,7 @@ def one_sided(
 
 
 def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
-    """The largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
+    """Return the largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
     if not isinstance(model, Model):
         from hvdc_ident.linearize.fmu_linear import error_of
 

@@ -1,8 +1,8 @@
-"""The linear model: matrices with names, units, the operating point and how they came about."""
+"""The linear model: matrices with names, units, operating point and provenance, and its analysis as methods."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -141,41 +141,61 @@ class LinearModel(Shown):
         )
 
     def channel(self, inputs: Sequence[str] | str, outputs: Sequence[str] | str) -> LinearModel:
-        """The model between some of its inputs and outputs; the states stay."""
+        """Return the model between some of its inputs and outputs; the states stay."""
         i = [self._index("input", n) for n in ([inputs] if isinstance(inputs, str) else inputs)]
         o = [self._index("output", n) for n in ([outputs] if isinstance(outputs, str) else outputs)]
-        core = self.delay_free
-        rows = columns = np.zeros(0, dtype=int)
-        if core is not None:
-            n = core.nx
-            rows = np.array([*range(n), *(n + k for k in o), *range(n + core.no, core.matrix.shape[0])])
-            columns = np.array([*range(n), *(n + k for k in i), *range(n + core.nu, core.matrix.shape[1])])
-            core = replace(core, matrix=core.matrix[np.ix_(rows, columns)], no=len(o), nu=len(i))
-        gradients = {
-            k: Gradient(
-                g.A,
-                g.B[:, i],
-                g.C[o],
-                g.D[np.ix_(o, i)],
-                None if g.delay_free is None else g.delay_free[np.ix_(rows, columns)],
-                g.times,
-            )
-            for k, g in self.gradients.items()
-        }
-        return replace(
-            self,
-            B=self.B[:, i],
-            C=self.C[o],
-            D=self.D[np.ix_(o, i)],
+        return self._rewired(
+            lambda columns: columns[:, i],
+            lambda rows: rows[o],
             input_names=tuple(self.input_names[k] for k in i),
             output_names=tuple(self.output_names[k] for k in o),
             input_units=tuple(self.input_units[k] for k in i),
             output_units=tuple(self.output_units[k] for k in o),
             u0=tuple(self.u0[k] for k in i),
             y0=tuple(self.y0[k] for k in o),
+        )
+
+    def negated(self) -> LinearModel:
+        """Return the model whose outputs have the other sign."""
+        return self._rewired(lambda columns: columns, lambda rows: -rows)
+
+    def _rewired(self, columns: Callable[[Array], Array], rows: Callable[[Array], Array], **fields: Any) -> LinearModel:
+        """Return the model with the columns of its inputs and the rows of its outputs changed, in every matrix it has."""
+        core = self.delay_free
+
+        def whole(m: Array) -> Array:
+            assert core is not None
+            n, u, y = core.nx, core.nx + core.nu, core.nx + core.no
+            m = np.concatenate([m[:, :n], columns(m[:, n:u]), m[:, u:]], axis=1)
+            return np.concatenate([m[:n], rows(m[n:y]), m[y:]])
+
+        gradients = {
+            k: Gradient(
+                g.A, columns(g.B), rows(g.C), rows(columns(g.D)),
+                None if g.delay_free is None else whole(g.delay_free), g.times,
+            )
+            for k, g in self.gradients.items()
+        }  # fmt: skip
+        d = rows(columns(self.D))
+        if core is not None:
+            core = replace(core, matrix=whole(core.matrix), no=d.shape[0], nu=d.shape[1])
+        return replace(
+            self,
+            B=columns(self.B),
+            C=rows(self.C),
+            D=d,
             gradients=FrozenMap(gradients),
             delay_free=core,
+            **fields,
         )
+
+    def with_matrices(self, a: Array, b: Array, c: Array, d: Array, *, prefix: str = "x", **fields: Any) -> LinearModel:
+        """Return the model with other matrices, its states numbered; delays and derivatives are not those of these matrices."""
+        n = a.shape[0]
+        return replace(
+            self, A=a, B=b, C=c, D=d, E=np.eye(n), x0=(0.0,) * n, state_units=(),
+            state_names=tuple(f"{prefix}{k + 1}" for k in range(n)), delay_free=None, gradients=FrozenMap(), **fields,
+        )  # fmt: skip
 
     def _index(self, kind: str, name: str) -> int:
         names = self.input_names if kind == "input" else self.output_names
@@ -196,35 +216,17 @@ class LinearModel(Shown):
                 raise LinearizationError("a size is not above 0", where=f"scale of '{name}'", got=f"{size:g}")
         u = np.array([sizes.get(n, 1.0) for n in self.input_names])
         y = np.array([sizes.get(n, 1.0) for n in self.output_names])[:, None]
-        core, n = self.delay_free, 0 if self.delay_free is None else self.delay_free.nx
-
-        def whole(matrix: Array) -> Array:
-            result = matrix.copy()
-            result[:, n : n + u.size] *= u
-            result[n : n + y.size] /= y
-            return result
-
-        gradients = {
-            k: Gradient(
-                g.A, g.B * u, g.C / y, g.D * u / y, None if g.delay_free is None else whole(g.delay_free), g.times
-            )
-            for k, g in self.gradients.items()
-        }
 
         def units(names: tuple[str, ...], own: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(f"{sizes[k]:g} {v}".strip() if k in sizes else v for k, v in zip(names, own, strict=True))
 
-        return replace(
-            self,
-            B=self.B * u,
-            C=self.C / y,
-            D=self.D * u / y,
+        return self._rewired(
+            lambda columns: columns * u,
+            lambda rows: rows / y,
             input_units=units(self.input_names, self.input_units),
             output_units=units(self.output_names, self.output_units),
             u0=tuple(v / k for v, k in zip(self.u0, u, strict=True)),
             y0=tuple(v / k for v, k in zip(self.y0, y[:, 0], strict=True)),
-            gradients=FrozenMap(gradients),
-            delay_free=None if core is None else replace(core, matrix=whole(core.matrix)),
         )
 
     def to_control(self) -> control.StateSpace:

@@ -1,7 +1,8 @@
 """Loops opened at named signals, and their stability margins.
 
 Open-loop transfer, sensitivity and complementary sensitivity; plant and controller; gain, phase, delay, modulus and disk
-margin of each loop, and the disk margin of all together.
+margin of each loop, and the disk margin of all together. python-control 0.10.2 without Slycot was measured and does not do:
+it finds a false gain margin of 3e-6 on the link, and has no disk margin of several loops.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def loop(
     found = linearize(
         opened, at, inputs=list(signals), outputs=outputs, sensitivities=sensitivities, pade_order=pade_order
     )
-    return Loop(", ".join(signals), negated(found))
+    return Loop(", ".join(signals), found.negated())
 
 
 def plant_and_controller(
@@ -156,7 +157,7 @@ def plant_and_controller(
     where there is a way from inputs to inputs, or outputs to outputs, that passes neither: the cut does not part them.
     """
     both = loop(model, (*inputs, *outputs), point).open
-    back = negated(both)
+    back = both.negated()
     k = len(inputs)
     names = both.output_names
     returned_inputs, returned_outputs = names[:k], names[k:]
@@ -196,23 +197,6 @@ def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> 
         shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
         found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
     return found
-
-
-def negated(model: LinearModel) -> LinearModel:
-    """The model whose outputs have the other sign."""
-    core = model.delay_free
-    if core is not None:
-        matrix = core.matrix.copy()
-        matrix[core.nx : core.nx + core.no] *= -1.0
-        core = replace(core, matrix=matrix)
-    gradients = {}
-    for n, g in model.gradients.items():
-        free = g.delay_free
-        if free is not None and core is not None:
-            free = free.copy()
-            free[core.nx : core.nx + core.no] *= -1.0
-        gradients[n] = replace(g, C=-g.C, D=-g.D, delay_free=free)
-    return replace(model, C=-model.C, D=-model.D, delay_free=core, gradients=FrozenMap(gradients))
 
 
 # --- stability margins ---

@@ -101,23 +101,11 @@ def eigen(a: Array) -> tuple[Array, Array, Array]:
 
 def modes(model: LinearModel) -> tuple[Mode, ...]:
     """Every mode of a model, by falling real part; conjugates follow each other, the upper one first."""
-    from dataclasses import replace
-
     names = model.state_names
     if model.is_descriptor:
         a, b, c, d = model.standard()
         names = names[: a.shape[0]]
-        model = replace(
-            model,
-            A=a,
-            B=b,
-            C=c,
-            D=d,
-            E=np.eye(a.shape[0]),
-            state_names=names,
-            state_units=(),
-            x0=model.x0[: len(names)],
-        )
+        model = replace(model.with_matrices(a, b, c, d), state_names=names)
     if model.A.shape[0] == 0:
         return ()
     values, right, left = eigen(model.A)

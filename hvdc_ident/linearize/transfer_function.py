@@ -1,6 +1,7 @@
 """Transfer functions: invariant zeros, zeros, poles and gain of a channel, and formulas in a few parameters.
 
-Zeros come from the system matrix, never from polynomials.
+Zeros come from the system matrix, never from polynomials; python-control 0.10.2 without Slycot gives a false zero on 5 of 20
+badly scaled systems.
 """
 
 from __future__ import annotations

@@ -314,4 +314,4 @@ def test_the_voltage_loop_as_a_formula(link):
 def test_default_frequencies_cover_the_poles(model):
     found = frequency_response(model)
     assert found.omega[0] < 30 / 10 and found.omega[-1] > 4.1e5
-    assert found.array.dims == ("omega", "output", "input")
+    assert found.to_xarray().dims == ("omega", "output", "input")
