@@ -1,6 +1,6 @@
-"""Profiles and intervals as an identifiability report's JSON has them, drawn on axes that are given.
+"""Drawing of profiles and intervals from the JSON of an identifiability report, on given axes.
 
-By itself, so that a page is made without importing what computes them.
+It imports nothing that computes them, so that a page of results is made quickly.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FINEST = 1e-4
 
 
 def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapping[str, Any]) -> None:
-    """The rise of the cost over one parameter, in units of the 95 % level, with the interval's ends."""
+    """Draw the rise of the cost over one parameter, in units of the 95 % level, with the ends of the interval."""
     x, y = np.array(profile["values"], dtype=float), np.array(profile["rises"], dtype=float) / profile["threshold"]
     axes.plot(*_joined(x, y), color=LINE, linewidth=1.2)
     axes.plot(x, y, color=LINE, linewidth=0, marker="o", markersize=2.5)
@@ -35,14 +35,14 @@ def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapp
 
 
 def _joined(x: Array, y: Array) -> tuple[Array, Array]:
-    """The points joined by pieces of parabolas: straight lines in the signed root of the rise."""
+    """Return the points joined by pieces of parabolas: straight lines in the signed root of the rise."""
     root = np.sqrt(np.clip(y, 0.0, None)) * np.where(x < x[int(np.argmin(y))], -1.0, 1.0)
     dense = np.unique(np.concatenate([x, np.linspace(x[0], x[-1], 200)]))
     return dense, np.interp(dense, x, root) ** 2
 
 
 def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    """One line a candidate: its 95 % interval about the value, in % of its scale, open ends as arrows; the verdict."""
+    """Draw the 95 % interval of each parameter about its value, in % of its scale, open ends as arrows, with the verdict."""
     names = list(parameters)
     ends = {n: _relative(parameters[n]) for n in names}
     known = [abs(e) for pair in ends.values() if pair is not None for e in pair if e is not None and e != 0]
@@ -77,7 +77,7 @@ def _decades(low: float, high: float) -> list[float]:
 
 
 def _relative(verdict: Mapping[str, Any]) -> tuple[float | None, float | None] | None:
-    """The interval's ends about the value, in %; None where there is no interval."""
+    """Return the interval's ends about the value, in %; None where there is no interval."""
     if not verdict.get("ci95") or verdict["value"] is None:
         return None
     value, scale = float(verdict["value"]), float(verdict.get("scale") or 1.0)

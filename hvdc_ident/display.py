@@ -87,7 +87,7 @@ def data_frame(columns: Mapping[str, Any], index: Any = None, index_name: str | 
 
 
 def axes_of(ax: Any, width: float = 7.0, height: float = 5.0, *, rows: int = 1) -> Any:
-    """The axes given; else those of a new figure, sizes in inches: one, or an array of so many above each other."""
+    """Return the axes given; else those of a new figure, sizes in inches: one, or an array of so many above each other."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt

@@ -57,7 +57,7 @@ class FrozenMap(Mapping[str, V]):
         return FrozenMap({**self._items, **other})
 
     def without(self, *names: str) -> FrozenMap[V]:
-        """A copy that lacks the names."""
+        """Return a copy that lacks the names."""
         return FrozenMap({k: v for k, v in self._items.items() if k not in names})
 
     def __reduce__(self) -> tuple[Any, ...]:

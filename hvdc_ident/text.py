@@ -1,4 +1,4 @@
-"""Values and lists as sentences say them."""
+"""Text of quantities, durations, ranges and lists for messages and reports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _SMALLER = ((1e-4, 1e6, "µs"), (0.1, 1e3, "ms"))
 
 
 def quantity(value: float, unit: str = "", digits: int = 4) -> str:
-    """A value with its unit, so many significant digits; short times in ms or µs."""
+    """Return a value with its unit, so many significant digits; short times in ms or µs."""
     for below, factor, smaller in _SMALLER:
         if unit == "s" and 0.0 < abs(value) < below:
             return f"{factor * value:.{digits}g} {smaller}"
@@ -19,7 +19,7 @@ def quantity(value: float, unit: str = "", digits: int = 4) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time that somebody waits, in s, min or h: two figures."""
+    """Return a waiting time in s, min or h with two digits."""
     for above, unit in ((3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * above:
             return f"{seconds / above:.2g} {unit}"
@@ -27,7 +27,7 @@ def duration(seconds: float) -> str:
 
 
 def span(low: float, high: float, unit: str = "", digits: int = 4) -> str:
-    """Two ends with one unit, that of the upper one."""
+    """Return the two ends of a range with one unit, that of the upper one."""
     for below, factor, smaller in _SMALLER:
         if unit == "s" and 0.0 < abs(high) < below:
             return f"{factor * low:.{digits}g} and {factor * high:.{digits}g} {smaller}"
@@ -35,20 +35,17 @@ def span(low: float, high: float, unit: str = "", digits: int = 4) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """The names as a sentence has them: A, B and C."""
+    """Return the names as "A, B and C"."""
     *most, last = [*names] or [""]
     return f"{', '.join(most)} and {last}" if most else last
 
 
 def with_study(text: str, study: str, *options: str) -> str:
-    """Return the text with every "hvdc-ident COMMAND STUDY" in it made a command to paste: of this study, with these options.
-
-    Results say STUDY, for they do not know where their reader stands.
-    """
+    """Return the text with every "hvdc-ident COMMAND STUDY" in it made a command to paste, with this study and these options."""
     typed = shlex.join([study, *options])
     return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda found: f"{found[1]} {typed}", text)
 
 
-def form_of(told: Mapping[str, Any]) -> str:
-    """The name of an effect as the results tell it; with its formula where it is one outside the catalogue."""
-    return f"{told['effect']} {told.get('expression', '')}".rstrip()
+def form_of(effect: Mapping[str, Any]) -> str:
+    """Return the name of an effect in the results, with its formula where it is outside the catalogue."""
+    return f"{effect['effect']} {effect.get('expression', '')}".rstrip()

@@ -1,4 +1,4 @@
-"""What was done to the system and what was recorded: input signals, measured outputs, noise, window, role."""
+"""Experiments: input signals, measured outputs, noise, window and role of each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SignalLike: TypeAlias = InputSignal | float | ArrayLike | Callable[[Array], Any]
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Experiment(Shown):
-    """One experiment: how the inputs moved, the instants at which outputs are wanted, and what was recorded.
+    """One experiment: its input signals, the instants at which outputs are wanted, and the recorded outputs.
 
     time: (n,) instants at which outputs are wanted, s; one that stands twice asks for the values before and after a jump.
     name: unique among the experiments of a fit.
@@ -170,7 +170,7 @@ class Experiment(Shown):
         return axes
 
     def with_(self, **changes: Any) -> Experiment:
-        """A copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return replace(self, **changes)
 
     @property

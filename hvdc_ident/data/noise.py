@@ -24,7 +24,7 @@ _OUTLIER = 5.0  # standard deviations
 
 
 def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
-    """The instant of the first change of any input in s; None where none changes.
+    """Return the instant of the first change of any input in s; None where none changes.
 
     Noise of a recorded input is no change: without a break in it, the signal has to leave its first level by six times
     the scatter from point to point.
@@ -34,7 +34,7 @@ def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
 
 
 def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> float:
-    """The standard deviation of the noise in a record, in its unit; 0.0 where the record is deterministic.
+    """Return the standard deviation of the noise in a record, in its unit; 0.0 where the record is deterministic.
 
     time: (n,) in s. values: (n,), NaN where not recorded. event: instant of the first disturbance in s; None where there
     is none. Before the event: the scatter around a line, by the median. Where fewer than 8 rows lie before it, or none is given:
@@ -62,7 +62,7 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> f
 
 
 def row_scatter(time: ArrayLike, values: ArrayLike) -> float | None:
-    """The standard deviation of the white noise that a record shows from row to row, in its unit; None where it does not.
+    """Return the standard deviation of the white noise that a record shows from row to row, in its unit; None where it does not.
 
     time: (n,) in s, uneven allowed; values: (n,), NaN where nothing was recorded. The divided differences of second,
     third and fourth order of white noise give the same standard deviation once each is scaled, and so do those of
@@ -86,7 +86,7 @@ def row_scatter(time: ArrayLike, values: ArrayLike) -> float | None:
 
 
 def _difference(t: Array, v: Array, order: int) -> Array:
-    """(n - order,) divided differences, scaled so that white noise of 1 makes a standard deviation of 1."""
+    """Return (n - order,) divided differences, scaled so that white noise of 1 makes a standard deviation of 1."""
     windows = np.lib.stride_tricks.sliding_window_view(t, order + 1)
     gaps = windows[:, :, None] - windows[:, None, :]
     gaps[:, range(order + 1), range(order + 1)] = np.median(np.diff(t))  # leaves the product's scale as it is
@@ -96,7 +96,7 @@ def _difference(t: Array, v: Array, order: int) -> Array:
 
 
 def noise_floor(values: ArrayLike) -> float:
-    """The smallest noise to assume of a record, in its unit: 1e-6 of the range or the resolution of the file.
+    """Return the smallest noise to assume of a record, in its unit: 1e-6 of the range or the resolution of the file.
 
     values: (n,), NaN where not recorded. The resolution is the smallest change between rows, over the square root of 12;
     it counts only where the values are clearly quantised: every change a multiple of it, as a converter or few written
@@ -110,7 +110,7 @@ def noise_floor(values: ArrayLike) -> float:
 
 
 def pre_event_ar(values: ArrayLike) -> float:
-    """The lag-1 autocorrelation of noise, -0.99 .. 0.99, around its trend; 0.0 where there is no noise to tell from.
+    """Return the lag-1 autocorrelation of noise, -0.99 .. 0.99, around its trend; 0.0 where there is no noise to tell from.
 
     values: (n,) the rows before the event, evenly sampled. Corrected for the bias the trend makes in short records.
     """
@@ -142,13 +142,13 @@ def _first_change(signal: InputSignal) -> float | None:
 
 
 def _distinct(t: Array, v: Array) -> tuple[Array, Array]:
-    """The rows with the first of two at one time left out."""
+    """Return the rows with the first of two at one time left out."""
     keep = np.append(np.diff(t) > 0, True)
     return t[keep], v[keep]
 
 
 def _bend(t: Array, v: Array) -> tuple[Array, Array]:
-    """(n - 2,) distances of the inner rows from the line through their neighbours, and what white noise of 1 makes."""
+    """Return (n - 2,) distances of the inner rows from the line through their neighbours, and what white noise of 1 makes."""
     if t.size < 3:
         return np.zeros(0), np.ones(0)
     share = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
@@ -156,7 +156,7 @@ def _bend(t: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _detrended(t: Array, v: Array) -> Array:
-    """The values less the straight line that fits them best once outliers are left out."""
+    """Return the values less the straight line that fits them best once outliers are left out."""
     rest = v - np.median(v)
     for _ in range(5):
         near = np.abs(rest - np.median(rest)) <= _OUTLIER * _scatter(rest)
@@ -169,7 +169,7 @@ def _detrended(t: Array, v: Array) -> Array:
 
 
 def _scatter(x: Array) -> float:
-    """The standard deviation, by the median where that says anything: not where half the values are equal."""
+    """Return the standard deviation, by the median where that says anything: not where half the values are equal."""
     if x.size == 0:
         return 0.0
     middle = float(np.median(x))
@@ -178,7 +178,7 @@ def _scatter(x: Array) -> float:
 
 
 def _resolution(v: Array) -> float:
-    """The step all changes are multiples of; 0.0 where they are not, or too few to tell."""
+    """Return the step all changes are multiples of; 0.0 where they are not, or too few to tell."""
     change = np.diff(v)
     change = change[change != 0]
     if change.size < _QUANTISED_CHANGES:

@@ -63,27 +63,27 @@ class InputSignal:
 
     @classmethod
     def constant(cls, value: float) -> InputSignal:
-        """A signal that never changes."""
+        """Return a signal that never changes."""
         return cls(np.zeros(1), np.array([float(value)]), np.empty(0))
 
     @classmethod
     def corners(cls, points: Iterable[tuple[float, float]]) -> InputSignal:
-        """The signal through (time, value) points joined by lines; two points at one time are a jump. Every point is a break."""
+        """Return the signal through (time, value) points joined by lines; two points at one time are a jump. Every point is a break."""
         t, v = np.array(list(points), dtype=float).T
         return cls(t, v, np.unique(t))
 
     @classmethod
     def step(cls, time: float, before: float, after: float) -> InputSignal:
-        """A jump from one value to another."""
+        """Return a jump from one value to another."""
         return cls.corners([(time, before), (time, after)])
 
     @classmethod
     def ramp(cls, start: float, before: float, end: float, after: float) -> InputSignal:
-        """A ramp between two constant values."""
+        """Return a ramp between two constant values."""
         return cls.corners([(start, before), (end, after)])
 
     def __call__(self, t: float | Array) -> Array:
-        """The value at t, after the jump where there is one."""
+        """Return the value at t, after the jump where there is one."""
         t = np.asarray(t, dtype=float)
         right = np.searchsorted(self.times, t, side="right")
         i, j = np.clip(right - 1, 0, None), np.clip(right, None, self.times.size - 1)
@@ -168,7 +168,7 @@ def multisine(
 
 
 def input_signal(time: ArrayLike, values: ArrayLike, interpolation: Interpolation | None = None) -> InputSignal:
-    """The signal recorded by rows, as a piecewise linear one with jumps.
+    """Return the signal recorded by rows, as a piecewise linear one with jumps.
 
     time: (n,) in s, non-decreasing; two rows at one time are a jump. values: (n,), any unit.
     interpolation: "hold": a value holds from its row until the next, so that a step lies at the first row that shows
@@ -192,7 +192,7 @@ def _holds(v: Array) -> bool:
 
 
 def _held(t: Array, v: Array) -> InputSignal:
-    """The staircase through the rows; of two rows at one time the second holds."""
+    """Return the staircase through the rows; of two rows at one time the second holds."""
     last = np.append(np.diff(t) > 0, True)
     times, after = t[last], v[last]
     before = np.concatenate([v[:1], after[:-1]])
@@ -206,14 +206,14 @@ def _held(t: Array, v: Array) -> InputSignal:
 
 
 def _large_changes(v: Array) -> NDArray[np.bool_]:
-    """(n,) the rows that show a change of over 20 times the median nonzero one."""
+    """Return (n,) the rows that show a change of over 20 times the median nonzero one."""
     change = np.abs(np.diff(v, prepend=v[:1]))
     nonzero = change[change > 0]
     return change > (JUMP_RATIO * np.median(nonzero) if nonzero.size else np.inf)
 
 
 def _with_jumps(t: Array, v: Array, jumps: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """The rows with the value before each jump put in at its instant; no instant more than twice, no row twice."""
+    """Return the rows with the value before each jump put in at its instant; no instant more than twice, no row twice."""
     at = np.flatnonzero(jumps)
     t, v = np.insert(t, at, t[at]), np.insert(v, at, v[at - 1])
     new = np.diff(t) > 0
@@ -224,7 +224,7 @@ def _with_jumps(t: Array, v: Array, jumps: NDArray[np.bool_]) -> tuple[Array, Ar
 
 
 def _joined(t: Array, v: Array) -> InputSignal:
-    """The polygon through the rows, rows on one line merged."""
+    """Return the polygon through the rows, rows on one line merged."""
     scale = float(np.ptp(v))
     if scale == 0.0:
         return InputSignal(t[:1], v[:1], np.empty(0))
@@ -241,14 +241,14 @@ def _joined(t: Array, v: Array) -> InputSignal:
 
 
 def off_line(t: Array, v: Array) -> Array:
-    """(n - 2,) how far each inner row lies off the line through its neighbours; 0 beside a jump."""
+    """Return (n - 2,) how far each inner row lies off the line through its neighbours; 0 beside a jump."""
     width = t[2:] - t[:-2]
     share = (t[1:-1] - t[:-2]) / np.where(width > 0, width, 1.0)
     return np.where(width > 0, v[1:-1] - v[:-2] - share * (v[2:] - v[:-2]), 0.0)
 
 
 def _simplified(t: Array, v: Array, kept: NDArray[np.bool_], tolerance: float, most: int) -> NDArray[np.bool_]:
-    """(n,) the rows through which the polygon stays within the tolerance of all rows.
+    """Return (n,) the rows through which the polygon stays within the tolerance of all rows.
 
     Starts from `kept` and adds the farthest row of every stretch that is off (Douglas and Peucker 1973), all stretches
     at once; stops when more than `most` rows are kept.

@@ -74,7 +74,7 @@ def conversion(unit: str, wanted: str) -> tuple[float, float] | None:
 
 
 def seconds_of(unit: str) -> float | None:
-    """The length of a unit of time in s, "" counting as s; None where it is none. S, which is siemens, means seconds here."""
+    """Return the length of a unit of time in s, "" counting as s; None where it is none. S, which is siemens, means seconds here."""
     if not _plain(unit) or _plain(unit) in ("-", "S"):
         return 1.0
     known = unit_of(unit)
@@ -82,7 +82,7 @@ def seconds_of(unit: str) -> float | None:
 
 
 def scaled(values: Array, scale: float) -> Array:
-    """The values times the scale; by division where the scale is one over a whole number, so that 1400 ms are 1.4 s."""
+    """Return the values times the scale; by division where the scale is one over a whole number, so that 1400 ms are 1.4 s."""
     if scale == 1.0:
         return values
     whole = 1.0 / scale
@@ -96,7 +96,7 @@ def is_unit(text: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def unit_of(text: str) -> Unit | None:
-    """The unit of a text; None where it is not known."""
+    """Return the unit of a text; None where it is not known."""
     plain = _plain(text)
     if plain.lower() in PER_UNIT:
         return UNITS["pu"]
@@ -111,7 +111,7 @@ def unit_of(text: str) -> Unit | None:
 
 
 def _single(text: str) -> Unit | None:
-    """A unit without a stroke but in `rad/s` and its like: its own name, another spelling, or a prefix before either."""
+    """Return a unit without a stroke but in `rad/s` and its like: its own name, another spelling, or a prefix before either."""
     name = SPELT.get(text, text)
     if name in UNITS:
         return UNITS[name]
@@ -128,7 +128,7 @@ def _single(text: str) -> Unit | None:
 
 
 def _plain(text: str) -> str:
-    """The text without the brackets people put around a unit, blanks, and letters of one look and two codes."""
+    """Return the text without the brackets people put around a unit, blanks, and letters of one look and two codes."""
     found = unicodedata.normalize("NFKC", text).strip()
     if len(found) > 1 and (found[0], found[-1]) in (("[", "]"), ("(", ")"), ("<", ">")):
         found = found[1:-1]

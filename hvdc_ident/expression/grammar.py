@@ -72,7 +72,7 @@ class Source:
 
 
 def tokens(source: Source) -> list[Token]:
-    """The tokens of the text, closed by one of kind "end"."""
+    """Return the tokens of the text, closed by one of kind "end"."""
     text, found, at = source.text, list[Token](), 0
     if len(text) > MAX_LENGTH:
         got = f"{len(text)}"

@@ -41,7 +41,7 @@ _NOT_REAL = "the value is not a finite real number: a division by zero, or a fun
 
 
 def parse(text: str, *, where: str = "") -> sp.Expr:
-    """The sympy expression that the text of the card's grammar stands for.
+    """Return the sympy expression that the text of the card's grammar stands for.
 
     text: numbers, names, + - * / **, where(condition, a, b) with one comparison as its condition, clip, min, max, abs,
     sign, sqrt, exp, log, sin, cos, tan, tanh, asin, acos, atan, atan2, pi and `time`. where: its place, for messages.
@@ -190,7 +190,7 @@ def _chain(node: ast.BinOp, marks: Mapping[type[ast.operator], str]) -> list[tup
 
 
 def _quotient(marks: list[str], arguments: list[sp.Expr]) -> sp.Expr:
-    """The product of the arguments after *, divided by those after /; its numbers as Python would divide them."""
+    """Return the product of the arguments after *, divided by those after /; its numbers as Python would divide them."""
     numbers = [(m, a) for m, a in zip(marks, arguments, strict=True) if a.is_Rational or a.is_Float]
     exact = all(a.is_Rational for _, a in numbers)
     coefficient: Any = sp.Integer(1) if exact else 1.0
@@ -207,7 +207,7 @@ def _quotient(marks: list[str], arguments: list[sp.Expr]) -> sp.Expr:
 
 
 def literal(text: str) -> sp.Expr:
-    """The number of a literal: an exact integer up to 2**53, else the double."""
+    """Return the number of a literal: an exact integer up to 2**53, else the double."""
     if text.isdigit() and len(text.lstrip("0")) <= 16 and int(text) <= EXACT:
         return sp.Integer(int(text))
     number = float(text)
@@ -217,7 +217,7 @@ def literal(text: str) -> sp.Expr:
 
 
 def call(function: str, arguments: list[sp.Expr]) -> sp.Expr:
-    """A function of the grammar applied to expressions."""
+    """Return a function of the grammar applied to expressions."""
     match function:
         case "sqrt":
             return power(arguments[0], sp.Rational(1, 2))
@@ -229,7 +229,7 @@ def call(function: str, arguments: list[sp.Expr]) -> sp.Expr:
 
 
 def _within(expression: sp.Expr) -> sp.Expr:
-    """The expression with the functions that sympy brings in on its own written in those of the grammar."""
+    """Return the expression with the functions that sympy brings in on its own written in those of the grammar."""
     if not expression.has(sp.cot, sp.Heaviside):
         return expression
     expression = expression.replace(sp.cot, lambda x: 1 / sp.tan(x))
@@ -251,7 +251,7 @@ def compare(relation: Relation, left: sp.Expr, right: sp.Expr) -> Any:
 
 
 def product(factors: list[sp.Expr]) -> sp.Expr:
-    """The product of the factors, made at once as sympy would otherwise expand a number times a sum halfway."""
+    """Return the product of the factors, made at once as sympy would otherwise expand a number times a sum halfway."""
     return sp.Mul(*(_tame_base(f) for f in factors))
 
 
@@ -274,7 +274,7 @@ def power(base: sp.Expr, exponent: sp.Expr) -> sp.Expr:
 
 
 def _bits(expression: sp.Expr) -> int:
-    """The bits of the largest integer that a power of the expression would raise."""
+    """Return the bits of the largest integer that a power of the expression would raise."""
     if expression.is_Rational:
         return (max(abs(expression.p), expression.q) - 1).bit_length()
     if expression.is_Mul:
@@ -283,7 +283,7 @@ def _bits(expression: sp.Expr) -> int:
 
 
 def _tame(exponent: sp.Expr) -> sp.Expr:
-    """The exponent with large numbers as floats where a logarithm could turn them into an integer power."""
+    """Return the exponent with large numbers as floats where a logarithm could turn them into an integer power."""
     if not exponent.has(sp.log):
         return exponent
     large = {n: sp.Float(float(n)) for n in exponent.atoms(sp.Rational) if max(abs(n.p), n.q) > _FREE_BITS}
@@ -291,7 +291,7 @@ def _tame(exponent: sp.Expr) -> sp.Expr:
 
 
 def _tame_base(factor: sp.Expr, outer: sp.Expr | None = None) -> sp.Expr:
-    """The factor, its numeric base a float where the exponents could cancel down to a huge integer power."""
+    """Return the factor, its numeric base a float where the exponents could cancel down to a huge integer power."""
     if factor.is_Mul and any(f.is_Pow and f.base.is_Rational for f in factor.args):
         return sp.Mul(*(_tame_base(f, outer) for f in factor.args))
     base, exponent = factor.as_base_exp() if factor.is_Pow else (factor, sp.Integer(1))
@@ -304,7 +304,7 @@ def _tame_base(factor: sp.Expr, outer: sp.Expr | None = None) -> sp.Expr:
 
 
 def constant(expression: sp.Expr) -> float:
-    """The value of an expression without variables, in doubles; OverflowError or ValueError where it has none."""
+    """Return the value of an expression without variables, in doubles; OverflowError or ValueError where it has none."""
     if expression.is_Rational or expression.is_Float or expression in (sp.pi, sp.E):
         value = float(expression)
     elif number := _number_of(expression.func):
@@ -332,7 +332,7 @@ def checked(expression: sp.Expr) -> sp.Expr:
 
 
 def finish(expression: sp.Expr) -> sp.Expr:
-    """The normal form of the expression; refuses parts that are constant but no finite real number."""
+    """Return the normal form of the expression; refuses parts that are constant but no finite real number."""
     for number in expression.atoms(sp.Number):
         if not is_double(number) and not math.isfinite(to_double(number)):
             raise _Unfit("a number in the expression is not finite: too large for a double")
@@ -353,7 +353,7 @@ _OUTSIDE = (AppliedUndef, sp.Derivative, sp.Integral)
 
 @lru_cache(maxsize=50_000)
 def normal(value: sp.Expr) -> sp.Expr | None:
-    """The expression in the form that models hold, None where no model can hold it; doing it twice changes nothing.
+    """Return the expression in the form that models hold, None where no model can hold it; doing it twice changes nothing.
 
     Symbols are the models' real ones, numbers are doubles or integers that a double holds exactly, factors that were
     kept apart are multiplied out as sympy does, and a choice in the last branch of a choice is part of it.
@@ -385,7 +385,7 @@ def is_double(value: sp.Expr) -> bool:
 
 
 def to_double(value: sp.Expr) -> float:
-    """The nearest double of a number, infinite where it is too large."""
+    """Return the nearest double of a number, infinite where it is too large."""
     try:
         return float(value)
     except OverflowError:
@@ -411,7 +411,7 @@ def _rebuilt(value: sp.Expr, parts: list[Any]) -> Any:
 
 
 def _without_and(value: sp.Expr) -> sp.Expr:
-    """The choice with conditions joined by `&` as choices inside choices, which the grammar has words for."""
+    """Return the choice with conditions joined by `&` as choices inside choices, which the grammar has words for."""
     if not isinstance(value, sp.Piecewise) or not any(c.has(And) for _, c in value.args):
         return value
     (yes, condition), rest = value.args[0], value.args[1:]

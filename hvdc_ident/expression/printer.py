@@ -23,7 +23,7 @@ Text = tuple[str, int]
 
 
 def to_text(expression: sp.Expr) -> str:
-    """The text of an expression in the grammar of model cards: `parse(to_text(e)) == e`.
+    """Return the text of an expression in the grammar of model cards: `parse(to_text(e)) == e`.
 
     Numbers lose nothing: floats are written as the shortest text of the same double. A condition joined by `&` is
     written as nested where, which has the same value. Raises ExpressionError that names the function, for an

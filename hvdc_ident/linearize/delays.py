@@ -57,7 +57,7 @@ MAX_ORDER = 12
 
 
 def pade(order: int) -> tuple[Array, Array, Array, float]:
-    """(A, B, C, D) of the diagonal Pade approximant of exp(-s), scaled so that all entries are of the size of 1 to 30.
+    """Return (A, B, C, D) of the diagonal Pade approximant of exp(-s), scaled so that all entries are of the size of 1 to 30.
 
     For exp(-sT) divide A and B by T. It is all-pass: gain 1 at every frequency, phase right to about `order` radians.
     Raises LinearizationError for an order outside 1 to 12. Source: Golub and Van Loan, Matrix Computations, 11.3.
@@ -91,7 +91,7 @@ def pade(order: int) -> tuple[Array, Array, Array, float]:
 
 
 def response(kind: str, time: float, compute: float, s: Array) -> Array:
-    """The exact transfer of a delay, exp(-s T), or of a sampled block: hold over one period, then the compute time.
+    """Return the exact transfer of a delay, exp(-s T), or of a sampled block: hold over one period, then the compute time.
 
     A sampled block's aliases are left out: it is the part at the frequency of the excitation, which below half the
     sampling frequency is what matters. time, compute: s; s: complex frequencies, rad/s.
@@ -105,7 +105,7 @@ def response(kind: str, time: float, compute: float, s: Array) -> Array:
 
 
 def response_slopes(kind: str, time: float, compute: float, s: Array) -> tuple[Array, Array]:
-    """The derivatives of `response` by its time (period) and by the compute time."""
+    """Return the derivatives of `response` by its time (period) and by the compute time."""
     value = response(kind, time, compute, s)
     if kind == "delay":
         return -s * value, np.zeros_like(value)
@@ -176,7 +176,7 @@ class DelayFree:
 
     @classmethod
     def of(cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...]) -> DelayFree:
-        """The core of a Jacobian (main rows, columns)."""
+        """Return the core of a Jacobian (main rows, columns)."""
         rows, columns = _order(size, inputs)
         n_r, n_c = size.nx + size.no + size.ne, size.nx + len(inputs) + size.ne
         reduced = eliminate(jac[np.ix_(rows, columns)], n_r, n_c)
@@ -184,7 +184,7 @@ class DelayFree:
 
     @staticmethod
     def derivative(size: Layout, jac: Array, djac: Array, inputs: list[int]) -> Array:
-        """(directions, ...) the derivative of the core's matrix."""
+        """Return (directions, ...) the derivative of the core's matrix."""
         rows, columns = _order(size, inputs)
         r, c = size.nx + size.no + size.ne, size.nx + len(inputs) + size.ne
         reduced = eliminate(jac[np.ix_(rows, columns)], r, c)
@@ -192,7 +192,7 @@ class DelayFree:
         return reduced.derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
 
     def response(self, s: Array) -> Array:
-        """(frequencies, outputs, inputs) exact transfer matrix at complex frequencies s, rad/s."""
+        """Return (frequencies, outputs, inputs) exact transfer matrix at complex frequencies s, rad/s."""
         try:
             return self._solve(s, None, ())
         except LinearizationError:
@@ -205,7 +205,7 @@ class DelayFree:
         return found
 
     def response_along(self, s: Array, change: Array, times: tuple[Array, ...]) -> Array:
-        """The derivative of the response for a derivative of the matrix and of each channel's times."""
+        """Return the derivative of the response for a derivative of the matrix and of each channel's times."""
         return self._solve(s, change, times)
 
     def _solve(self, s: Array, change: Array | None, times: tuple[Array, ...]) -> Array:
@@ -280,7 +280,7 @@ class Blocks:
         return total
 
     def matrix(self, jac: Array) -> Array:
-        """The matrix to reduce: rows [x', Pade', outputs | g, delays], columns [x, Pade, u | z, e]."""
+        """Return the matrix to reduce: rows [x', Pade', outputs | g, delays], columns [x, Pade, u | z, e]."""
         total = self.spread(jac)
         if self.channels:
             a, _, c, through = self.pade

@@ -44,7 +44,7 @@ class NuGap:
     distance: float
 
     def to_dict(self) -> dict[str, Any]:
-        """The gap as plain numbers."""
+        """Return the gap as plain numbers."""
         return {"nu_gap": self.value, "omega": self.omega, "winding": self.winding, "chordal_distance": self.distance}
 
 
@@ -90,7 +90,7 @@ def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
 
 
 def _chordal(p1: Array, p2: Array) -> Array:
-    """(points,) largest singular value of (1 + P2 P2*)^-1/2 (P1 - P2) (1 + P1* P1)^-1/2."""
+    """Return (points,) largest singular value of (1 + P2 P2*)^-1/2 (P1 - P2) (1 + P1* P1)^-1/2."""
     u, s2, _ = np.linalg.svd(p2)
     _, s1, v = np.linalg.svd(p1)
     inner = np.conj(np.swapaxes(u, 1, 2)) @ (p1 - p2) @ np.conj(np.swapaxes(v, 1, 2))
@@ -128,7 +128,7 @@ def winding_count(first: LinearModel, second: LinearModel) -> int:
 
 
 def _count(a: Array) -> tuple[int, int]:
-    """(eigenvalues right of the axis, eigenvalues on it)."""
+    """Return (eigenvalues right of the axis, eigenvalues on it)."""
     if a.shape[0] == 0:
         return 0, 0
     values = np.linalg.eigvals(a)
@@ -176,14 +176,14 @@ def _graph(model: LinearModel) -> StateSpace:
 
 
 def _scale(graphs: list[StateSpace]) -> float:
-    """The frequency that the bilinear map sends to the middle of the circle: between the graphs' poles, rad/s."""
+    """Return the frequency that the bilinear map sends to the middle of the circle: between the graphs' poles, rad/s."""
     poles = np.concatenate([np.abs(np.linalg.eigvals(a)) for a, _, _, _ in graphs if a.shape[0]] or [np.ones(1)])
     poles = poles[poles > 0]
     return float(np.exp(np.mean(np.log(poles)))) if poles.size else 1.0
 
 
 def _on_circle(graph: StateSpace, scale: float) -> Complex:
-    """(points, rows, inputs) of [M; N] over the whole circle: the upper half, then its conjugate, mirrored."""
+    """Return (points, rows, inputs) of [M; N] over the whole circle: the upper half, then its conjugate, mirrored."""
     a, b, c, d = graph
     points = 8 * LARGEST
     omega = scale * np.tan((np.arange(points // 2) + 0.5) * np.pi / points)
@@ -300,7 +300,7 @@ def _four_blocks(plant: LinearModel, controller: LinearModel) -> LinearModel:
 
 
 def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
-    """The peak of the four blocks on a grid and beside its maximum, delays exact."""
+    """Return the peak of the four blocks on a grid and beside its maximum, delays exact."""
 
     def blocks(w: Array) -> Array:
         p, c = transfer(plant, 1j * w), transfer(controller, 1j * w)
@@ -331,7 +331,7 @@ class ModelDistance:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """The comparison as plain numbers."""
+        """Return the comparison as plain numbers."""
         return {
             "model": self.first,
             "other": self.second,

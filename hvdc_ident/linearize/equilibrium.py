@@ -246,7 +246,7 @@ class EquilibriumSearch:
         return (*rows, *(f"the bounds of '{s.outputs[k - first]}'" for k in self.bounded_rows))
 
     def vectors(self, v: Array) -> tuple[Array, Array, Array]:
-        """(y, w, p) at the unknowns v."""
+        """Return (y, w, p) at the unknowns v."""
         size = self.system.layout
         w = np.empty(1 + size.nu + size.ne)
         w[0] = self.time
@@ -262,7 +262,7 @@ class EquilibriumSearch:
         return v[: size.n].copy(), w, p
 
     def equations(self, v: Array) -> tuple[Array, Array]:
-        """(residual, Jacobian) at v, modes from the values."""
+        """Return (residual, Jacobian) at v, modes from the values."""
         s, size = self.system, self.system.layout
         y, w, p = self.vectors(v)
         m = s.modes(y, w, p)
@@ -291,7 +291,7 @@ class EquilibriumSearch:
         return r, jac
 
     def _columns(self, y: Array, w: Array, p: Array, m: Array) -> Array:
-        """(all rows, unknowns) of the Jacobian."""
+        """Return (all rows, unknowns) of the Jacobian."""
         s, size = self.system, self.system.layout
         jac = s.jacobian(y, w, p, m)
         if not (self.freed_u or self.freed_p or self.bounded_rows or size.ne):
@@ -304,7 +304,7 @@ class EquilibriumSearch:
         return np.concatenate(parts, axis=1)
 
     def by_parameters(self, v: Array, which: list[int]) -> Array:
-        """(unknowns, parameters) derivatives of the solution by fixed parameters, by implicit differentiation.
+        """Return (unknowns, parameters) derivatives of the solution by fixed parameters, by implicit differentiation.
 
         Where the Jacobian is singular (a state that rests anywhere) the change of least norm.
         """
@@ -348,7 +348,7 @@ class EquilibriumSearch:
         return places
 
     def _with_signals(self, v: Array) -> Array:
-        """The guess with delays, sampled values and bounded signals set to what they show."""
+        """Return the guess with delays, sampled values and bounded signals set to what they show."""
         s, size = self.system, self.system.layout
         k = len(self.bounded_rows)
         for _ in range(3 if size.ne or k else 0):

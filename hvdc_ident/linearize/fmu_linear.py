@@ -32,7 +32,7 @@ NUDGE = 1e-3
 
 
 def fmu_of(model: External) -> FmuModel:
-    """The FMU that a model is. Raises ModelError for another kind of model, and for effects at an FMU's ends."""
+    """Return the FMU that a model is. Raises ModelError for another kind of model, and for effects at an FMU's ends."""
     if not isinstance(model, FmuModel):
         raise ModelError("this model shows no equations", where=f"model '{model.name}'")
     if model.effects:
@@ -260,7 +260,7 @@ def _matrices(model: FmuModel, p: FmuPoint, inputs: Sequence[str]) -> tuple[Arra
 def _gradient(
     model: FmuModel, point: OperatingPoint, name: str, inputs: Sequence[str], outputs: Sequence[str]
 ) -> Gradient:
-    """The total derivatives of A, B, C, D by a parameter, the shift of the operating point included."""
+    """Return the total derivatives of A, B, C, D by a parameter, the shift of the operating point included."""
     size = model.parameters[name].size
     held = {**point.parameters, **point.inputs}
     guess = dict(point.states)

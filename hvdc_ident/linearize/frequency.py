@@ -1,4 +1,4 @@
-"""Frequency responses: exact with delays, with bands and sensitivities, singular values, impedances."""
+"""Frequency responses, delays exact: values, singular values, derivatives by parameters and error bands."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class FrequencyResponse(Shown):
         return np.asarray(np.degrees(np.unwrap(np.angle(self.values), axis=0)))
 
     def channel(self, input: str, output: str) -> Array:
-        """(n,) complex response of one channel."""
+        """Return (n,) complex response of one channel."""
         if input not in self.input_names:
             raise unknown_name("input", input, self.input_names)
         if output not in self.output_names:
@@ -101,13 +101,13 @@ class FrequencyResponse(Shown):
         yield f"and {len(rows) - ROWS_SHOWN} more channels" if len(rows) > ROWS_SHOWN else ""
 
     def plot(self, ax: Any = None) -> Any:
-        """The two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""
+        """Return the two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""
         from hvdc_ident.linearize.plot import bode
 
         return bode([self], ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
-        """The response as plain lists."""
+        """Return the response as plain lists."""
         return {
             "omega": self.omega.tolist(),
             "outputs": list(self.output_names),
@@ -119,7 +119,7 @@ class FrequencyResponse(Shown):
 
 
 def transfer(model: LinearModel, s: Array) -> Array:
-    """(points, outputs, inputs) transfer matrix at complex frequencies s, rad/s; delays exact.
+    """Return (points, outputs, inputs) transfer matrix at complex frequencies s, rad/s; delays exact.
 
     Raises LinearizationError exactly on a pole.
     """
@@ -139,7 +139,7 @@ def transfer(model: LinearModel, s: Array) -> Array:
 
 
 def default_omega(model: LinearModel, points: int = 400) -> Array:
-    """(n,) rad/s: logarithmic from a decade below the slowest to a decade above the fastest pole and zero."""
+    """Return (n,) rad/s: logarithmic from a decade below the slowest to a decade above the fastest pole and zero."""
     sizes = np.abs(model.poles())
     fastest = sizes.max(initial=1.0)
     sizes = sizes[(sizes > 1e-6 * max(fastest, 1e-12)) & (sizes > 1e-6)]
@@ -150,7 +150,7 @@ def default_omega(model: LinearModel, points: int = 400) -> Array:
 
 
 def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:
-    """The response of every channel at omega in rad/s (default: around the poles)."""
+    """Return the response of every channel at omega in rad/s (default: around the poles)."""
     w = default_omega(model) if omega is None else _checked(omega)
     units = tuple((o, i) for o in model.output_units for i in model.input_units)
     return FrequencyResponse(w, transfer(model, 1j * w), model.output_names, model.input_names, units)
@@ -164,7 +164,7 @@ def _checked(omega: Array | Sequence[float]) -> Array:
 
 
 def sigma(model: LinearModel, omega: Array | Sequence[float] | None = None) -> tuple[Array, Array]:
-    """(omega, (n, k) singular values, largest first) of the transfer matrix."""
+    """Return (omega, (n, k) singular values, largest first) of the transfer matrix."""
     w = default_omega(model) if omega is None else _checked(omega)
     return w, np.linalg.svd(transfer(model, 1j * w), compute_uv=False)
 
@@ -172,7 +172,7 @@ def sigma(model: LinearModel, omega: Array | Sequence[float] | None = None) -> t
 def sensitivity(
     model: LinearModel, omega: Array | Sequence[float], parameters: Sequence[str] | None = None
 ) -> dict[str, Array]:
-    """By parameter: (n, outputs, inputs) derivatives of the response, with the operating point's shift and delays."""
+    """Return by parameter the (n, outputs, inputs) derivatives of the response, with the operating point's shift and delays."""
     from hvdc_ident.linearize.modal import gradient_of
 
     w = _checked(omega)
@@ -200,7 +200,7 @@ def sensitivity(
 def bands(
     model: LinearModel, omega: Array | Sequence[float], covariance: Array, parameters: Sequence[str]
 ) -> FrequencyResponse:
-    """The response with, as std, the first-order standard deviation of its error from a parameter covariance.
+    """Return the response with, as std, the first-order standard deviation of its error from a parameter covariance.
 
     covariance: (k, k) in the parameters' units, in the order of `parameters`, whose derivatives the model must have.
     """

@@ -100,7 +100,7 @@ def port_response(linear: LinearModel, port: Port, omega: Sequence[float] | Arra
 
 
 def port_sensitivity(linear: LinearModel, port: Port, omega: Array, kind: str, names: Sequence[str]) -> Array:
-    """(n, k, k, parameters) derivatives of a port's response: dZ = (dV - Z dI) I^-1, the operating point's shift included."""
+    """Return (n, k, k, parameters) derivatives of a port's response: dZ = (dV - Z dI) I^-1, the operating point's shift included."""
     top, bottom = _parts(linear.response(omega), port, kind)
     inverse = np.linalg.inv(bottom)
     ratio = top @ inverse
@@ -119,7 +119,7 @@ def _parts(values: Array, port: Port, kind: str) -> tuple[Array, Array]:
 
 
 def disturbed_model(model: Model, port: Port) -> tuple[Model, list[str], list[str]]:
-    """(model, inputs, outputs): with the source's disturbances as inputs, and voltages and currents at the port as outputs."""
+    """Return (model, inputs, outputs): with the source's disturbances as inputs, and voltages and currents at the port as outputs."""
     inputs = [fresh(model, f"disturbance_{axis}") for axis in port.axes]
     angle = parse(port.angle)
     turned = _turned(tuple(symbol(n) for n in inputs), -angle)
@@ -236,7 +236,7 @@ class MeasuredResponse:
         return self._picked(found, slopes, [(rows.index(o), columns.index(i)) for o, i in self.channels])
 
     def _disturbed(self, model: Model) -> tuple[Model, list[str], list[str]]:
-        """The model with the port's disturbances, made once for a model."""
+        """Return the model with the port's disturbances, made once for a model."""
         assert self.port is not None
         known = self._made
         if known.get("of") is not model:
@@ -249,7 +249,7 @@ class MeasuredResponse:
         return {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Only the data travel to another process."""
+        """Return the data alone, which travel to another process."""
         return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
 
     def _picked(self, values: Array, slopes: Sequence[Array], places: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
@@ -295,7 +295,7 @@ class MeasuredResponse:
 
 
 def _factor(measured: Array, model: Array) -> float | None:
-    """A sign, unit or base by which two responses differ, as `MeasuredResponse.errors` says."""
+    """Return a sign, unit or base by which two responses differ, as `MeasuredResponse.errors` says."""
     power = float(np.sum(np.abs(model) ** 2))
     apart = float(np.sum(np.abs(measured - model) ** 2))
     if power == 0.0 or apart == 0.0:
@@ -353,7 +353,7 @@ def response_at_tones(
 def response_from_record(
     time: Array, u: Array, y: Array, *, input: str = "u", output: str = "y", segments: int = 8, window: str = "hann"
 ) -> FrequencyResponse:
-    """The response from recorded input to recorded output by Welch's averages, with coherence and standard deviation.
+    """Return the response from recorded input to recorded output by Welch's averages, with coherence and standard deviation.
 
     time: (n,) s; uneven rows are put on an even grid by straight lines. segments: how many, half overlapped; more give
     a surer and coarser estimate. The standard deviation is sqrt((1 - g2)/(2 k g2)) |H| (Bendat and Piersol, 9.2) with k
@@ -405,7 +405,7 @@ def simulated_response(
     rtol: float = 1e-9,
     seed: int = 0,
 ) -> FrequencyResponse:
-    """The response measured on the nonlinear model by a multisine about its steady state: a check on the linear one.
+    """Return the response measured on the nonlinear model by a multisine about its steady state: a check on the linear one.
 
     omega: wanted frequencies, rad/s; each is moved to a multiple of one base frequency, so read them from the result.
     amplitude: of every sine, in the input's unit, small enough for no limit to act and large enough for the solver's

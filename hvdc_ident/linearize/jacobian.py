@@ -129,7 +129,7 @@ def one_sided(
     sensitivities: Sequence[str] = (),
     descriptor: bool = False,
 ) -> tuple[LinearModel, LinearModel]:
-    """The linear models below and above the limit on which a point lies; equal where it lies on none."""
+    """Return the linear models below and above the limit on which a point lies; equal where it lies on none."""
 
     def at(side: Side) -> LinearModel:
         return linearize(
@@ -161,7 +161,7 @@ def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str
 
 
 def modes_at(s: CompiledSystem, y: Array, w: Array, p: Array, side: Side) -> Array:
-    """The branch of every switch at a point. Raises LinearizationError on a kink unless a side is chosen."""
+    """Return the branch of every switch at a point. Raises LinearizationError on a kink unless a side is chosen."""
     values = s.switches(y, w, p)
     modes = s.modes(y, w, p)
     near = np.flatnonzero(np.abs(values) <= ON_KINK)
@@ -208,7 +208,7 @@ def _gradient(
     names: Sequence[str],
     chosen: list[int],
 ) -> dict[str, Gradient]:
-    """The total derivatives of A, B, C, D by parameters."""
+    """Return the total derivatives of A, B, C, D by parameters."""
     which = [s.parameters.index(n) for n in names]
     directions = shift(s, at, which)
     djac = s.jacobian_along(at.y, at.w, at.p, modes, directions)
@@ -229,7 +229,7 @@ def _gradient(
 
 
 def shift(s: CompiledSystem, at: OperatingPoint, which: list[int]) -> Array:
-    """(columns + parameters, k) how the point and the parameters move for each of the chosen parameters."""
+    """Return (columns + parameters, k) how the point and the parameters move for each of the chosen parameters."""
     size = s.layout
     total = np.zeros((size.columns + size.np, len(which)))
     total[[size.columns + k for k in which], range(len(which))] = 1.0

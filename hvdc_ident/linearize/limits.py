@@ -51,12 +51,12 @@ class Limit:
 
     @property
     def text(self) -> str:
-        """One line for people."""
+        """The limit in one line of text."""
         side = {"lower": "at least", "upper": "at most", "branch": "against"}[self.kind]
         return f"{self.signal}: {self.expression} {side} {self.level}, margin {self.margin:.6g}"
 
     def to_dict(self) -> dict[str, object]:
-        """The limit as plain text and numbers."""
+        """Return the limit as plain text and numbers."""
         return {
             "signal": self.signal,
             "limit": self.kind,
@@ -101,7 +101,7 @@ def conditions(structure: ModelEquations) -> tuple[Condition, ...]:
 
 
 def _text(e: Any) -> str:
-    """The expression as engineers write it: numbers short."""
+    """Return the expression as engineers write it: numbers short."""
     if isinstance(e, (int, float)) or getattr(e, "is_number", False):
         return f"{float(e):g}"
     return to_text(e)
@@ -172,24 +172,24 @@ def limits(structure: ModelEquations, known: tuple[Condition, ...], values: NDAr
 
 
 def structure_roots(structure: ModelEquations) -> list[int]:
-    """The nodes whose values the model shows or integrates."""
+    """Return the nodes whose values the model shows or integrates."""
     return [*structure.rhs, *structure.sources, *structure.observed]
 
 
 def in_use(structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
-    """The switches that decide a branch which the roots' values come from; negative: the switches' modes."""
+    """Return the switches that decide a branch which the roots' values come from; negative: the switches' modes."""
     return _walk(structure, roots, negative)[1]
 
 
 def nodes_in_use(structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
-    """The nodes which the roots' values come from, branches that are switched off left out."""
+    """Return the nodes which the roots' values come from, branches that are switched off left out."""
     return _walk(structure, roots, negative)[0]
 
 
 def _walk(
     structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]
 ) -> tuple[frozenset[int], frozenset[int]]:
-    """(nodes, switches) in use."""
+    """Return (nodes, switches) in use."""
     nodes = structure.graph.nodes
     used: set[int] = set()
 

@@ -230,7 +230,7 @@ class LinearModel(Shown):
         )
 
     def to_control(self) -> control.StateSpace:
-        """A python-control StateSpace with the same names; delays are in their Pade form."""
+        """Return a python-control StateSpace with the same names; delays are in their Pade form."""
         import control
 
         a, b, c, d = self.standard()
@@ -243,7 +243,7 @@ class LinearModel(Shown):
     # --- analysis ---
 
     def poles(self) -> Array:
-        """(states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor."""
+        """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor."""
         from hvdc_ident.linearize.modal import poles
 
         return poles(self)
@@ -275,7 +275,7 @@ class LinearModel(Shown):
         return names[0]
 
     def response(self, omega: Array) -> Array:
-        """(frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
+        """Return (frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
         from hvdc_ident.linearize.frequency import transfer
 
         return transfer(self, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
@@ -346,7 +346,7 @@ class LinearModel(Shown):
         return write(self, path)
 
     def plot(self, kind: str = "bode", ax: Any = None) -> Any:
-        """The axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation"."""
+        """Return the axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation"."""
         from hvdc_ident.linearize.plot import draw
 
         return draw(self, kind, ax)
@@ -367,12 +367,12 @@ class LinearModel(Shown):
         yield f"and {len(modes) - 20} more modes" if len(modes) > 20 else ""
 
     def to_dict(self) -> dict[str, Any]:
-        """The model as plain lists, with names, units, operating point and provenance."""
+        """Return the model as plain lists, with names, units, operating point and provenance."""
         from hvdc_ident.linearize.export.json_text import to_dict
 
         return to_dict(self)
 
 
 def _eigenvalue(value: complex) -> str:
-    """An eigenvalue as text, its conjugate with it."""
+    """Return an eigenvalue as text, its conjugate with it."""
     return f"{value.real:.5g} ± {value.imag:.5g}j" if value.imag else f"{value.real:.5g}"

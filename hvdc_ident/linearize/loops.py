@@ -76,7 +76,7 @@ class Loop:
 
 
 def open_model(model: Model, signal: str) -> tuple[Model, str]:
-    """(model, output): the model in which the signal is an input, and the output that shows what it would have been.
+    """Return (model, output): the model in which the signal is an input, and the output that shows what it would have been.
 
     A state is opened between its integrator and its readers. Raises UnknownNameError, and LinearizationError for an
     input, where there is nothing to open.
@@ -181,7 +181,7 @@ def plant_and_controller(
 
 
 def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
-    """The value of any name at an operating point."""
+    """Return the value of any name at an operating point."""
     return signal_values(model, point, (name,))[name]
 
 
@@ -253,7 +253,7 @@ class Margins:
         return disk_phase(self.disk.value)
 
     def to_dict(self) -> dict[str, Any]:
-        """The margins as plain numbers."""
+        """Return the margins as plain numbers."""
 
         def pair(c: Crossing) -> dict[str, float]:
             return {"value": c.value, "omega": c.omega}
@@ -304,7 +304,7 @@ class LoopMargins:
         return disk_phase(self.disk.value)
 
     def to_dict(self) -> dict[str, Any]:
-        """The margins as plain numbers."""
+        """Return the margins as plain numbers."""
         disk = {
             "value": self.disk.value,
             "omega": self.disk.omega,
@@ -415,7 +415,7 @@ def _grid(model: LinearModel, omega: Array | None) -> Array:
 
 
 def _of_curve(values_at: Curves, grid: Array, stable: bool) -> Margins:
-    """The margins of a loop whose transfer function is given over rad/s."""
+    """Return the margins of a loop whose transfer function is given over rad/s."""
     values = values_at(grid)
 
     def curve(w: float) -> complex:
@@ -431,7 +431,7 @@ def _of_curve(values_at: Curves, grid: Array, stable: bool) -> Margins:
 
 
 def _common_disk(sensitivity: Curves, grid: Array) -> Crossing:
-    """The largest balanced disk for all loops at once: 1 over the largest structured singular value of (S - T)/2.
+    """Return the largest balanced disk for all loops at once: 1 over the largest structured singular value of (S - T)/2.
 
     Its bound by Osborne's scaling is cheap and never below the sharper one, so that only the frequencies whose cheap
     bound exceeds the largest sharp one found so far have to be looked at.
@@ -496,7 +496,7 @@ def _scaled_norm(matrix: Array, logs: Array) -> float:
 
 
 def _schatten(logs: Array, matrix: Array, order: int) -> tuple[float, Array]:
-    """The logarithm of the Schatten norm of D M D^-1 and its derivatives by log D."""
+    """Return the logarithm of the Schatten norm of D M D^-1 and its derivatives by log D."""
     scale = np.exp(logs - logs.mean())
     u, s, vh = np.linalg.svd(scale[:, None] * matrix / scale)
     weight = (s / s[0]) ** order
@@ -553,7 +553,7 @@ def _phases(grid: Array, values: Array, curve: Curve) -> list[Crossing]:
 
 
 def _smallest(grid: Array, values: Array, at: Callable[[float], float]) -> Crossing:
-    """The smallest value of a curve over the frequencies, refined between the grid's neighbours."""
+    """Return the smallest value of a curve over the frequencies, refined between the grid's neighbours."""
     k = int(np.argmin(values))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)]
     if high > low:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """One eigenvalue in rad/s with what it means.
+    """One eigenvalue in rad/s, with damping, participation, shape and kind.
 
     frequency_hz: of the oscillation, 0 for a real one. damping: -Re/|lambda|, 0 for a zero eigenvalue.
     participation: share of each state, they sum to 1. shape: the right eigenvector, its largest entry 1.
@@ -56,7 +56,7 @@ class Mode:
         return max(self.participation, key=lambda n: self.participation[n])
 
     def to_dict(self) -> dict[str, Any]:
-        """The mode as plain numbers."""
+        """Return the mode as plain numbers."""
         pair = {n: [v.real, v.imag] for n, v in self.sensitivity.items()}
         return {
             "eigenvalue": [self.eigenvalue.real, self.eigenvalue.imag],
@@ -69,7 +69,7 @@ class Mode:
 
 
 def poles(model: LinearModel) -> Array:
-    """(n,) complex eigenvalues, rad/s; for a descriptor those of the pencil without the infinite ones."""
+    """Return (n,) complex eigenvalues, rad/s; for a descriptor those of the pencil without the infinite ones."""
     if model.A.shape[0] == 0:
         return np.zeros(0, dtype=complex)
     if not model.is_descriptor:
@@ -79,12 +79,12 @@ def poles(model: LinearModel) -> Array:
 
 
 def finite(alpha: Array, beta: Array) -> Array:
-    """Which of the generalised eigenvalues alpha/beta are finite."""
+    """Return a mask of the generalised eigenvalues alpha/beta that are finite."""
     return np.asarray(np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), np.abs(beta)).clip(1e-300) * 1e-2)
 
 
 def eigen(a: Array) -> tuple[Array, Array, Array]:
-    """(eigenvalues, right vectors in columns, left vectors in rows) with left @ right = 1.
+    """Return (eigenvalues, right vectors in columns, left vectors in rows) with left @ right = 1.
 
     The left ones are the inverse of the right ones where that is well conditioned, else LAPACK's own.
     """
@@ -152,7 +152,7 @@ def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: f
 
 
 def _hidden(model: LinearModel, right: Array, driven: bool, seen: bool) -> str:
-    """A zero eigenvalue that the chosen inputs and outputs do not both reach."""
+    """Return a zero eigenvalue that the chosen inputs and outputs do not both reach."""
     if model.point is not None and model.point.active_limits:
         state = model.state_names[int(np.argmax(np.abs(right)))]
         row = model.A[model.state_names.index(state)]
@@ -164,7 +164,7 @@ def _hidden(model: LinearModel, right: Array, driven: bool, seen: bool) -> str:
 
 
 def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
-    """(n,) d(lambda)/dp for a derivative of A: w' dA v, and in a cluster of equal eigenvalues those of the block.
+    """Return (n,) d(lambda)/dp for a derivative of A: w' dA v, and in a cluster of equal eigenvalues those of the block.
 
     A defective cluster has no derivative (it moves like a root): each of its members gets the mean of the cluster.
     """
@@ -183,7 +183,7 @@ def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
 
 
 def gradient_of(model: LinearModel, parameter: str) -> Gradient:
-    """The derivatives of A, B, C, D by a parameter; raises where the model was linearised without it."""
+    """Return the derivatives of A, B, C, D by a parameter; raises where the model was linearised without it."""
     if parameter not in model.gradients:
         if model.point is not None and parameter in model.point.parameters:
             raise LinearizationError(
@@ -269,13 +269,13 @@ class RootLocus:
         return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
 
     def plot(self, ax: Any = None) -> Any:
-        """The axes with the locus."""
+        """Return the axes with the locus."""
         from hvdc_ident.linearize.plot import locus
 
         return locus(self, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
-        """The locus as plain lists, complex numbers as [re, im]."""
+        """Return the locus as plain lists, complex numbers as [re, im]."""
         pairs = np.stack([self.eigenvalues.real, self.eigenvalues.imag], axis=-1).tolist()
         limits = [
             {"value": x.value, "eigenvalue": [x.eigenvalue.real, x.eigenvalue.imag], "direction": x.direction}
@@ -334,14 +334,14 @@ class _Along:
         self._place = names.index(parameter)
 
     def _at(self, value: float) -> EquilibriumSearch:
-        """The search at a value: nothing else in it changes but the guesses that stand on parameters."""
+        """Return the search at a value: nothing else in it changes but the guesses that stand on parameters."""
         key = "p" if self.parameter in self.model.parameters else "u"
         values = getattr(self._search, key).copy()
         values[self._place] = value
         return replace(self._search, **{key: values})
 
     def matrix(self, value: float) -> Array:
-        """A alone at the value's own operating point: the steady state that a simulation starts from there."""
+        """Return a alone at the value's own operating point: the steady state that a simulation starts from there."""
         search = self._at(value)
         try:
             root, _ = steady(self.model, search)
@@ -351,12 +351,12 @@ class _Along:
 
 
 def at_zero(table: Array) -> Array:
-    """Which eigenvalues (points, modes) are 0 but for rounding."""
+    """Return a mask (points, modes) of the eigenvalues that are 0 but for rounding."""
     return np.asarray(np.abs(table) <= ZERO * np.maximum(1.0, np.abs(table).max(axis=1, keepdims=True)))
 
 
 def match(before: Array, left: Array, after: Array, right: Array) -> Array:
-    """The order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding between alike."""
+    """Return the order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding between alike."""
     likeness = np.abs(left @ right)
     likeness = likeness / np.maximum(likeness.max(axis=1, keepdims=True), 1e-300)
     distance = np.abs(before[:, None] - after[None, :])

@@ -96,7 +96,7 @@ class OperatingPoint(Shown):
         return np.array([*self.parameters.values()], dtype=float)
 
     def to_dict(self) -> dict[str, Any]:
-        """The point as plain numbers; active limits with what is limited, by what, and the margin."""
+        """Return the point as plain numbers; active limits with what is limited, by what, and the margin."""
         return {
             "states": dict(self.states),
             "unknowns": dict(self.unknowns),
@@ -165,7 +165,7 @@ def find_operating_point(
 
 
 def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | None = None) -> OperatingPoint:
-    """The point a search leads to; SteadyStateError with the worst equation where it leads to none."""
+    """Return the point a search leads to; SteadyStateError with the worst equation where it leads to none."""
     if search.is_plain and not guess:
         return point_of(model, search, *steady(model, search))
     own = _own(model, search)
@@ -179,7 +179,7 @@ def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | 
 
 
 def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
-    """The steady state that a simulation of the same inputs and parameters starts from, and its branch."""
+    """Return the steady state that a simulation of the same inputs and parameters starts from, and its branch."""
     free = model if search.at == "start" else resting(model)
     try:
         at = equilibria(free)
@@ -200,7 +200,7 @@ def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
 
 
 def _own(model: Model, search: EquilibriumSearch) -> Array | None:
-    """The model's own steady state at the search's inputs and parameters; None where it has none there."""
+    """Return the model's own steady state at the search's inputs and parameters; None where it has none there."""
     free = model if search.at == "start" else resting(model)
     at = equilibria(free)
     try:
@@ -210,7 +210,7 @@ def _own(model: Model, search: EquilibriumSearch) -> Array | None:
 
 
 def _constrained(model: Model, search: EquilibriumSearch, guess: Mapping[str, float], own: Array | None) -> Root:
-    """The root that the guess leads to, else one near the model's own steady state, else near its guesses."""
+    """Return the root that the guess leads to, else one near the model's own steady state, else near its guesses."""
     best: Root | None = None
     starts = search.guesses(guess)
     near = (
@@ -251,7 +251,7 @@ def _not_found(model: Model, search: EquilibriumSearch, root: Root) -> SteadySta
 
 
 def point_of(model: Model, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
-    """The point of a solved search."""
+    """Return the point of a solved search."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
     values = s.values(y, w, p, s.modes(y, w, p))
@@ -504,7 +504,7 @@ def _independent(model: AnyModel, outputs: list[str], gains: Array) -> None:
 
 
 def _dc_gains(model: AnyModel, point: OperatingPoint, outputs: Collection[str]) -> Array:
-    """(outputs, all inputs) gains at rest; 0 for an input that drives an integrator: there is no rest with another value."""
+    """Return (outputs, all inputs) gains at rest; 0 for an input that drives an integrator: there is no rest with another value."""
     from hvdc_ident.linearize.jacobian import linearize
 
     a, b, c, d = linearize(model, point, outputs=list(outputs)).standard()

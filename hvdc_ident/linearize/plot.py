@@ -43,7 +43,7 @@ def axes_through_zero(axes: Any) -> None:
 
 
 def bode(responses: Sequence[FrequencyResponse], labels: Sequence[str] = (), ax: Any = None) -> Any:
-    """The two axes, gain above phase; every channel of every response is one curve, measured ones are dots."""
+    """Return the two axes, gain above phase; every channel of every response is one curve, measured ones are dots."""
     gain, phase = pair = axes_of(ax, 7.0, 6.0, rows=2)
     k = 0
     for number, r in enumerate(responses):
@@ -75,7 +75,7 @@ def bode(responses: Sequence[FrequencyResponse], labels: Sequence[str] = (), ax:
 
 
 def nyquist(responses: Sequence[FrequencyResponse], modulus: float = 0.0, reach: float = 3.0, ax: Any = None) -> Any:
-    """The axes; reach: how far the axes go where the curves go further. modulus: radius of the disk around -1."""
+    """Return the axes; reach: how far the axes go where the curves go further. modulus: radius of the disk around -1."""
     axes = axes_of(ax, 6.0, 6.0)
     k, largest = 0, 1.5
     for r in responses:
@@ -104,7 +104,7 @@ def nyquist(responses: Sequence[FrequencyResponse], modulus: float = 0.0, reach:
 
 
 def poles(model: LinearModel, ax: Any = None) -> Any:
-    """The axes: crosses for poles, circles for invariant zeros, rad/s; a symmetric log axis where they spread."""
+    """Return the axes: crosses for poles, circles for invariant zeros, rad/s; a symmetric log axis where they spread."""
     axes = axes_of(ax, 6.0, 5.0)
     p, z = model.poles(), model.zeros()
     axes.plot(p.real, p.imag, "x", color=COLOURS[0], markersize=8, label="poles")
@@ -120,7 +120,7 @@ def poles(model: LinearModel, ax: Any = None) -> Any:
 
 
 def participation(modes: Sequence[Mode], ax: Any = None) -> Any:
-    """The axes: a row for each state, a column for each mode (one of each conjugate pair), shares from 0 to 1."""
+    """Return the axes: a row for each state, a column for each mode (one of each conjugate pair), shares from 0 to 1."""
     shown = [m for m in modes if m.eigenvalue.imag >= 0]
     names = list(shown[0].participation) if shown else []
     table = np.array([[m.participation[n] for m in shown] for n in names]).reshape(len(names), len(shown))
@@ -140,7 +140,7 @@ def participation(modes: Sequence[Mode], ax: Any = None) -> Any:
 
 
 def shapes(mode: Mode, smallest: float = 0.01, ax: Any = None) -> Any:
-    """The axes of one mode; entries below a share of the largest are left out."""
+    """Return the axes of one mode; entries below a share of the largest are left out."""
     axes = axes_of(ax, 5.5, 5.0)
     k = 0
     for name, value in mode.shape.items():
@@ -163,7 +163,7 @@ def shapes(mode: Mode, smallest: float = 0.01, ax: Any = None) -> Any:
 
 
 def locus(found: RootLocus, left: float | None = None, ax: Any = None) -> Any:
-    """The axes: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
+    """Return the axes: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
     axes = axes_of(ax, 6.5, 5.0)
     for k in range(found.eigenvalues.shape[1]):
         v = found.eigenvalues[:, k]
@@ -194,7 +194,7 @@ KINDS = ("bode", "nyquist", "poles", "participation")
 
 
 def draw(model: LinearModel, kind: str, ax: Any = None) -> Any:
-    """The axes of a drawing of a linear model: "bode", "nyquist", "poles" or "participation". Raises UnknownNameError."""
+    """Return the axes of a drawing of a linear model: "bode", "nyquist", "poles" or "participation". Raises UnknownNameError."""
     if kind == "bode":
         return bode([model.bode()], ax=ax)
     if kind == "nyquist":

@@ -52,7 +52,7 @@ class Reduction:
         return f"{order} states{dc}; the gain is off by {self.bound:.4g} at most\nHankel singular values {listed}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The reduced model as plain numbers."""
+        """Return the reduced model as plain numbers."""
         m = self.model
         return {
             "order": len(m.state_names),
@@ -69,7 +69,7 @@ class Reduction:
 
 
 def staircase(a: Array, b: Array, tolerance: float = TOLERANCE) -> tuple[Array, int]:
-    """(orthogonal basis, k): its first k columns span what the inputs reach."""
+    """Return (orthogonal basis, k): its first k columns span what the inputs reach."""
     n = a.shape[0]
     basis, at, reached = np.eye(n), a.copy(), 0
     block, size = b.copy(), max(float(np.linalg.norm(b)), 1e-300)
@@ -178,7 +178,7 @@ def _renamed(model: LinearModel, a: Array, b: Array, c: Array, d: Array, how: st
 
 
 def hankel(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
-    """(singular values, left and right square-root balancing matrices) of a stable system."""
+    """Return (singular values, left and right square-root balancing matrices) of a stable system."""
     p = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
     q = scipy.linalg.solve_continuous_lyapunov(a.T, -c.T @ c)
     root_p, root_q = _root(p), _root(q)
@@ -248,7 +248,7 @@ def balanced(
 
 
 def _stable_last(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array, int]:
-    """A block diagonal with the modes that are not stable first, B and C to match, and the number of their states."""
+    """Return a block diagonal with the modes that are not stable first, B and C to match, and the number of their states."""
     if a.shape[0] == 0:
         return a, b, c, 0
     poles = np.linalg.eigvals(a)
@@ -269,7 +269,7 @@ def _stable_last(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array, int
 
 
 def _residualised(a: Array, b: Array, c: Array, d: Array, count: int) -> tuple[Array, Array, Array, Array]:
-    """The first states of a balanced model, the others at rest."""
+    """Return the first states of a balanced model, the others at rest."""
     if count == a.shape[0]:
         return a, b, c, d
     fast = a[count:, count:]
@@ -294,7 +294,7 @@ class Peak:
     omega: float
 
     def to_dict(self) -> dict[str, float]:
-        """The peak as plain numbers."""
+        """Return the peak as plain numbers."""
         return {"value": self.value, "omega": self.omega}
 
 

@@ -106,7 +106,7 @@ def _columns(text: str, where: str) -> ResponseFile:
 
 
 def _frequency_column(titles: Sequence[str], where: str) -> tuple[int, float]:
-    """(place, factor to rad/s) of the column of frequencies: the one that is titled so, else the first."""
+    """Return (place, factor to rad/s) of the column of frequencies: the one that is titled so, else the first."""
     for k, title in enumerate(titles):
         words = _words(title)
         if words and words[0].lower() in _FREQUENCY:
@@ -130,7 +130,7 @@ def _words(title: str) -> list[str]:
 
 
 def _meaning(title: str) -> tuple[str, str]:
-    """(channel, part) that a column's title names; part "" is the complex number itself."""
+    """Return (channel, part) that a column's title names; part "" is the complex number itself."""
     bracket = re.search(r"[\[(]([^\])]*)[\])]", title)
     outside = title[: bracket.start()] + title[bracket.end() :] if bracket else title
     inside = _words(bracket[1]) if bracket else []
@@ -151,7 +151,7 @@ def _meaning(title: str) -> tuple[str, str]:
 
 
 def _joined(parts: Mapping[str, Array], name: str, where: str) -> Array:
-    """The complex numbers of a channel from its columns."""
+    """Return the complex numbers of a channel from its columns."""
     have = set(parts) - {"std"}
     phase = next((p for p in ("deg", "rad") if p in have), None)
     size = next((p for p in ("mag", "db") if p in have), None)
@@ -181,7 +181,7 @@ def _cell(text: str, separator: str, where: str) -> complex:
 
 
 def _complex(text: str, separator: str) -> complex | None:
-    """The number of a cell: real, or complex as 1.2-0.3j, 1.2 - 0.3i, (1.2-0.3j) or 1.2-j0.3; None where it is none."""
+    """Return the number of a cell: real, or complex as 1.2-0.3j, 1.2 - 0.3i, (1.2-0.3j) or 1.2-j0.3; None where it is none."""
     bare = text.strip().strip("()").replace(" ", "").replace("*", "")
     if separator == ";":
         bare = bare.replace(",", ".")
@@ -250,7 +250,7 @@ def _touchstone(text: str, ports: int, where: str) -> ResponseFile:
 
 
 def _averaged(found: ResponseFile, where: str) -> ResponseFile:
-    """The response in the order of its frequencies, repeated ones by their mean with the mean's standard deviation."""
+    """Return the response in the order of its frequencies, repeated ones by their mean with the mean's standard deviation."""
     if not (np.isfinite(found.omega).all() and (found.omega >= 0).all()):
         raise WaveformError("a frequency is not a number of at least 0", where=where)
     omega, place, counts = np.unique(found.omega, return_inverse=True, return_counts=True)
@@ -278,7 +278,7 @@ MANY = 10
 
 
 def _scatter(deviation: Array, mean: Array, place: Array, counts: Array) -> Array:
-    """(n,) standard deviation of the mean of repeated sweeps; from few of them one share of the modulus for all frequencies.
+    """Return (n,) standard deviation of the mean of repeated sweeps; from few of them one share of the modulus for all frequencies.
 
     A standard deviation from two or three numbers is too often far too small, and would weigh its frequency too much.
     """

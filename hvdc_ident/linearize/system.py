@@ -24,7 +24,7 @@ Array = NDArray[Any]
 
 
 def evaluate(graph: Graph, roots: Iterable[int], leaves: Mapping[int, Any], size: int) -> list[Any]:
-    """The roots' values, (size,) complex arrays; conditions are decided by the real parts. leaves: {node: array}."""
+    """Return the roots' values, (size,) complex arrays; conditions are decided by the real parts. leaves: {node: array}."""
     wanted = list(roots)
     values: dict[int, Any] = {}
     with np.errstate(all="ignore"):
@@ -145,7 +145,7 @@ class CompiledSystem:
         self._compile()
 
     def _entries(self) -> list[tuple[int, int, int]]:
-        """(row, column, node) of every derivative over y and w that is not 0 by structure."""
+        """Return (row, column, node) of every derivative over y and w that is not 0 by structure."""
         n = self.layout.n
         found = []
         for i, v in enumerate(self.nodes):
@@ -190,24 +190,24 @@ class CompiledSystem:
         return [n for (n, _), value in zip(self.roots, at, strict=True) if value == 0.0]
 
     def modes(self, y: Array, w: Array, p: Array) -> Array:
-        """One number a switch: 1 where the switch is negative at the point, else 0."""
+        """Return (switches,) numbers: 1 where the switch is negative at the point, else 0."""
         return self._run("modes", self.n_switches, y, w, p, self._zero)
 
     def switches(self, y: Array, w: Array, p: Array) -> Array:
-        """The values whose signs decide the switches."""
+        """Return the values whose signs decide the switches."""
         return self._run("switches", self.n_switches, y, w, p, self._zero)
 
     def values(self, y: Array, w: Array, p: Array, m: Array) -> Array:
-        """(rows,) values of every row."""
+        """Return (rows,) values of every row."""
         return self._run("values", self.layout.rows, y, w, p, m)
 
     def jacobian(self, y: Array, w: Array, p: Array, m: Array) -> Array:
-        """(rows, columns) derivatives over [x, z, inputs, delays, sampled]."""
+        """Return (rows, columns) derivatives over [x, z, inputs, delays, sampled]."""
         size = self.layout
         return self._run("jac", size.rows * size.columns, y, w, p, m).reshape(size.rows, size.columns)
 
     def by_parameters(self, y: Array, w: Array, p: Array, m: Array) -> Array:
-        """(rows, parameters) partial derivatives over the parameters."""
+        """Return (rows, parameters) partial derivatives over the parameters."""
         size = self.layout
         return self._run("jac_p", size.rows * size.np, y, w, p, m).reshape(size.rows, size.np)
 
@@ -229,7 +229,7 @@ class CompiledSystem:
         return code, _SIGNATURE(code.address["hess"]), rows, columns, over
 
     def jacobian_along(self, y: Array, w: Array, p: Array, m: Array, directions: Array) -> Array:
-        """(directions, main rows, columns) derivatives of the Jacobian along given directions.
+        """Return (directions, main rows, columns) derivatives of the Jacobian along given directions.
 
         directions: (columns + parameters, k), in the order [x, z, inputs, delays, sampled, parameters].
         """
@@ -263,13 +263,13 @@ class CompiledSystem:
         return t
 
     def timing_by_parameters(self, p: Array) -> Array:
-        """(times, parameters) derivatives of the delay times, periods and compute times."""
+        """Return (times, parameters) derivatives of the delay times, periods and compute times."""
         count = len(self.structure.timing)
         zero = self._zero
         return self._run("timing_p", count * p.size, zero, zero, p, zero).reshape(count, p.size)
 
     def start_values(self, p: Array) -> dict[int, float]:
-        """The states' given start values by their place; they may depend on parameters."""
+        """Return the states' given start values by their place; they may depend on parameters."""
         size = self.layout
         if not self.with_start:
             return {}
@@ -278,7 +278,7 @@ class CompiledSystem:
         return {i: -float(v) for i, v in zip(self.with_start, tail, strict=True)}
 
     def complex_step(self, y: Array, w: Array, p: Array) -> Array:
-        """(main rows, columns) the Jacobian once more, by complex steps of 1e-30 through the values alone: a check."""
+        """Return (main rows, columns) the Jacobian once more, by complex steps of 1e-30 through the values alone: a check."""
         size, g = self.layout, self.structure.graph
         eye = 1e-30j * np.eye(size.columns)
         leaves: dict[int, Any] = {g.leaf("w", 0): np.full(size.columns, w[0], dtype=complex)}

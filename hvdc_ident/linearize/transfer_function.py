@@ -51,12 +51,12 @@ class SymbolicTransfer:
         return tuple(str(sp.N(sp.collect(e, S), digits)) for e in (self.numerator, self.denominator))  # type: ignore[return-value]
 
     def latex(self, digits: int = 5) -> str:
-        """The formula in LaTeX, by powers of s, numbers to some digits."""
+        """Return the formula in LaTeX, by powers of s, numbers to some digits."""
         top, bottom = (_latex(e, digits) for e in (self.numerator, self.denominator))
         return f"\\frac{{{top}}}{{{bottom}}}"
 
     def __call__(self, s: complex, values: Mapping[str, float]) -> complex:
-        """The value at a complex frequency, rad/s, for values of the symbols."""
+        """Return the value at a complex frequency, rad/s, for values of the symbols."""
         known = {symbol(n): v for n, v in values.items()} | {S: s}
         return complex(self.expression.subs(known).evalf())
 
@@ -70,7 +70,7 @@ def symbolic_transfer(
     *,
     together: Mapping[str, str] | None = None,
 ) -> SymbolicTransfer:
-    """The transfer function between an input and an output (or signal) with some parameters as symbols.
+    """Return the transfer function between an input and an output (or signal) with some parameters as symbols.
 
     together: parameters shown as one symbol, such as {"C1": "C", "C2": "C"}. Only the states that lie between input and
     output count. Raises UnknownNameError, and LinearizationError where more than six states do, or for delays.
@@ -113,7 +113,7 @@ def _fraction(a: sp.Matrix, b: sp.Matrix, c: sp.Matrix, d: sp.Expr) -> tuple[sp.
 
 
 def _number(e: sp.Expr) -> sp.Expr:
-    """The numeric factor of an expression's first term."""
+    """Return the numeric factor of an expression's first term."""
     factor = sp.expand(e).as_ordered_terms()[0].as_coeff_Mul()[0]
     return factor if factor != 0 else sp.Integer(1)
 
@@ -158,7 +158,7 @@ def _matrices(
 
 
 def _rational(e: sp.Expr) -> sp.Expr:
-    """The expression with its floating-point numbers as short fractions, right to 15 digits."""
+    """Return the expression with its floating-point numbers as short fractions, right to 15 digits."""
     return e.xreplace({x: sp.Rational(f"{float(x):.15g}") for x in e.atoms(sp.Float)})
 
 
@@ -167,7 +167,7 @@ def _is_choice(e: sp.Basic) -> bool:
 
 
 def _branch(e: sp.Expr, values: Mapping[sp.Symbol, float]) -> sp.Expr:
-    """The branch of a limiter or choice that is in use at the point."""
+    """Return the branch of a limiter or choice that is in use at the point."""
 
     def number(x: sp.Expr) -> float:
         return float(x.subs(values))
@@ -185,7 +185,7 @@ def _branch(e: sp.Expr, values: Mapping[sp.Symbol, float]) -> sp.Expr:
 
 
 def _between(a: sp.Matrix, b: sp.Matrix, c: sp.Matrix) -> tuple[sp.Matrix, sp.Matrix, sp.Matrix]:
-    """The part that the input reaches and the output sees, by structure."""
+    """Return the part that the input reaches and the output sees, by structure."""
     n = a.shape[0]
     reached = {i for i in range(n) if b[i, 0] != 0}
     seen = {i for i in range(n) if c[0, i] != 0}
@@ -274,7 +274,7 @@ def _rank(values: Array, scale: float) -> int:
 
 
 def _deflate(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
-    """The system with D of full row rank and the same zeros."""
+    """Return the system with D of full row rank and the same zeros."""
     while True:
         n, o = a.shape[0], c.shape[0]
         scale = max(float(np.abs(np.block([[b], [d]])).max(initial=0.0)), 1e-300) if d.size else 1.0
@@ -311,7 +311,7 @@ class TransferFunction:
     cancelled: tuple[tuple[complex, complex], ...] = ()
 
     def __call__(self, s: complex | Array) -> Array:
-        """The value at complex frequencies s."""
+        """Return the value at complex frequencies s."""
         s = np.asarray(s, dtype=complex)
         top = np.prod(s[..., None] - self.zeros, axis=-1)
         return np.asarray(self.gain * top / np.prod(s[..., None] - self.poles, axis=-1))
@@ -324,7 +324,7 @@ class TransferFunction:
         return float(self(0.0).real)
 
     def to_dict(self) -> dict[str, Any]:
-        """The transfer function as plain numbers, complex ones as [re, im]."""
+        """Return the transfer function as plain numbers, complex ones as [re, im]."""
 
         def pairs(values: Array) -> list[list[float]]:
             return [[float(v.real), float(v.imag)] for v in values]
@@ -391,13 +391,13 @@ def _cancel(poles: Array, zeros_: Array, hidden: Array) -> tuple[Array, Array, l
 
 
 def _paired(values: Array) -> Array:
-    """Sorted by size; rounding's imaginary parts removed."""
+    """Return the values sorted by size, imaginary parts due to rounding removed."""
     values = np.where(np.abs(values.imag) < 1e-13 * np.abs(values), values.real, values)
     return np.asarray(values[np.lexsort((-values.imag, values.real, np.abs(values).round(12)))], dtype=complex)
 
 
 def _gain(a: Array, b: Array, c: Array, d: Array, zeros_: Array, poles: Array) -> float:
-    """The leading coefficient, from values of the transfer function at points away from every pole and zero."""
+    """Return the leading coefficient, from values of the transfer function at points away from every pole and zero."""
     sizes = np.abs(np.concatenate([poles, zeros_, [1.0 + 0j]]))
     typical = float(np.exp(np.log(np.maximum(sizes, 1e-3)).mean()))
     found, eye = [], np.eye(a.shape[0])

@@ -28,7 +28,7 @@ _SHORT = frozenset(("signals", "outputs"))
 
 
 def read_card(path: str | Path) -> Model:
-    """The model of a card, a TOML file.
+    """Return the model of a card, a TOML file.
 
     Raises ModelError for a file that is missing, over 5 MB, not UTF-8 or not TOML, and ModelError, UnknownNameError
     or ExpressionError with the file and the place in it for what it says.
@@ -51,7 +51,7 @@ def read_card(path: str | Path) -> Model:
 
 
 def parse_card(text: str, where: str = "model card") -> Model:
-    """The model of a card's text. where: what to call the card in errors, which are those of `read_card`."""
+    """Return the model of a card's text. where: what to call the card in errors, which are those of `read_card`."""
     try:
         card = tomllib.loads(text)
     except tomllib.TOMLDecodeError as e:
@@ -128,7 +128,7 @@ def _kind(value: object) -> str:
 
 
 def write_card(model: Model) -> str:
-    """The text of the model's card: `parse_card(write_card(m)) == m`, every number to the last bit.
+    """Return the text of the model's card: `parse_card(write_card(m)) == m`, every number to the last bit.
 
     Raises ExpressionError with the place for an expression that the card's grammar has no words for.
     """
@@ -150,7 +150,7 @@ def write_card(model: Model) -> str:
 
 
 def save_card(model: Model, path: str | Path) -> Path:
-    """The path, once the model's card is written there whole: the file is the old one or the new one, never a part."""
+    """Return the path, once the model's card is written there whole: the file is the old one or the new one, never a part."""
     return write_text(Path(path), write_card(model))
 
 

@@ -1,4 +1,4 @@
-"""From plain values to a consistent model: numbers, texts and dicts become the objects that a model stores; then names, symbols and
+"""Consistency of a model: numbers, texts and dicts become the objects that a model stores; then names, symbols and
 circles of signals are checked."""
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SECTIONS: dict[str, tuple[type[Any], str, str]] = {
 
 
 def coerced(model: Model) -> dict[str, FrozenMap[Any]]:
-    """The mappings of the model with every value as the object that the model stores.
+    """Return the mappings of the model with every value as the object that the model stores.
 
     A number becomes a Parameter or Input; a text of the grammar, a sympy expression or a number a State (its
     derivative), Signal, Algebraic or Output; a dict is taken by the names of the object's fields. Symbols become the
@@ -93,7 +93,7 @@ def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> N
 
 
 def _read(kind: type[Any]) -> FrozenMap[bool]:
-    """The fields of a class, and whether each has to be given."""
+    """Return the fields of a class, and whether each has to be given."""
     return FrozenMap({f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(kind)})
 
 
@@ -150,7 +150,7 @@ def _shown(value: object) -> str:
 
 
 def expression(value: object, place: str) -> sp.Expr:
-    """The sympy expression of a text, a number or a sympy expression, in the normal form of models."""
+    """Return the sympy expression of a text, a number or a sympy expression, in the normal form of models."""
     if isinstance(value, str):
         return parse(value, where=place)
     if isinstance(value, sp.Expr):
@@ -243,7 +243,7 @@ def _check_name(name: object, place: str) -> None:
 
 
 def _expressions(model: Model) -> Iterator[tuple[str, str, str, sp.Expr, bool]]:
-    """(section, name, part, expression, whether only parameters may be used) of every expression of the model."""
+    """Return (section, name, part, expression, whether only parameters may be used) of every expression of the model."""
     for name, state in model.states.items():
         yield "states", name, "", state.derivative, False
         if isinstance(state.start, sp.Expr):

@@ -172,13 +172,13 @@ class Model(Shown):
         return driven(self, tuple(points))
 
     def parameterised(self, name: str) -> Model:
-        """The model in another of its own parameterisations; the values follow from the new parameters' start values."""
+        """Return the model in another of its own parameterisations; the values follow from the new parameters' start values."""
         from hvdc_ident.model.transform import parameterised
 
         return parameterised(self, name)
 
     def tied(self, ties: Mapping[str, sp.Expr | str]) -> Model:
-        """The model in which some parameters are expressions of others, as {"KIQ2": "KIQ"}."""
+        """Return the model in which some parameters are expressions of others, as {"KIQ2": "KIQ"}."""
         from hvdc_ident.expression import parse
         from hvdc_ident.model.transform import tied
 
@@ -248,7 +248,7 @@ class Model(Shown):
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Only the definition travels to another process: symbols hash anew there."""
+        """Return the definition alone, which travels to another process: symbols hash anew there."""
         return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
 
 
@@ -300,7 +300,7 @@ class External(Protocol):
         """Text that differs where the model or a value does."""
 
     def with_values(self, values: Mapping[str, float]) -> External:
-        """The model with other parameter or input values."""
+        """Return the model with other parameter or input values."""
 
     def recording(self, names: Iterable[str]) -> External:
         """Return the model with these variables among its outputs. Raises InputError for what it cannot record."""
@@ -315,7 +315,7 @@ class External(Protocol):
         """Return the model in which these insertion points follow a recorded column."""
 
     def parameterised(self, name: str) -> External:
-        """The model in another parameterisation."""
+        """Return the model in another parameterisation."""
 
     def simulate(
         self,
@@ -327,7 +327,7 @@ class External(Protocol):
         tolerance: Any = None,
         partial: bool = False,
     ) -> Any:
-        """A run: a `hvdc_ident.simulate.Simulation`."""
+        """Return a run: a `hvdc_ident.simulate.Simulation`."""
 
 
 AnyModel: TypeAlias = Model | External

@@ -18,7 +18,7 @@ Renaming = Mapping[sp.Symbol, sp.Symbol]
 
 
 def fresh(model: Model, name: str) -> str:
-    """A name like the one given that the model does not use yet."""
+    """Return a name like the one given that the model does not use yet."""
     taken = {*model.names, *(f"{s}_start" for s in model.states)}
     if name not in taken:
         return name
@@ -26,7 +26,7 @@ def fresh(model: Model, name: str) -> str:
 
 
 def substituted(model: Model, renaming: Renaming) -> dict[str, Any]:
-    """The model's equations with symbols exchanged, as fields for `dataclasses.replace`."""
+    """Return the model's equations with symbols exchanged, as fields for `dataclasses.replace`."""
 
     def new(e: Any) -> Any:
         return e.xreplace(renaming) if isinstance(e, sp.Basic) else e
@@ -144,7 +144,7 @@ def insertion_point_of(points: Collection[str], name: str) -> str:
 
 
 def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal) -> FrozenMap[Signal]:
-    """The signals with `before` put in front of `name`, which for now only repeats it."""
+    """Return the signals with `before` put in front of `name`, which for now only repeats it."""
     items: dict[str, Signal] = {}
     for n, s in signals.items():
         if n == name:
@@ -156,7 +156,7 @@ def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal)
 
 
 def _derived(model: Model) -> Model:
-    """The model, with itself as what it comes from where it does not come from another."""
+    """Return the model, with itself as what it comes from where it does not come from another."""
     return model if model.origin else replace(model, origin=ModelOrigin(model))
 
 
@@ -185,7 +185,7 @@ def driven(model: Model, points: tuple[str, ...]) -> Model:
 
 
 def parameterised(model: Model, name: str) -> Model:
-    """The model with some parameters written as expressions of the parameterisation's own."""
+    """Return the model with some parameters written as expressions of the parameterisation's own."""
     if name not in model.parameterisations:
         raise unknown_name("parameterisation", name, model.parameterisations, where=f"model '{model.name}'")
     chosen = model.parameterisations[name]
@@ -212,7 +212,7 @@ def parameterised(model: Model, name: str) -> Model:
 
 
 def tied(model: Model, ties: Mapping[str, sp.Expr]) -> Model:
-    """The model in which some parameters are expressions of others; they become signals of their names.
+    """Return the model in which some parameters are expressions of others; they become signals of their names.
 
     Raises ModelError for an expression that uses anything but parameters that are not tied, UnknownNameError for a tie
     of what is no parameter.

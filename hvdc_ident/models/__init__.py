@@ -39,12 +39,12 @@ def shipped_models() -> tuple[str, ...]:
 
 
 def is_shipped(name: str) -> bool:
-    """True where a model of that name is shipped, be it one of a family."""
+    """Return True where a model of that name is shipped, alone or as one of a family."""
     return name in _shipped_by_name() or _of_a_family(name) is not None
 
 
 def summaries() -> dict[str, str]:
-    """One line on each shipped model."""
+    """Return one line on each shipped model, by name."""
     return {name: summary for name, (summary, _) in _shipped_by_name().items()}
 
 
@@ -58,7 +58,7 @@ def _shipped(name: str) -> Model:
 
 @cache
 def _of_a_family(name: str) -> Model | None:
-    """The member of a family of models that goes by the name; None where none does."""
+    """Return the member of a family of models that goes by the name; None where none does."""
     for module_name in (m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")):
         module: Any = importlib.import_module(f"{__name__}.{module_name}")
         found = module.family(name) if hasattr(module, "family") else None
@@ -74,7 +74,7 @@ def load_model(
     interface: Literal["model-exchange", "co-simulation"] | None = None,
     limits: Limits | Mapping[str, float] | None = None,
 ) -> AnyModel:
-    """A shipped model by name, or the model of a file: a model card (.toml), an FMU (.fmu), or Python (.py, needs trust).
+    """Return a shipped model by name, or the model of a file: a model card (.toml), an FMU (.fmu), or Python (.py, needs trust).
 
     Python runs its code here; an FMU runs its own in a process of its own, which contains crashes, not malice: load
     only FMUs you trust. interface: of an FMU that offers both (default: model exchange). limits: of an FMU's process, as

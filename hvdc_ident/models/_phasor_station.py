@@ -23,7 +23,7 @@ def plant(i: str) -> dict[str, str]:
 
 
 def control_vdc(i: str, tag: str = "") -> dict[str, str]:
-    """The dc voltage control, state xv: its measurement, error, limited output and current order."""
+    """Return the dc voltage control, state xv: its measurement, error, limited output and current order."""
     return {
         f"Vdc{i}_m": f"Vdc{i}",
         f"ev{tag}": f"Vdcref{i} - Vdc{i}_m",
@@ -34,7 +34,7 @@ def control_vdc(i: str, tag: str = "") -> dict[str, str]:
 
 
 def control_p(i: str, tag: str = "") -> dict[str, str]:
-    """The active power control, state xp: its measurement, error, limited output and current order."""
+    """Return the active power control, state xp: its measurement, error, limited output and current order."""
     return {
         f"P{i}_m": f"P{i}",
         f"ep{tag}": f"Pref{i} - P{i}_m",
@@ -45,7 +45,7 @@ def control_p(i: str, tag: str = "") -> dict[str, str]:
 
 
 def control_q(i: str, kp: str, ki: str) -> dict[str, str]:
-    """The reactive power control, state xq: what the active current leaves bounds its order."""
+    """Return the reactive power control, state xq: what the active current leaves bounds its order."""
     return {
         f"Q{i}_m": f"Q{i}",
         f"eq{i}": f"Qref{i} - Q{i}_m",

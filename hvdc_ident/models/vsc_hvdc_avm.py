@@ -54,7 +54,7 @@ RATINGS = {
 
 
 def inputs(rated: Rating) -> dict[str, Input]:
-    """The inputs with their start values in pu."""
+    """Return the inputs with their start values in pu."""
     return {
         "Vdcref1": Input(1.0, "pu", "dc voltage set-point of station 1"),
         "Qref1": Input(0.0, "pu", "reactive power set-point of station 1"),
@@ -71,7 +71,7 @@ def _parameter(value: float, unit: str, text: str) -> Parameter:
 
 
 def gains(rated: Rating) -> dict[str, Parameter]:
-    """The outer controls' gains, named as in the phasor link."""
+    """Return the outer controls' gains, named as in the phasor link."""
     return {
         "KPVDC": _parameter(rated.KPVDC, "pu", "proportional gain of the dc voltage control"),
         "KIVDC": _parameter(rated.KIVDC, "pu/s", "integral gain of the dc voltage control"),
@@ -122,7 +122,7 @@ def model(
     priority: Literal["d", "q"] = "d",
     name: str = "vsc-hvdc-avm",
 ) -> Model:
-    """The link in the paper's case (100 MVA, Table I) or the authors' (1000 MVA, 1 pu from station 2 to station 1).
+    """Return the link in the paper's case (100 MVA, Table I) or the authors' (1000 MVA, 1 pu from station 2 to station 1).
 
     filters: measurements that pass a critically damped second-order low-pass, -3 dB at FM (140 Hz); P and Q unfiltered
     make a circle through their proportional gains, so that they are unknowns then. priority: the axis whose order is
@@ -229,7 +229,7 @@ _PARTS = {
 
 
 def _part(state: str) -> str:
-    """The part of the plant that a state belongs to, with its station's number where it has one."""
+    """Return the part of the plant that a state belongs to, with its station's number where it has one."""
     prefix = max((p for p in _PARTS if state.startswith(p)), key=len)
     station = next((c for c in state if c.isdigit()), "")
     return _PARTS[prefix] if prefix in ("Vc", "Idc", "xv", "xp") else f"{_PARTS[prefix]} {station}"
@@ -318,7 +318,7 @@ def _control_vdc() -> dict[str, str]:
 
 
 def _control_p() -> dict[str, str]:
-    """Active power control with a droop of 10 outside 0.95 to 1.05 pu of dc voltage."""
+    """Return active power control with a droop of 10 outside 0.95 to 1.05 pu of dc voltage."""
     return {
         "ep": "Pref2 - P2_m",
         "yp_u": "KPP*ep + xp",
@@ -337,7 +337,7 @@ def _control_q(i: int) -> dict[str, str]:
 
 
 def _orders(priority: str) -> dict[str, str]:
-    """The orders with their limits: the first axis has its own, the other what is left of 1.1."""
+    """Return the orders with their limits: the first axis has its own, the other what is left of 1.1."""
     wanted = {"1": "yv", "2": "(yp + db2) / clip(Vf2, 0.01, 2)"}
     orders: dict[str, str] = {}
     for i, d in wanted.items():

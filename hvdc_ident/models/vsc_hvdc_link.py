@@ -19,7 +19,7 @@ DAMPING = 0.7
 
 
 def model() -> Model:
-    """The link in the paper's case: 40 MW from station 2 to station 1, gains of Table I."""
+    """Return the link in the paper's case: 40 MW from station 2 to station 1, gains of Table I."""
     return Model(
         name="vsc-hvdc-link",
         description="Two-terminal VSC-HVDC link in phasors; pu of 100 MVA and 640 kV",
@@ -125,7 +125,7 @@ def _line() -> dict[str, str]:
 
 
 def physical() -> Parameterisation:
-    """The gains from total capacitance J and settling time Ts: wn = 3/(z Ts), Kp = 2 z wn J, Ki = wn^2 J, else 3/Ts.
+    """Return the gains from total capacitance J and settling time Ts: wn = 3/(z Ts), Kp = 2 z wn J, Ki = wn^2 J, else 3/Ts.
 
     The rule is reconstructed from Table I's numbers, which it gives digit for digit; it is not quoted from a manual.
     """

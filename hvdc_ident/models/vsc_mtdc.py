@@ -26,18 +26,18 @@ _NAME = re.compile(r"vsc-mtdc-(\d{1,4})")
 
 
 def model() -> Model:
-    """The grid of four terminals."""
+    """Return the grid of four terminals."""
     return vsc_mtdc(4)
 
 
 def family(name: str) -> Model | None:
-    """The grid a name like `vsc-mtdc-12` asks for; None for another kind of name."""
+    """Return the grid a name like `vsc-mtdc-12` asks for; None for another kind of name."""
     match = _NAME.fullmatch(name)
     return vsc_mtdc(int(match[1])) if match else None
 
 
 def vsc_mtdc(terminals: int) -> Model:
-    """The grid of so many terminals, 2 to 400; ModelError outside that."""
+    """Return the grid of so many terminals, 2 to 400; ModelError outside that."""
     if not 2 <= terminals <= MOST:
         raise ModelError(
             "a grid of so many terminals is not offered", expected=f"2 to {MOST} terminals", got=str(terminals)

@@ -17,7 +17,7 @@ __all__ = ["formats", "read", "write"]
 
 @cache
 def formats() -> dict[str, ModuleType]:
-    """The formats by ending."""
+    """Return the formats by ending."""
     found = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     return {m.SUFFIX: m for m in found}
 
@@ -31,7 +31,7 @@ def _format(path: Path) -> Any:
 
 
 def write(model: LinearModel, path: str | Path) -> Path:
-    """The path, with the model written in the format of its ending. Raises ModelError for an ending that has none."""
+    """Write the model in the format of the ending of the path, and return the path. Raises ModelError for an ending that has none."""
     return Path(_format(Path(path)).write(model, Path(path)))
 
 

@@ -19,7 +19,7 @@ _ARROW = " from "
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written, at frequencies around the poles."""
+    """Write the response at frequencies around the poles, and return the path."""
     return write_text(path, text(model.bode()) + _note(model))
 
 
@@ -43,7 +43,7 @@ def text(response: FrequencyResponse) -> str:
 
 
 def read(path: Path) -> FrequencyResponse:
-    """The response of a file that `write` wrote. Raises ModelError."""
+    """Return the response of a file that `write` wrote. Raises ModelError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         rows = list(csv.reader(line for line in lines if not line.startswith("#")))

@@ -17,7 +17,7 @@ SUMMARY = "all matrices, names, units, operating point and provenance, full prec
 
 
 def to_dict(model: LinearModel) -> dict[str, Any]:
-    """The linear model as plain lists and text."""
+    """Return the linear model as plain lists and text."""
     point = {} if model.point is None else {"operating_point": model.point.to_dict()}
     return {
         "schema": SCHEMA,
@@ -40,7 +40,7 @@ def to_dict(model: LinearModel) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any], where: str = "linear model") -> LinearModel:
-    """The linear model of `to_dict`'s result. Raises ModelError where it is not one."""
+    """Return the linear model of `to_dict`'s result. Raises ModelError where it is not one."""
     if not isinstance(data, dict) or data.get("schema") != SCHEMA or "A" not in data:
         raise ModelError(
             "this is no linear model", where=where, expected=f"a JSON object with schema {SCHEMA} and A, B, C, D"
@@ -57,12 +57,12 @@ def from_dict(data: dict[str, Any], where: str = "linear model") -> LinearModel:
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written."""
+    """Write the model and return the path."""
     return write_text(path, json_text(to_dict(model)))
 
 
 def read(path: Path) -> LinearModel:
-    """The linear model of a file. Raises ModelError."""
+    """Return the linear model of a file. Raises ModelError."""
     try:
         return from_dict(json.loads(path.read_text(encoding="utf-8")), str(path))
     except (OSError, ValueError) as e:

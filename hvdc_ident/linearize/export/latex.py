@@ -16,14 +16,14 @@ SUMMARY = "the transfer functions in LaTeX, zeros and poles with six digits"
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written: where the model comes from as comments, then one displayed equation for each channel."""
+    """Write the provenance as comments and one displayed equation a channel, and return the path."""
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     head = "".join(f"% {' '.join(f'{k}: {v}'.split())}\n" for k, v in model.provenance.items())
     return write_text(path, head + "\n".join(text(f) for f in functions))
 
 
 def text(f: TransferFunction, digits: int = 6) -> str:
-    """The transfer function as an equation; conjugate pairs as quadratic factors."""
+    """Return the transfer function as an equation; conjugate pairs as quadratic factors."""
     top, bottom = factors(f.zeros, digits), factors(f.poles, digits)
     gain = number(f.gain, digits)
     fraction = f"{gain} \\, \\frac{{{top or '1'}}}{{{bottom}}}" if bottom else f"{gain} \\, {top}" if top else gain
@@ -32,12 +32,12 @@ def text(f: TransferFunction, digits: int = 6) -> str:
 
 
 def escape(name: str) -> str:
-    """A name as LaTeX text."""
+    """Return a name as LaTeX text."""
     return name.replace("\\", r"\backslash ").replace("_", r"\_").replace("%", r"\%").replace("#", r"\#")
 
 
 def number(value: float, digits: int = 6) -> str:
-    """A number as LaTeX math."""
+    """Return a number as LaTeX math."""
     text = f"{value:.{digits}g}"
     if "e" not in text:
         return text
@@ -46,7 +46,7 @@ def number(value: float, digits: int = 6) -> str:
 
 
 def factors(roots: Array, digits: int) -> str:
-    """(s + a)(s^2 + b s + c)... of roots whose complex ones come in pairs."""
+    """Return (s + a)(s^2 + b s + c)... of roots whose complex ones come in pairs."""
     parts = []
     for r in roots:
         if abs(r.imag) <= 1e-12 * max(1.0, abs(r)):

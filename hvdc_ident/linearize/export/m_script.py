@@ -18,12 +18,12 @@ SUMMARY = "a MATLAB or Octave script that builds the state space, with names and
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written."""
+    """Write the model and return the path."""
     return write_text(path, text(model))
 
 
 def text(model: LinearModel) -> str:
-    """The script."""
+    """Return the script."""
     lines = [f"% Linear model of {_line(model.name)}: E*dx/dt = A*x + B*u, y = C*x + D*u, time in s."]
     lines += [f"% {_line(k)}: {_line(v)}" for k, v in model.provenance.items()]
     lines += [f"name = {_quoted(model.name)};"]
@@ -54,7 +54,7 @@ def _matrix(values: Array) -> str:
 
 
 def read(path: Path) -> LinearModel:
-    """The linear model of a script that `write` wrote. Raises ModelError; nothing in the file is run."""
+    """Return the linear model of a script that `write` wrote. Raises ModelError; nothing in the file is run."""
     try:
         content = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as e:

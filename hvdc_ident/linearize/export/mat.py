@@ -18,7 +18,7 @@ SUMMARY = "MATLAB version 5: A, B, C, D, E, x0, u0, y0, names and units; sys = s
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written: doubles as they are, names as cell arrays."""
+    """Write the model, doubles as they are and names as cell arrays, and return the path."""
     import scipy.io
 
     def cells(names: tuple[str, ...]) -> Any:
@@ -41,7 +41,7 @@ def write(model: LinearModel, path: Path) -> Path:
 
 
 def read(path: Path) -> LinearModel:
-    """The linear model of a file. Raises ModelError."""
+    """Return the linear model of a file. Raises ModelError."""
     import scipy.io
 
     try:

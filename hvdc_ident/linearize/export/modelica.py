@@ -18,12 +18,12 @@ SUMMARY = "Modelica text of the state space: inputs and outputs in the plant's o
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written."""
+    """Write the model and return the path."""
     return write_text(path, text(model, path.stem))
 
 
 def text(model: LinearModel, name: str = "") -> str:
-    """The Modelica model: y = y0 + C x + D (u - u0), der(x) = A x + B (u - u0). Needs no library.
+    """Return the Modelica model: y = y0 + C x + D (u - u0), der(x) = A x + B (u - u0). Needs no library.
 
     Raises LinearizationError for a descriptor whose algebraic part cannot be eliminated.
     """
@@ -69,7 +69,7 @@ def text(model: LinearModel, name: str = "") -> str:
 
 
 def identifier(name: str) -> str:
-    """A Modelica identifier like the name."""
+    """Return a Modelica identifier like the name."""
     cleaned = re.sub(r"\W", "_", name, flags=re.ASCII) or "model_"
     reserved = {"model", "end", "equation", "input", "output", "parameter", "constant", "block", "class", "der"}
     return f"m_{cleaned}" if cleaned[0].isdigit() or cleaned in reserved else cleaned
@@ -84,7 +84,7 @@ def _matrix(values: Array) -> str:
 
 
 def read(path: Path) -> LinearModel:
-    """The linear model of a file that `write` wrote. Raises ModelError."""
+    """Return the linear model of a file that `write` wrote. Raises ModelError."""
     try:
         content = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as e:

@@ -18,7 +18,7 @@ SUMMARY = "zeros, poles, gain and continuous second-order sections of every chan
 
 
 def write(model: LinearModel, path: Path) -> Path:
-    """The path, written."""
+    """Write the model and return the path."""
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     rows = [{**f.to_dict(), "sections": sections(f).tolist()} for f in functions]
     text = "[b2, b1, b0, a2, a1, a0] in falling powers of s; G is their product"
@@ -27,7 +27,7 @@ def write(model: LinearModel, path: Path) -> Path:
 
 
 def read(path: Path) -> tuple[TransferFunction, ...]:
-    """The transfer functions of a file that `write` wrote. Raises ModelError."""
+    """Return the transfer functions of a file that `write` wrote. Raises ModelError."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         return tuple(
@@ -45,7 +45,7 @@ def read(path: Path) -> tuple[TransferFunction, ...]:
 
 
 def sections(f: TransferFunction) -> Array:
-    """(k, 6) rows [b2, b1, b0, a2, a1, a0] of second-order factors, falling powers of s; the gain is in the first."""
+    """Return (k, 6) rows [b2, b1, b0, a2, a1, a0] of second-order factors, falling powers of s; the gain is in the first."""
     top, bottom = _quadratics(f.zeros), _quadratics(f.poles)
     count = max(len(top), len(bottom), 1)
     one = [0.0, 0.0, 1.0]
