@@ -60,7 +60,7 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
     """
     if wanted is not None and wanted not in SETS:
         raise StudyError(
-            "no set of values has this name",
+            "no such set of values",
             where="--values",
             expected=", ".join(SETS),
             got=repr(wanted),

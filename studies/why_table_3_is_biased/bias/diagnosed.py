@@ -119,7 +119,7 @@ def sized(told: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def delay(effects: Sequence[Mapping[str, Any]]) -> float:
     """Return the total low-frequency delay of the effects in one loop, s, from their transfer functions."""
-    return sum(late(e["parameters"]) for e in effects if (late := catalogue()[e["effect"]].late))
+    return sum(delay_of(e["parameters"]) for e in effects if (delay_of := catalogue()[e["effect"]].equivalent_delay))
 
 
 def augmented(told: Mapping[str, Any]) -> Model:
