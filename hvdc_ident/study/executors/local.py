@@ -15,7 +15,7 @@ import pickle
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from multiprocessing import spawn
 from multiprocessing.connection import Connection, wait
@@ -92,7 +92,7 @@ class _PoolWorker:
     supervisor: Supervisor
     child: ChildProcess
     ready: bool = False
-    pending: Mapping[int, Any] = field(default_factory=dict)
+    pending: dict[int, Any] = field(default_factory=dict)
 
     def send(self, message: bytes) -> None:
         """Send a pickle and count its time from now on; that the worker has just died is noticed when it is heard."""
@@ -214,8 +214,8 @@ class _Session:
         if outcomes:
             cost = spent / len(outcomes)
             self.cost = cost if not self.cost else 0.7 * self.cost + 0.3 * cost
-        reported = {outcome.index for outcome in outcomes}
-        worker.pending = {index: item for index, item in worker.pending.items() if index not in reported}
+        for outcome in outcomes:
+            worker.pending.pop(outcome.index, None)
         yield from outcomes
 
     def _overdue(self, worker: _PoolWorker) -> Iterator[Outcome]:
