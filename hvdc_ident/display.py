@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from textwrap import fill
@@ -13,6 +13,8 @@ from hvdc_ident.errors import InputError
 
 WIDTH = 110
 """Characters in a line of a summary."""
+ROWS_SHOWN = 40
+"""Rows of a table that a summary lists, where nothing else is said."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,14 @@ class Table:
         head = "".join(f"<th>{escape(h)}</th>" for h in self.header)
         body = "".join("<tr>" + "".join(f"<td>{escape(_text(c))}</td>" for c in row) + "</tr>" for row in self.rows)
         return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def first_rows(
+    header: tuple[str, ...], rows: Sequence[tuple[Any, ...]], kind: str = "", most: int = ROWS_SHOWN
+) -> Iterator[str | Table]:
+    """Yield a table of the first rows, and the number of the others. kind: of what the rows are."""
+    yield Table(header, tuple(rows[:most]))
+    yield f"and {len(rows) - most} more {kind}".rstrip() if len(rows) > most else ""
 
 
 class Shown:
@@ -71,12 +81,17 @@ def _breaks(text: str) -> str:
     return escape(text).replace("\n", "<br>")
 
 
-def library(name: str, purpose: str) -> Any:
-    """Return an optional library, imported now. Raises InputError where it is not installed."""
+def library(name: str, purpose: str, package: str = "") -> Any:
+    """Return an optional library, imported now. Raises InputError where it is not installed.
+
+    package: what pip installs, where that is not the library's own name.
+    """
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError(f"{purpose} needs {name}, which is not installed", hint=f"pip install {name}") from None
+        raise InputError(
+            f"{purpose} needs {name}, which is not installed", hint=f"pip install {package or name}"
+        ) from None
 
 
 def data_frame(columns: Mapping[str, Any], index: Any = None, index_name: str | None = None) -> Any:

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.display import Shown, Table, axes_of, data_frame, library
+from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import WaveformError, unknown_name
 
 Array = NDArray[np.float64]
-ROWS_SHOWN = 40
-"""Signals listed on the screen of a trajectory."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +124,7 @@ class Trajectory(Shown):
         rows = [
             (n, u, float(v[0]), float(v[-1]), float(np.fmin.reduce(v)), float(np.fmax.reduce(v))) for n, u, v in columns
         ]
-        shown = tuple(rows[:ROWS_SHOWN])
-        yield Table(("signal", "unit", "first", "last", "smallest", "largest"), shown)
-        yield f"and {len(rows) - ROWS_SHOWN} more signals" if len(rows) > ROWS_SHOWN else ""
+        yield from first_rows(("signal", "unit", "first", "last", "smallest", "largest"), rows, "signals")
 
     def to_dict(self) -> dict[str, Any]:
         """Return time, signals and units as plain lists."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.display import Shown, Table, data_frame
+from hvdc_ident.display import Shown, Table, data_frame, first_rows
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.linearize.system import Array
 
@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     import xarray
 
     from hvdc_ident.linearize.linear_model import LinearModel
-
-ROWS_SHOWN = 40
-"""Channels listed on the screen of a response."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,17 +85,16 @@ class FrequencyResponse(Shown):
     def _screen(self) -> Iterator[str | Table]:
         f = self.frequency_hz
         yield f"Frequency response ({self.source}): {f.size} frequencies, {f.min():.4g} to {f.max():.4g} Hz"
-        rows = []
+        rows, magnitude, phases = [], self.magnitude, self.phase_deg
         for j, output in enumerate(self.output_names):
             for k, input in enumerate(self.input_names):
-                gain, phase = self.magnitude[:, j, k], self.phase_deg[:, j, k]
+                gain, phase = magnitude[:, j, k], phases[:, j, k]
                 peak = int(np.argmax(gain))
                 rows.append(
                     (f"{input} to {output}", *map(float, (gain[0], phase[0], gain[peak], f[peak], gain[-1], phase[-1])))
                 )
         header = ("channel", "first gain", "phase, deg", "largest gain", "at, Hz", "last gain", "phase, deg")
-        yield Table(header, tuple(rows[:ROWS_SHOWN]))
-        yield f"and {len(rows) - ROWS_SHOWN} more channels" if len(rows) > ROWS_SHOWN else ""
+        yield from first_rows(header, rows, "channels")
 
     def plot(self, ax: Any = None) -> Any:
         """Return the two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.display import Shown, Table
+from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delays import DelayFree, eliminate
@@ -362,9 +362,8 @@ class LinearModel(Shown):
             lines.append(f"at the {self.provenance['values']}")
         yield "\n".join(lines)
         modes = [m for m in self.modes() if m.eigenvalue.imag >= 0]
-        rows = [(_eigenvalue(m.eigenvalue), m.frequency_hz, m.damping, m.dominant) for m in modes[:20]]
-        yield Table(("eigenvalue, 1/s", "Hz", "damping", "mostly"), tuple(rows))
-        yield f"and {len(modes) - 20} more modes" if len(modes) > 20 else ""
+        rows = [(_eigenvalue(m.eigenvalue), m.frequency_hz, m.damping, m.dominant) for m in modes]
+        yield from first_rows(("eigenvalue, 1/s", "Hz", "damping", "mostly"), rows, "modes", 20)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists, with names, units, operating point and provenance."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.display import Shown, Table
+from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, homotopy, newton, weights
@@ -24,8 +24,6 @@ Side = Literal["here", "below", "above"]
 Branch = Literal["own", "unconnected", "other", "trimmed"]
 ZERO = 1e-8
 """An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
-ROWS_SHOWN = 40
-"""Values listed on the screen of a point."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,8 +58,7 @@ class OperatingPoint(Shown):
         yield f"Operating point of {self.model.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
         parts = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
         rows = tuple((n, kind, v) for kind, values in parts for n, v in values.items())
-        yield Table(("name", "kind", "value"), rows[:ROWS_SHOWN])
-        yield f"and {len(rows) - ROWS_SHOWN} more" if len(rows) > ROWS_SHOWN else ""
+        yield from first_rows(("name", "kind", "value"), rows)
         yield "\n".join([x.text for x in self.active_limits] or ["no limit is active"])
         yield "\n".join(self.notes)
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.display import Shown, Table, axes_of
-from hvdc_ident.errors import ComputationError, InputError, StudyError
+from hvdc_ident.display import Shown, Table, axes_of, library
+from hvdc_ident.errors import ComputationError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -104,18 +104,16 @@ def morris(
     ranges: (min, max) by parameter, in its unit. A trajectory with a failed run is left out and counted. Other arguments
     as in `sweep`. Raises InputError where SALib is not installed, ComputationError where no trajectory is whole.
     """
-    _installed()
+    library("SALib", "global screening", "'hvdc_ident[screening]'")
     from SALib.analyze import morris as analyse
     from SALib.sample import morris as sample
 
     problem = _problem(ranges, trajectories)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        x = np.asarray(sample.sample(problem, trajectories, num_levels=LEVELS, seed=seed), dtype=float)
+    points = _points(sample.sample, problem, trajectories, num_levels=LEVELS, seed=seed)
     swept = sweep(
         model,
         experiments,
-        Samples(tuple(ranges), x),
+        points,
         against=against,
         outputs=outputs,
         values=values,
@@ -130,11 +128,11 @@ def morris(
     rows = np.repeat(whole, len(ranges) + 1)
 
     def effects(rmse: Array) -> Mapping[str, Any]:
-        return analyse.analyze(problem, x[rows], rmse[rows], num_levels=LEVELS, seed=seed)
+        return analyse.analyze(problem, points.values[rows], rmse[rows], num_levels=LEVELS, seed=seed)
 
     measures = _measures(("mu_star", "mu", "sigma", "mu_star_conf"), effects, swept.rmse)
     failed, dropped = int((~good).sum()), int((~whole).sum())
-    return ScreeningResult("morris", tuple(ranges), swept.series, measures, x.shape[0], failed, dropped)
+    return ScreeningResult("morris", tuple(ranges), swept.series, measures, len(points), failed, dropped)
 
 
 def sobol(
@@ -155,20 +153,18 @@ def sobol(
     samples: a power of 2. Other arguments as in `morris`. Raises InputError where SALib is not installed,
     ComputationError where a run fails: the indices need every one.
     """
-    _installed()
+    library("SALib", "global screening", "'hvdc_ident[screening]'")
     from SALib.analyze import sobol as analyse
     from SALib.sample import sobol as sample
 
     if samples < 2 or samples & (samples - 1):
         raise StudyError("the number of samples is wrong", where="sobol", expected="a power of 2", got=str(samples))
     problem = _problem(ranges, samples)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        x = np.asarray(sample.sample(problem, samples, calc_second_order=False, seed=seed), dtype=float)
+    points = _points(sample.sample, problem, samples, calc_second_order=False, seed=seed)
     swept = sweep(
         model,
         experiments,
-        Samples(tuple(ranges), x),
+        points,
         against=against,
         outputs=outputs,
         values=values,
@@ -179,7 +175,7 @@ def sobol(
     if failed:
         raise ComputationError(
             "Sobol's indices need every run",
-            got=f"{failed} of {x.shape[0]} failed; {next(iter(swept.failed.values()), '')}",
+            got=f"{failed} of {len(points)} failed; {next(iter(swept.failed.values()), '')}",
             hint="narrower ranges, or morris",
         )
 
@@ -187,17 +183,7 @@ def sobol(
         return analyse.analyze(problem, rmse, calc_second_order=False, seed=seed)
 
     measures = _measures(("S1", "ST", "S1_conf", "ST_conf"), indices, swept.rmse)
-    return ScreeningResult("sobol", tuple(ranges), swept.series, measures, x.shape[0])
-
-
-def _installed() -> None:
-    """Raise InputError where SALib is missing."""
-    try:
-        import SALib  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "global screening needs SALib, which is not installed", hint="pip install 'hvdc_ident[screening]'"
-        ) from None
+    return ScreeningResult("sobol", tuple(ranges), swept.series, measures, len(points))
 
 
 def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str, Any]:
@@ -210,6 +196,13 @@ def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str,
             got=f"{', '.join(wrong) or len(ranges)}; {count} samples",
         )
     return {"num_vars": len(ranges), "names": list(ranges), "bounds": [list(map(float, r)) for r in ranges.values()]}
+
+
+def _points(sample: Callable[..., Any], problem: Mapping[str, Any], count: int, **options: Any) -> Samples:
+    """Return the points that SALib draws in the ranges, its warnings silenced."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Samples(tuple(problem["names"]), sample(problem, count, **options))
 
 
 def _measures(names: Sequence[str], analyse: Callable[[Array], Mapping[str, Any]], rmse: Array) -> FrozenMap[Array]:
