@@ -29,7 +29,7 @@ from hvdc_ident.fit.multistart import (
     search_clock_offsets,
     whitened_by_residuals,
 )
-from hvdc_ident.fit.noise_model import source_of, source_text
+from hvdc_ident.fit.noise_model import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
 from hvdc_ident.fit.objective import predicted_reduction
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
@@ -95,8 +95,9 @@ def _result(
         r, _ = problem.residual(trend.theta)
         best = LocalMinimum(trend.theta, 0.5 * float(r @ r))
         # An end in another local minimum of this trend is no other optimum.
-        threshold = threshold_of(problem, residual_at(problem, best.theta))
-        rivals = [r for r in rivals if not trend.holds(r.theta, threshold)]
+        if rivals:
+            threshold = threshold_of(problem, residual_at(problem, best.theta))
+            rivals = [end for end in rivals if not trend.holds(end.theta, threshold)]
     blocks = problem.blocks(best.theta)
     inner, everything = (u.on_trend(trend, problem.names) for u in _uncertainties(problem, best.theta, blocks))
     samples = sum(b.residual.size for b in blocks)
@@ -105,14 +106,13 @@ def _result(
     if trend is not None:
         optima = [best, *(o for o in optima if o is not best)]
     outcomes = _outcomes(problem, points, runs, weigh=problem is not first)
-    status, message = _status(problem, best, optima, outcomes, effective_share, trend, refitted=refitted)
+    near = [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
+    status, message = _status(problem, best, near, outcomes, effective_share, trend, refitted=refitted)
     noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
     inner, everything = inner.widened(judged.widening), everything.widened(judged.widening)
     estimates = estimates_of(problem, best.theta, blocks, inner, everything)
-    estimates = _with_rivals(
-        problem, estimates, [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
-    )
+    estimates = _with_rivals(problem, estimates, near)
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     in_time = blocks if problem.band is None else problem.blocks(best.theta, derivatives=False, in_time=True)
     return problem, FitResult(
@@ -176,15 +176,16 @@ def _uncertainties(problem: Problem, theta: Array, blocks: Sequence[ResidualBloc
             for b in blocks
         ]
     names = problem.names
-    source = {o: source_of(problem.fitted_experiments, o) for o in problem.outputs}
     spans = np.array([u.span for u in problem.unknowns])
-    inside = [i for i, (u, v) in enumerate(zip(problem.unknowns, theta, strict=True)) if u.min < v < u.max]
+    inside = [i for i, (u, v) in enumerate(zip(problem.unknowns, theta, strict=True)) if not u.on_bound(v)]
     _, prior = problem.prior(theta)
-    everything = uncertainty(blocks, names, spans, source, prior, problem.noise_dof)
+    everything = uncertainty(blocks, names, spans, problem.noise_source, prior, problem.noise_dof)
     if len(inside) == len(names):
         return everything, everything
     fewer = [replace(b, jacobian=b.jacobian[:, inside]) for b in blocks]
-    inner = uncertainty(fewer, [names[i] for i in inside], spans[inside], source, prior[:, inside], problem.noise_dof)
+    inner = uncertainty(
+        fewer, [names[i] for i in inside], spans[inside], problem.noise_source, prior[:, inside], problem.noise_dof
+    )
     return inner, everything
 
 
@@ -203,7 +204,7 @@ def _outcomes(
 def _status(
     problem: Problem,
     best: LocalMinimum,
-    optima: Sequence[LocalMinimum],
+    near: Sequence[LocalMinimum],
     outcomes: Sequence[StartOutcome],
     effective_share: float,
     trend: Trend | None,
@@ -212,7 +213,8 @@ def _status(
 ) -> tuple[Status, str]:
     """Return the status of the whole fit and its reason, worst first.
 
-    refitted: whether the optimum was found once more in other weights than the runs had. trend: where the cost is nonsmooth.
+    near: other optima that are as good. refitted: whether the optimum was found once more in other weights than the runs
+    had. trend: where the cost is nonsmooth.
     """
     jump = 0.0 if trend is None else LUCK * trend.roughness
     lower = [o for o in outcomes if o.cost is not None and (best.cost - jump - o.cost) * effective_share > DISTINCT]
@@ -231,11 +233,10 @@ def _status(
         )
     if not refitted and trend is None and not _is_optimum(problem, best, arrived):
         return "not-converged", f"the best run did not reach an optimum: {arrived[0].message}"
-    near = [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
     if near:
         theta = ", ".join(f"{n} = {v:.6g}" for n, v in zip(problem.names, near[0].theta, strict=True))
         return "two-optima", f"another optimum is as good (cost higher by {near[0].cost - best.cost:.3g}): {theta}"
-    at_bound = [f.name for f, v in zip(problem.unknowns, best.theta, strict=True) if not f.min < v < f.max]
+    at_bound = [f.name for f, v in zip(problem.unknowns, best.theta, strict=True) if f.on_bound(v)]
     if at_bound:
         return "at-bound", f"on a bound: {', '.join(at_bound)}"
     if refitted:

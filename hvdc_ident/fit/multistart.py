@@ -16,7 +16,7 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import MAD, MISFIT, autoregression, before_event, floor_of, source_of
+from hvdc_ident.fit.noise_model import MAD, MISFIT, autoregression, before_event, floor_of
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers import catalogue
 from hvdc_ident.fit.optimisers import optimiser as named
@@ -250,7 +250,7 @@ def reweighted(
     ends: the best first. One output: the optimum does not depend on its weight. Several: fitted again until the weights
     stand (1 %).
     """
-    unknown = [o for o in problem.outputs if source_of(problem.fitted_experiments, o) == MISFIT]
+    unknown = [o for o, source in problem.noise_source.items() if source == MISFIT]
     if not unknown:
         return problem, ends[0], list(ends[1:])
     best = ends[0]

@@ -42,11 +42,10 @@ def from_misfit(source: str) -> bool:
 
 def _has_quiet_rows(experiments: Sequence[Experiment], output: str) -> bool:
     """Return whether every record of an output has enough rows before its event to estimate its noise from."""
-    measured = [e for e in experiments if output in e.outputs and e.measured is not None]
     counts = [
         0 if e.event is None else int(np.isfinite(e.measured[output][e.time < e.event]).sum())
-        for e in measured
-        if e.measured is not None
+        for e in experiments
+        if output in e.outputs and e.measured is not None
     ]
     return min(counts, default=0) >= FEWEST_QUIET
 

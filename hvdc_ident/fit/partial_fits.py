@@ -237,7 +237,7 @@ def _row(free: FitParameter, results: Mapping[str, FitResult]) -> dict[str, Any]
         rows[run]["status"] = result.status
     ended = [r for r in rows.values() if r["status"] in ("converged", "at-bound")]
     inside = np.array([r["value"] for r in ended if r["std"] is not None], dtype=float)
-    on_bound = sum(r["value"] is not None and not free.min < r["value"] < free.max for r in ended)
+    on_bound = sum(r["value"] is not None and free.on_bound(r["value"]) for r in ended)
     return {"experiments": rows, "on_bound": on_bound, **spread(inside)}
 
 
@@ -255,13 +255,14 @@ def spread(values: Array) -> dict[str, Any]:
     if n < 2:
         return table
     mean, std = table["mean"], float(values.std(ddof=1))
-    one = half_width(std, n) * math.sqrt(n + 1.0)
+    half = half_width(std, n)
+    one = half * math.sqrt(n + 1.0)
     return table | {
         "std": std,
         "variance": std**2,
         "cv": std / abs(mean) if mean else None,
         "ci95": [mean - one, mean + one],
-        "ci95_of_mean": [mean - half_width(std, n), mean + half_width(std, n)],
+        "ci95_of_mean": [mean - half, mean + half],
     }
 
 

@@ -115,6 +115,11 @@ class Problem:
         return tuple(dict.fromkeys(o for e in self.fitted_experiments for o in e.outputs))
 
     @cached_property
+    def noise_source(self) -> FrozenMap[str]:
+        """Source of each output's standard deviation: "given" or "misfit", see `source_of`."""
+        return FrozenMap({o: source_of(self.fitted_experiments, o) for o in self.outputs})
+
+    @cached_property
     def outputs_in_time(self) -> tuple[str, ...]:
         """Outputs of recordings in time, without parts of measured frequency responses."""
         return tuple(dict.fromkeys(o for e in self.fitted_experiments if e.domain == "time" for o in e.outputs))

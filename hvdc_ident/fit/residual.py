@@ -18,7 +18,7 @@ from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
 from hvdc_ident.fit.noise_model import AR, GAP, segments, whitened
-from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, WithStates, observe
+from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, observe, states_of
 from hvdc_ident.immutable import FrozenMap
 
 Band = tuple[float, float]
@@ -297,7 +297,7 @@ def transformed(signal: Array, time: Array, band: Band, where: str) -> Array:
 def unknown_initial_states(simulator: Simulator, experiment: Experiment) -> tuple[str, ...]:
     """Return the states whose start is neither given nor estimated; none of a simulator that does not show its states."""
     known = {*experiment.starts, *experiment.nuisance}
-    return tuple(n for n in simulator.states if n not in known) if isinstance(simulator, WithStates) else ()
+    return tuple(n for n in states_of(simulator) if n not in known)
 
 
 def with_steady_start(

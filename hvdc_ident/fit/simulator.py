@@ -131,7 +131,7 @@ def unit_of(simulator: Simulator, nuisance: str) -> str:
     """Return the unit of a nuisance."""
     if nuisance == TIME_SHIFT:
         return "s"
-    for names in (simulator.parameters, _inputs(simulator), _states(simulator)):
+    for names in (simulator.parameters, _inputs(simulator), states_of(simulator)):
         if nuisance in names:
             return str(names[nuisance].unit)
     return ""
@@ -142,14 +142,14 @@ def _inputs(simulator: Simulator) -> Mapping[str, Input]:
     return simulator.inputs if isinstance(simulator, WithInputs) else {}
 
 
-def _states(simulator: Simulator) -> Mapping[str, Any]:
+def states_of(simulator: Simulator) -> Mapping[str, Any]:
     """Return the states whose start may be given; none of a simulator that does not name them."""
     return simulator.states if isinstance(simulator, WithStates) else {}
 
 
 def _nuisance_parameter(simulator: Simulator, experiment: Experiment, nuisance: str) -> FitParameter:
     name, where = unknown_of(experiment.name, nuisance), f"experiment '{experiment.name}'"
-    inputs, states = _inputs(simulator), _states(simulator)
+    inputs, states = _inputs(simulator), states_of(simulator)
     if nuisance in simulator.parameters and nuisance != TIME_SHIFT:
         search = dict(zip(("start", "min", "max"), experiment.search.get(nuisance, ()), strict=False))
         return FitParameter.of(name, simulator.parameters[nuisance], **search)
@@ -231,7 +231,7 @@ def _with_nuisances(
     The instants begin where the record begins. The outputs keep their names, for they decide what is computed.
     """
     own = {n: v for n, v in nuisance.items() if n in simulator.parameters}
-    starts = {n: v for n, v in nuisance.items() if n in _states(simulator) and n not in own}
+    starts = {n: v for n, v in nuisance.items() if n in states_of(simulator) and n not in own}
     offsets = {n: v for n, v in nuisance.items() if n != TIME_SHIFT and n not in own and n not in starts}
     simulated, time, rows = experiment, experiment.time, None
     if TIME_SHIFT in nuisance:

@@ -242,7 +242,7 @@ def estimates_of(
     gradient = jacobian.T @ problem.loss.psi(r)
     prior, rows = problem.prior(theta)
     gradient += rows.T @ prior
-    bound = [u.name for u, v in zip(problem.unknowns, theta, strict=True) if not u.min < v < u.max]
+    bound = [u.name for u, v in zip(problem.unknowns, theta, strict=True) if u.on_bound(v)]
     parameters = problem.simulator.parameters
     nuisances = {unknown_of(e.name, n): n for e in problem.fitted_experiments for n in e.nuisance}
     estimates = {}

@@ -15,6 +15,7 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.frequency_data import in_time
+from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Input
@@ -206,7 +207,7 @@ def half_widths(matrix: Array, per_std: Array, names: Sequence[str], error: floa
     Where only combinations are seen, as few as possible are taken as known, and those have None. per_std: (p,) half-width
     of a scaled coordinate whose standard deviation is 1, in the parameter's unit.
     """
-    kept = sorted(independent(matrix, error))
+    kept = independent(matrix, error)
     found: dict[str, float | None] = dict.fromkeys(names)
     if kept:
         std = standard_deviations(matrix[np.ix_(kept, kept)])
@@ -307,7 +308,7 @@ def recommend(
         return None
     template = max(recordings, key=lambda e: float(np.ptp(e.time)))
     values, of_inputs = {n: i.value for n, i in inputs.items()}, {n: i.unit for n, i in inputs.items()}
-    tried = _Ranking(whole)
+    tried = _Ranking(whole, template)
     singles = list(single_input_designs(recordings, values, of_inputs, template))
     ranked = list(tried.ranked(singles))
     steps: dict[str, ExperimentDesign] = {}  # the best single steps, each of another input
@@ -322,7 +323,7 @@ def recommend(
     by_determinant = max(
         ranked, key=lambda r: (r.criteria.directions, r.criteria.log_determinant, -len(r.design.moves))
     )
-    usual = float(np.median(list(thresholds.values()))) if thresholds else 1.92
+    usual = float(np.median(list(thresholds.values()))) if thresholds else TWO_SIDED
     per_std = whole.slope[: len(whole.names)] * np.sqrt([2.0 * thresholds.get(n, usual) for n in whole.names])
     now, then = (half_widths(m, per_std, whole.names, whole.error) for m in (base, base + best.gain))
     at = FrozenMap({n: whole.value(n) for n in whole.names})
@@ -335,10 +336,10 @@ def recommend(
 
 
 class _Ranking:
-    """Designs run and weighed, each with the signals recorded so far and with one more."""
+    """Designs run and weighed, each with the signals recorded so far and with one more. template: the record they are made of."""
 
-    def __init__(self, whole: LocalAnalysis) -> None:
-        self.whole = whole
+    def __init__(self, whole: LocalAnalysis, template: Experiment) -> None:
+        self.whole, self.template = whole, template
         self.base = whole.information.matrix
         self.recorded = whole.problem.outputs_in_time
         self.now = optimality(self.base, whole.error)
@@ -369,8 +370,7 @@ class _Ranking:
     def _gains(self, design: ExperimentDesign) -> dict[str, Array]:
         """Return the information of each output of the run, in scaled coordinates."""
         problem, names = self.whole.problem, self.whole.names
-        template = max(in_time(problem.fitted_experiments), key=lambda e: float(np.ptp(e.time)))
-        run = problem.simulator.simulate(design.experiment(template), problem.values(self.whole.theta), names)
+        run = problem.simulator.simulate(design.experiment(self.template), problem.values(self.whole.theta), names)
         found = {}
         for output in run.trajectory.names:
             gradient = run.gradient(output) * self.whole.slope[: len(names)]

@@ -20,14 +20,14 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.multistart import misfit_weights
-from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit, source_of
+from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.nonsmooth import Trend
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
-from hvdc_ident.identifiability.structural import combinations_of, parameter_directions
+from hvdc_ident.identifiability.structural import combinations_of, parameter_directions, scaled_slope
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import Information, independent, marginal, standard_deviations
 from hvdc_ident.text import listed, quantity
@@ -71,8 +71,7 @@ class LocalAnalysis:
     @cached_property
     def slope(self) -> Array:
         """(p,): length of a scaled coordinate's unit: the value where a parameter is positive, else the range."""
-        rows = [v if u.min > 0 else u.span for u, v in zip(self.problem.unknowns, self.theta, strict=True)]
-        return np.array(rows, dtype=float)
+        return scaled_slope(self.problem, self.theta)
 
     @cached_property
     def columns(self) -> Array:
@@ -93,16 +92,16 @@ class LocalAnalysis:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Covariance from the curvature, corrected for correlated samples."""
-        source = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
         spans = np.array([u.span for u in self.problem.unknowns])
-        known = uncertainty(self.blocks, self.problem.names, spans, source, noise_dof=self.problem.noise_dof)
+        known = uncertainty(
+            self.blocks, self.problem.names, spans, self.problem.noise_source, noise_dof=self.problem.noise_dof
+        )
         return known.on_trend(self.trend, self.problem.names)
 
     @property
     def deterministic(self) -> tuple[str, ...]:
         """Outputs whose standard deviation is the misfit's, for their noise is not known."""
-        experiments = self.problem.fitted_experiments
-        return tuple(o for o in self.problem.outputs if source_of(experiments, o) == MISFIT)
+        return tuple(o for o, source in self.problem.noise_source.items() if source == MISFIT)
 
     @cached_property
     def misfit(self) -> float:
@@ -114,8 +113,7 @@ class LocalAnalysis:
     def excess(self) -> float:
         """The misfit where `fit.adequacy` calls it larger than the noise told, else 1; 1 without noise."""
         known = self.uncertainty
-        sources = {o: source_of(self.problem.fitted_experiments, o) for o in self.problem.outputs}
-        return adequacy(self.problem, self.blocks, sources, known.effective, known.rho).widening
+        return adequacy(self.problem, self.blocks, self.problem.noise_source, known.effective, known.rho).widening
 
     def value(self, name: str) -> float:
         """The value of an unknown, in its unit."""
@@ -178,13 +176,12 @@ def at_given_values(problem: Problem) -> tuple[LocalAnalysis, FitResult]:
     """
     message = "no pilot fit, for the structure leaves no candidate to fit"
     try:
-        unknown = [o for o in problem.outputs if source_of(problem.fitted_experiments, o) != GIVEN]
+        unknown = [o for o, source in problem.noise_source.items() if source != GIVEN]
         weights = misfit_weights(problem, problem.given, unknown)
     except SimulationError as error:
         raise _failure(problem, str(error)) from None
     weighted = problem.with_(weights={**problem.weights, **weights})
-    source = FrozenMap({o: source_of(problem.fitted_experiments, o) for o in problem.outputs})
-    result = FitResult("failed", message, (), FrozenMap(), FrozenMap(problem.held), noise_source=source)
+    result = FitResult("failed", message, (), FrozenMap(), FrozenMap(problem.held), noise_source=problem.noise_source)
     return LocalAnalysis(weighted, problem.given), result
 
 

@@ -185,6 +185,11 @@ class StructuralAnalysis:
         return tuple(dict.fromkeys(n for c in self.combinations for n in c.members))
 
 
+def scaled_slope(problem: Problem, theta: Array) -> Array:
+    """Return the length of a scaled coordinate's unit, (p,): the value where an unknown is positive, else its range."""
+    return np.array([v if u.min > 0 else u.span for u, v in zip(problem.unknowns, theta, strict=True)], dtype=float)
+
+
 def rank_analysis(problem: Problem, seed: int = 0, *, wide: bool = False) -> StructuralAnalysis:
     """Return the structure from the rank of the whitened sensitivities at the start and at five random points in the bounds.
 
@@ -204,8 +209,7 @@ def rank_analysis(problem: Problem, seed: int = 0, *, wide: bool = False) -> Str
         except SimulationError as e:
             failures += [e.what] if k < POINTS else []
             continue
-        slope = [v if u.min > 0 else u.span for u, v in zip(problem.unknowns, theta, strict=True)]
-        jacobians.append(jacobian * np.array(slope))
+        jacobians.append(jacobian * scaled_slope(problem, theta))
     if not jacobians:
         return StructuralAnalysis("not decided", METHOD, names, note="no random point could be simulated")
     lengths = [np.linalg.norm(j, axis=0) for j in jacobians]
