@@ -30,7 +30,6 @@ def compile_fmu(path: Path, target: Path | None = None) -> Path:
     does not. Raises InputError without sources, without a compiler or where the target exists, ComputationError where
     the compiler refuses the sources.
     """
-
     new = target or path.with_name(f"{path.stem}-compiled.fmu")
     names = check_archive(path)
     if not has_sources(names):
@@ -87,10 +86,7 @@ def _binary(command: list[str], at: Path, sets: list[Any], path: Path, identifie
     library = at / f"{identifier}.library"
     line = [*command, "-shared", "-fPIC", "-O2", "-w", *standard, *defines, *(f"-I{f}" for f in folders),
             *map(str, files), "-lm", "-o", str(library)]  # fmt: skip
-    try:
-        run = subprocess.run(line, cwd=at, capture_output=True, text=True, timeout=SECONDS, check=False)
-    except (OSError, subprocess.TimeoutExpired) as e:
-        raise ComputationError("the C compiler did not run", where=shlex.join(command), got=str(e)[:200]) from None
+    run = _run(line, at, where=shlex.join(command))
     if run.returncode or not library.is_file():
         errors = re.findall(r"error: (.*)", run.stderr) or run.stderr.strip().splitlines() or [f"code {run.returncode}"]
         raise ComputationError(
@@ -100,6 +96,14 @@ def _binary(command: list[str], at: Path, sets: list[Any], path: Path, identifie
             hint="its maker knows which headers or compiler they need; else have it exported for this machine",
         )
     return library.read_bytes()
+
+
+def _run(line: list[str], at: Path, where: str) -> subprocess.CompletedProcess[str]:
+    """Return the run of the compiler in a folder, whatever its exit code. Raises ComputationError where it did not run."""
+    try:
+        return subprocess.run(line, cwd=at, capture_output=True, text=True, timeout=SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as e:
+        raise ComputationError("the C compiler did not run", where=where, got=str(e)[:200]) from None
 
 
 def _write(path: Path, new: Path, built: dict[str, bytes]) -> None:
@@ -122,7 +126,6 @@ def _write(path: Path, new: Path, built: dict[str, bytes]) -> None:
 
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
-SECONDS = 600
 
 
 def compiler() -> list[str] | None:
@@ -160,10 +163,7 @@ def compiled(command: list[str], sources: Mapping[str, str], identifier: str) ->
         library = at / f"{identifier}{library_suffix()}"
         files = [n for n in sources if n.endswith(".c")]
         line = [*command, *FLAGS, *shlex.split(os.environ.get("CFLAGS", "")), "-o", library.name, *files, "-lm"]
-        try:
-            run = subprocess.run(line, cwd=at, capture_output=True, text=True, timeout=SECONDS, check=False)
-        except (OSError, subprocess.TimeoutExpired) as e:
-            raise ComputationError("the C compiler did not run", where=command[0], got=str(e)[:200]) from None
+        run = _run(line, at, where=command[0])
         if run.returncode or not library.is_file():
             got = " ".join(run.stderr.split())[:300]
             raise ComputationError(

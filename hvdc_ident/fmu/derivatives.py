@@ -1,6 +1,6 @@
 """Derivatives of an FMU: directional derivatives and the Jacobian at a point, and differences of whole runs.
 
-DirectionalDerivative derivatives are used where the FMU offers them and they agree with differences. In worker processes only.
+Directional derivatives are used where the FMU offers them and they agree with differences. In worker processes only.
 
 A run has noise (its integrator's, and that of rows which an event passes): fourth differences over short steps of all
 parameters at once show it. A pair of runs around a parameter then gives its derivative, and the curvature from which the
@@ -26,8 +26,8 @@ AGREES = 1e-5  # of a row's largest entry: directional derivatives that differ b
 class DirectionalDerivative:
     """Derivatives of some unknowns along directions of some knowns.
 
-    What is its own known (an output that is a state, the derivative of a position that is the velocity's state) has
-    the identity, whatever the FMU says: some answer 0 there. A value reference that stands twice is asked for once.
+    An unknown that is itself a known (an output that is a state, the derivative of a position that is the velocity's
+    state) has the identity, whatever the FMU says: some answer 0 there. A value reference that stands twice is asked for once.
     """
 
     def __init__(self, instance: Instance, unknowns: Sequence[int], knowns: Sequence[int]) -> None:
@@ -58,7 +58,7 @@ class DirectionalDerivative:
 
 
 class VariationalEquations:
-    """DirectionalDerivative derivatives for the sensitivities of a run by some parameters, or by constants added to inputs."""
+    """Directional derivatives for the sensitivities of a run by some parameters, or by constants added to inputs."""
 
     def __init__(
         self, instance: Instance, parameters: Sequence[str], sizes: Sequence[float], outputs: Sequence[str]

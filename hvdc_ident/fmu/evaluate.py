@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known, unknown_name
-from hvdc_ident.fmu.model import FmuModel
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate import Simulation, Statistics, Tolerance
+from hvdc_ident.simulate import Simulation, Statistics, Tolerance, chains_of
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
@@ -46,14 +45,16 @@ def simulate(
     partial: bool = False,
 ) -> Simulation:
     """The run, with its recording chains and effects. See `FmuModel.simulate`."""
-    from hvdc_ident.fmu.terminal_effects import chains, simulate_with_effects
+    from hvdc_ident.fmu.terminal_effects import TerminalRun
 
     place = f"experiment '{experiment.name}'"
     given = {**experiment.values, **values}
     names = tuple(model.outputs if outputs is None else outputs)
     try:
         checked = (
-            model.recording((*names, *experiment.instrument)).driven(experiment.drive).with_effects(chains(experiment))
+            model.recording((*names, *experiment.instrument))
+            .driven(experiment.drive)
+            .with_effects(chains_of(experiment.instrument))
         )
     except InputError as e:
         raise e.at(place) from None
@@ -75,7 +76,7 @@ def simulate(
     require_known("input", experiment.offsets, checked.inputs, f"{place}, offsets")
     try:
         if checked.effects:
-            return simulate_with_effects(checked, experiment, given, sensitivities, names, tolerance)
+            return TerminalRun(checked, experiment, given, names, tolerance).simulation(sensitivities)
         return bare(checked, experiment, given, sensitivities, names, tolerance, partial=partial and not sensitivities)
     except HvdcIdentError as e:
         raise e.at(place) from None

@@ -90,7 +90,7 @@ def failure(error: Exception, messages: Sequence[str] = ()) -> RunFailed:
 class Instance:
     """An FMU with an instance, brought to the start of a run again and again.
 
-    learned: what was found out about the FMU, see `hvdc_ident.fmu.instance`; a restart that is not learned yet is by a
+    learned: what was found out about the FMU, see `find_reuse`; a restart that is not learned yet is by a
     new instance.
     """
 

@@ -16,7 +16,7 @@ from hvdc_ident.data import Array, InputSignal
 class PackedInputs:
     """Piecewise linear inputs with jumps, one after the other.
 
-    sizes: (nu,) points of each. times, values: the points, sampling_grid. breaks: instants an integrator has to stop at, s.
+    sizes: (nu,) points of each. times, values: the points, joined. breaks: instants an integrator has to stop at, s.
     """
 
     sizes: Array
@@ -27,12 +27,12 @@ class PackedInputs:
     @classmethod
     def of(cls, inputs: Sequence[InputSignal]) -> PackedInputs:
         """The signals of some inputs."""
-        sampling_grid = np.concatenate([np.empty(0), *(i.breaks for i in inputs)])
+        breaks = np.concatenate([np.empty(0), *(i.breaks for i in inputs)])
         return cls(
             np.array([i.times.size for i in inputs], dtype=float),
             np.concatenate([np.empty(0), *(i.times for i in inputs)]),
             np.concatenate([np.empty(0), *(i.values for i in inputs)]),
-            np.unique(sampling_grid),
+            np.unique(breaks),
         )
 
     def each(self) -> list[tuple[Array, Array]]:
@@ -151,7 +151,7 @@ def signal_of(time: Array, values: Array, breaks: Array) -> InputSignal:
 
 
 def kept_rows(time: Array, values: Array) -> NDArray[np.bool_]:
-    """Which rows a signal keeps: of three at one instant the middle one is passed through in no time."""
+    """Return which rows a signal keeps: of three at one instant the middle one is passed through in no time."""
     _, moved = _jumps(time, values)
     keep = np.ones(time.size, dtype=bool)
     keep[1:-1] = ~((moved[1:-1] == moved[:-2]) & (moved[1:-1] == moved[2:]))
@@ -159,7 +159,7 @@ def kept_rows(time: Array, values: Array) -> NDArray[np.bool_]:
 
 
 def _jumps(time: Array, values: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Which intervals are jumps, and the instants with those intervals closed."""
+    """Return which intervals are jumps, and the instants with those intervals closed."""
     short = 1e-6 * max(float(time[-1] - time[0]), 1e-300) / FIRST
     steep = (np.diff(time) <= short) & (np.abs(np.diff(values)) > HOLDS * max(float(np.ptp(values)), 1e-300))
     moved = time.copy()

@@ -1,7 +1,7 @@
 """Effects at an FMU's terminals: its inputs pass through them before they enter, its outputs before they are recorded.
 
 The effects are those of the catalogue, in a model that passes signals u0, u1 ... through to y0, y1 ..., which the engine
-simulates. PackedInputs between it and the FMU are piecewise linear: inputs on a grid refined until lines hold to 1e-5 of their
+simulates. Signals between it and the FMU are piecewise linear: inputs on a grid refined until lines hold to 1e-5 of their
 range, outputs on the experiment's rows, or on at least FINE rows where an effect has memory. An effect at an input that
 reads an output would close a loop around the FMU: it is refused.
 """
@@ -27,7 +27,7 @@ from hvdc_ident.fmu.piecewise_linear import kept_rows, refined, sampling_grid, s
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate import Simulation, Tolerance, chains_of
+from hvdc_ident.simulate import Simulation, Tolerance
 from hvdc_ident.simulate import simulate as engine_run
 
 if TYPE_CHECKING:
@@ -43,11 +43,6 @@ JUMP = 2.0
 """How many times as large as on the other side a change is where a jump is in it, at a row that one passes over."""
 BRIEF = 0.02
 """Share of the run that the largest value of a slope would have to last for as much as the slope comes to in all."""
-
-
-def chains(experiment: Experiment) -> list[EffectUse]:
-    """The experiment's recording chains as effects."""
-    return chains_of(experiment.instrument)
 
 
 def with_effects(model: FmuModel, uses: Iterable[Any]) -> FmuModel:
@@ -73,20 +68,8 @@ def _free_prefix(model: FmuModel, use: EffectUse) -> str:
     return next(p for p in tried if not any(f"{p}_{n}" in model.parameters for n in names))
 
 
-def simulate_with_effects(
-    model: FmuModel,
-    experiment: Experiment,
-    given: Mapping[str, float],
-    sensitivities: tuple[str, ...],
-    names: tuple[str, ...],
-    tolerance: Tolerance,
-) -> Simulation:
-    """The run with everything at the ends, and its derivatives by parameters of the FMU and of the effects."""
-    return _Ends(model, experiment, given, names, tolerance).simulation(sensitivities)
-
-
-class _Ends:
-    """One run through entrance, FMU and exit."""
+class TerminalRun:
+    """One run with the effects at the inputs, the FMU, and the effects at its outputs."""
 
     def __init__(
         self,
@@ -198,7 +181,7 @@ class _Ends:
         return replace(found, parameters=names, gradients=found.gradients[:, :, columns])
 
     def _key(self, inputs: Mapping[str, InputSignal], along: Mapping[str, Direction]) -> bytes:
-        """What decides a run, and in which ways its inputs move."""
+        """Return a key of what decides a run, and of the ways in which its inputs move."""
         values = sorted(changed(self.model, self.given).items())
         text = repr((values, self.raw, self.tolerance.rtol, _digest(inputs), sorted(along))).encode()
         return b"".join([self.time.tobytes(), text, *(along[n].points.tobytes() for n in sorted(along))])

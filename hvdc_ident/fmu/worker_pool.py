@@ -437,7 +437,7 @@ def idle_cores(own: int) -> int:
 
 
 CALL = re.compile(r"\b(fmi[23][A-Z]\w*)\s*\(|\b_(dlopen)\(")
-BOUND = re.compile(r"fmi[23][A-Z]\w*")  # the name of a function bound by `fmu.library`
+BOUND = re.compile(r"fmi[23][A-Z]\w*")  # the name of a function bound by `hvdc_ident.fmu.fmi`
 
 
 def key(name: str, value: float) -> str:

@@ -79,7 +79,7 @@ class ExportedVariables:
 
     @property
     def unknown_at_start(self) -> tuple[ExportedVariable, ...]:
-        """ExportedVariables that initialisation computes: outputs, states and derivatives."""
+        """Variables that initialisation computes: outputs, states and derivatives."""
         states = range(self.first["states"], self.first["outputs"])
         return tuple(v for v in self.all if v.causality == "output" or v.reference in states)
 
@@ -387,13 +387,10 @@ def _structure_2(structure: ET.Element, variables: ExportedVariables) -> None:
 
 
 def _structure_3(structure: ET.Element, variables: ExportedVariables) -> None:
-    def unknowns(kind: str, members: Sequence[ExportedVariable]) -> Iterator[None]:
+    for kind, members in (("Output", variables.outputs), ("ContinuousStateDerivative", variables.derivatives)):
         for v in members:
             known = _dependent(variables.dependencies(v))
-            yield ET.SubElement(structure, kind, {"valueReference": str(v.reference), **known})  # type: ignore[misc]
-
-    list(unknowns("Output", variables.outputs))
-    list(unknowns("ContinuousStateDerivative", variables.derivatives))
+            ET.SubElement(structure, kind, {"valueReference": str(v.reference), **known})
     for v in variables.unknown_at_start:
         ET.SubElement(structure, "InitialUnknown", valueReference=str(v.reference))
     for k in range(variables.program.structure.sizes.ns):
