@@ -17,7 +17,7 @@ from typing import Any, overload
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.errors import InputError, ModelError, require_known, unknown_name
+from hvdc_ident.errors import InputError, ModelError, require_known
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, fresh, insertion_point, insertion_point_of, rewritten
@@ -155,8 +155,7 @@ def apply_effects(model: AnyModel, uses: Iterable[EffectUse | Mapping[str, Any]]
     catalogue = effects()
     for given in uses:
         use = EffectUse.of(given)
-        if use.effect not in catalogue:
-            raise unknown_name("effect", use.effect, catalogue)
+        require_known("effect", [use.effect], catalogue, "")
         model = _with_effect(model, use, catalogue[use.effect])
     return model
 
@@ -172,7 +171,8 @@ def _with_effect(model: Model, use: EffectUse, effect: Effect) -> Model:
     given = {n: use.parameters.get(n, q.value) for n, q in parameters.items()}
     values: dict[str, float] = {}
     for n, v in given.items():
-        require_known("parameter", [v] if isinstance(v, str) else (), model.parameters, f"{where}, parameter '{n}'")
+        if isinstance(v, str):
+            require_known("parameter", [v], model.parameters, f"{where}, parameter '{n}'")
         values[n] = model.parameters[v].value if isinstance(v, str) else float(v)
     if replace(effect, parameters=FrozenMap(parameters)).is_neutral(values):
         return model

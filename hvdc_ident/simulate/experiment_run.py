@@ -36,9 +36,12 @@ def with_recording(model: Model, experiment: Experiment) -> Model:
 
 @lru_cache(maxsize=32)
 def _with_recording(model: Model, drive: tuple[str, ...], instrument: FrozenMap[FrozenMap[float]]) -> Model:
+    driven = model.driven(drive)
+    if not instrument:
+        return driven
     from hvdc_ident.effects import apply_effects  # only runs that see instruments load the effects
 
-    return apply_effects(model.driven(drive), chains_of(instrument))
+    return apply_effects(driven, chains_of(instrument))
 
 
 def chains_of(instrument: FrozenMap[FrozenMap[float]]) -> list[EffectUse]:
@@ -148,9 +151,9 @@ def simulate(
 
     Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
     """
+    tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
     if not isinstance(model, Model):
         chosen = tuple(model.outputs) if outputs is None else outputs
-        tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
         ending = {"partial": True} if partial else {}
         found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
         return found
@@ -175,7 +178,6 @@ def simulate(
             hint="an effect at an infinite neutral value is left out: do not set it",
         )
     signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
-    tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
     scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities]) if sensitivities else None
     try:
         out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale, model=plant)

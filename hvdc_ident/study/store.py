@@ -238,9 +238,10 @@ class CachingExecutor:
 
     def _put(self, key: bytes, value: Any) -> None:
         try:
-            self._job.put(key, packed(value))
+            content = packed(value)
         except TypeError as error:
             raise ComputationError("a result cannot be kept", got=str(error)) from None
+        self._job.put(key, content)
 
 
 def _item_digest(item: Any) -> str:

@@ -38,7 +38,7 @@ IDLE = -1
 LOADED = "hvdc_ident.discrepancy"
 """Module that is loaded once for all workers: it imports what nearly any work needs."""
 ORIGIN = ("sys_path", "sys_argv", "dir", "init_main_from_name", "init_main_from_path")
-"""What a worker takes over from this process, so that it can import what this one has."""
+"""Entries of `spawn.get_preparation_data` that let a worker import what this process can."""
 
 _shared: Supervisor | None = None
 
