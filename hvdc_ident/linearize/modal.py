@@ -152,7 +152,7 @@ def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: f
 
 
 def _hidden(model: LinearModel, right: Array, driven: bool, seen: bool) -> str:
-    """Return a zero eigenvalue that the chosen inputs and outputs do not both reach."""
+    """Return the kind of a zero eigenvalue that the chosen inputs and outputs do not both reach."""
     if model.point is not None and model.point.active_limits:
         state = model.state_names[int(np.argmax(np.abs(right)))]
         row = model.A[model.state_names.index(state)]
@@ -341,7 +341,7 @@ class _Along:
         return replace(self._search, **{key: values})
 
     def matrix(self, value: float) -> Array:
-        """Return a alone at the value's own operating point: the steady state that a simulation starts from there."""
+        """Return A, (states, states), at the value's own operating point: the steady state that a simulation starts from there."""
         search = self._at(value)
         try:
             root, _ = steady(self.model, search)

@@ -98,7 +98,7 @@ def _read(kind: type[Any]) -> FrozenMap[bool]:
 
 
 _fields = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
-"""The same, read once: it is asked for every value of every model that is made."""
+"""`_read`, once a class: it is asked for every value of every model that is made."""
 
 
 def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
@@ -243,7 +243,7 @@ def _check_name(name: object, place: str) -> None:
 
 
 def _expressions(model: Model) -> Iterator[tuple[str, str, str, sp.Expr, bool]]:
-    """Return (section, name, part, expression, whether only parameters may be used) of every expression of the model."""
+    """Yield (section, name, part, expression, whether only parameters may be used) of every expression of the model."""
     for name, state in model.states.items():
         yield "states", name, "", state.derivative, False
         if isinstance(state.start, sp.Expr):

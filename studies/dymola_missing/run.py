@@ -1,4 +1,4 @@
-"""What the phasor link lacks on waveforms computed by Dymola: the diagnosis without hints, and the gap before and after.
+"""Diagnose, without hints, what the phasor link lacks on waveforms computed by Dymola, and the gap before and after.
 
 python studies/dymola_missing/run.py [--workers N] [--pin]
 

@@ -281,6 +281,6 @@ def _named(value: FoundEffect | Rival | Line) -> dict[str, Any]:
 
 
 def _member(value: FoundEffect | Rival) -> dict[str, Any]:
-    """The same, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
+    """Return the line of `_named`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
     out = {k: v for k, v in _named(value).items() if k != "expression" or v}
     return out | ({} if value.late is None else {"late": value.late})
