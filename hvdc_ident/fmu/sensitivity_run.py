@@ -263,14 +263,16 @@ class _ExperimentRun:
         return 0.0 if name in self.inputs or name in self.along else self.values.get(name, self.starts[name])
 
     def _with(self, moved: Mapping[str, float]) -> tuple[dict[str, float], PackedInputs]:
-        """Values and signals of a run with parameters elsewhere, or something added to inputs."""
-        signals = self.signals
-        for name in moved.keys() & self.along.keys():
-            signals = replace(signals, values=signals.values + moved[name] * self.along[name])
-        for name in moved.keys() & set(self.inputs):
-            signals = signals.raised(self.inputs.index(name), moved[name])
-        ours = {n: v for n, v in moved.items() if n not in self.inputs and n not in self.along}
-        return {**self.values, **ours}, signals
+        """Return the values and signals of a run with parameters at other values, or constants added to inputs."""
+        signals, values = self.signals, dict(self.values)
+        for name, value in moved.items():
+            if name in self.along:
+                signals = replace(signals, values=signals.values + value * self.along[name])
+            elif name in self.inputs:
+                signals = signals.raised(self.inputs.index(name), value)
+            else:
+                values[name] = value
+        return values, signals
 
     def _run(self, values: Mapping[str, float], signals: PackedInputs | None = None) -> Array:
         """(n, outputs) of a run without derivatives, checked to be finite; the last one is kept for whoever asks again."""
@@ -358,12 +360,13 @@ class _ExperimentRun:
         if not self.parameters or self.jobs.isolated or not (d.directional and d.states):
             return []
         known = {**d.parameters, **{n: v for n, v in d.inputs.items() if v.continuous}}
-        fit = [n for n in self.parameters if n in known and known[n].kind in ("Real", "Float64")]
+        plain = [n for n in self.parameters if n in known and n not in self.along]
+        fit = [n for n in plain if known[n].kind in ("Real", "Float64")]
         confirmed: dict[str, bool] = self.learned.setdefault("derivatives", {})
         new = [n for n in fit if n not in confirmed]
         if new:
             confirmed |= self._confirmed(new)
-        return [n for n in self.parameters if confirmed.get(n)]
+        return [n for n in fit if confirmed.get(n)]
 
     def _confirmed(self, names: list[str]) -> dict[str, bool]:
         """Return which directional derivatives hold over this whole run.

@@ -180,7 +180,7 @@ class WorkerPool:
             return []
         d, confirmed = self.description, self.learned.get("derivatives", {})
         directions = heading.get("directions", {})
-        if d.directional and d.states and any(confirmed.get(n, n not in directions) for n in names):
+        if d.directional and d.states and any(n not in directions and confirmed.get(n, True) for n in names):
             return []
         count = min(self.limits.workers or idle_cores(self._busy), len(names))
         return [names[i::count] for i in range(count)]
