@@ -79,7 +79,7 @@ Seed = Annotated[
 
 @dataclass(frozen=True)
 class Console:
-    """Where results are told: text on stdout, or JSON there and nothing else; progress goes to stderr."""
+    """The command's output: text on stdout, or JSON there and nothing else; progress goes to stderr."""
 
     json: Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")] = False
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False
@@ -108,7 +108,7 @@ class Console:
 
 @dataclass(frozen=True)
 class Work:
-    """How the stages' work is done."""
+    """Options of the stages' work."""
 
     workers: Annotated[
         int,
@@ -130,7 +130,7 @@ class Work:
 
 @dataclass(frozen=True)
 class FitWork(Work):
-    """How the fit's work is done, and what is fitted against the verdicts."""
+    """Options of the fit's work, and what is fitted against the verdicts."""
 
     force: Annotated[
         list[str] | None,
@@ -144,7 +144,7 @@ class FitWork(Work):
 
 @dataclass(frozen=True)
 class Access:
-    """How the study's model may be loaded: whether its code may run, and the limits of an FMU."""
+    """Options of loading the study's model: whether its code may run, and the limits of an FMU."""
 
     trust: Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")] = False
     deadline: Annotated[

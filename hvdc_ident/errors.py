@@ -19,7 +19,8 @@ Every message says what is wrong, where, what was expected, what was found and w
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 
 
 class HvdcIdentError(Exception):
@@ -41,12 +42,21 @@ class HvdcIdentError(Exception):
         return text + (f". Try: {self.hint}" if self.hint else "")
 
     def at(self, where: str) -> HvdcIdentError:
-        """The same error with an outer place put before its own."""
+        """Return the error with an outer place put before its own."""
         place = f"{where}: {self.where}" if self.where else where
         return type(self)(self.what, where=place, expected=self.expected, got=self.got, hint=self.hint)
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.hint)
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Put a place before that of an InputError that is raised inside."""
+    try:
+        yield
+    except InputError as e:
+        raise e.at(where) from None
 
 
 def _rebuild(kind: type[HvdcIdentError], what: str, where: str, expected: str, got: str, hint: str) -> HvdcIdentError:

@@ -140,7 +140,7 @@ def json_text(value: Any) -> str:
 
 
 def json_pieces(value: Any) -> Iterator[str]:
-    """The same text in pieces, so that long `Rows` under a name of the outermost mapping are never held as a whole."""
+    """Yield the JSON text in pieces, so that long `Rows` under a name of the outermost mapping are never held as a whole."""
     value = plain(value)
     if not (isinstance(value, dict) and any(isinstance(v, Rows) for v in value.values())):
         yield _dumped(value, 1) + "\n"

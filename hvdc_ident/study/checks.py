@@ -11,13 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.data import Experiment
 from hvdc_ident.errors import (
     ComputationError,
     HvdcIdentError,
-    InputError,
     SteadyStateError,
     StudyError,
+    located,
     require_known,
 )
 from hvdc_ident.model import AnyModel, Model
@@ -61,15 +60,11 @@ def check_questions(study: Study, where: str) -> None:
         from hvdc_ident.fit.windowed_errors import tolerance
 
         require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
-        try:
+        with located(where):
             need(s.fit.optimiser)
-        except InputError as e:
-            raise e.at(where) from None
         require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
-        try:
+        with located(f"{where}, fit.tolerance"):
             tolerance(s.fit.tolerance, study.path.parent)
-        except InputError as e:
-            raise e.at(f"{where}, fit.tolerance") from None
     if s.diagnose:
         require_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
         if s.diagnose.effects != "all":
@@ -79,15 +74,15 @@ def check_questions(study: Study, where: str) -> None:
 
 
 def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
-    """Raises where a swept value leaves the model's own bounds."""
-    own = model.parameters[line.parameter]
+    """Raise StudyError where a swept value leaves the model's own bounds."""
+    parameter = model.parameters[line.parameter]
     ends = line.values or [v for v in (line.min, line.max) if v is not None]
     for value in (min(ends), max(ends)):
-        if not own.min <= value <= own.max:
+        if not parameter.min <= value <= parameter.max:
             raise StudyError(
                 f"a value of '{line.parameter}' lies outside the model's own bounds",
                 where=f"{where}, sweep of {line.parameter}",
-                expected=f"values in [{own.min:g}, {own.max:g}]",
+                expected=f"values in [{parameter.min:g}, {parameter.max:g}]",
                 got=f"{value:g}",
             )
 
@@ -168,10 +163,8 @@ def _check_port(port: schema.PortTable, study: Study, where: str) -> None:
     known = [*model.inputs, *model.states, *model.signals, *model.algebraic, *model.parameters]
     for key, texts in (("voltage", port.voltage), ("current", port.current), ("angle", [port.angle])):
         for text in texts:
-            try:
+            with located(f"{where}, {key}"):
                 names = sorted(s.name for s in parse(text).free_symbols)
-            except HvdcIdentError as e:
-                raise e.at(f"{where}, {key}") from None
             require_known("name", names, known, f"{where}, {key}")
 
 
@@ -193,7 +186,7 @@ def need_experiments(study: Study, stage: str, role: str | None = None, *, respo
 
 
 def need_candidates(study: Study, stage: str) -> None:
-    """Raises StudyError where the study names no parameter to estimate."""
+    """Raise StudyError where the study names no parameter to estimate."""
     if not study.candidates:
         known = ", ".join(list(study.model.parameters)[:8])
         hint = f"[parameters] with lines like NAME = {{given = 1, min = 0, max = 10}}; the model has {known}"
@@ -216,10 +209,8 @@ def need_start(study: Study) -> None:
         with suppress(SimulationError):
             simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
     for response in study.responses:
-        try:
+        with located(f"response '{response.name}'"):
             response.of_model(study.model, study.start)
-        except InputError as e:
-            raise e.at(f"response '{response.name}'") from None
 
 
 @contextmanager
@@ -253,7 +244,9 @@ def steady_notes(study: Study, *, searches: bool = False) -> list[str]:
     model = study.model
     if not isinstance(model, Model) or any(s.start is not None for s in model.states.values()):
         return []
-    begins = {"model": (), **{f"experiment {e.name}": _first(e) for e in study.experiments if not e.drive}}
+    begins: dict[str, Mapping[str, float]] = {"model": {}}
+    for e in (e for e in study.experiments if not e.drive):
+        begins[f"experiment {e.name}"] = e.values | {n: float(signal.values[0]) for n, signal in e.inputs.items()}
     at_given = {where: _notes(model, study.given, inputs) for where, inputs in begins.items()}
     found = [f"{where}: {note}" for where, notes in at_given.items() for note in notes]
     if searches and study.start != study.given:
@@ -263,15 +256,10 @@ def steady_notes(study: Study, *, searches: bool = False) -> list[str]:
     return found
 
 
-def _first(e: Experiment) -> tuple[tuple[str, float], ...]:
-    """The inputs before anything happens, by name."""
-    return (*e.values.items(), *((n, float(signal.values[0])) for n, signal in e.inputs.items()))
-
-
-def _notes(model: Model, values: Mapping[str, float], inputs: Iterable[tuple[str, float]]) -> tuple[str, ...]:
+def _notes(model: Model, values: Mapping[str, float], inputs: Mapping[str, float]) -> tuple[str, ...]:
     from hvdc_ident.linearize import find_operating_point
 
-    fixed = {**values, **dict(inputs)}
+    fixed = {**values, **inputs}
     known = {n: v for n, v in fixed.items() if n in model.parameters or n in model.inputs}
     try:
         return find_operating_point(model, known).notes
@@ -302,7 +290,8 @@ def intervals_contain(data: Mapping[str, Any]) -> Iterator[str]:
         for key in ("ci95", "ci95_independent"):
             low, high = entry.get(key) or (None, None)
             if not _contains(low, high, entry["value"]):
-                yield f"{place} = {entry['value']:.6g} lies outside its own interval {_end(low)} to {_end(high)}"
+                ends = " to ".join("open" if end is None else f"{end:.6g}" for end in (low, high))
+                yield f"{place} = {entry['value']:.6g} lies outside its own interval {ends}"
 
 
 def best_cost_is_told(data: Mapping[str, Any]) -> Iterator[str]:
@@ -365,12 +354,13 @@ OWN: Mapping[str, tuple[Check, ...]] = {
 
 
 def _with_intervals(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Every mapping inside that has a number `value` and a `ci95`, with its place in words.
+    """Yield the place, in words, of every mapping inside that has a number `value` and a `ci95`, and the mapping.
 
     A parameter that `identify` holds is told at the value it is held at, with what the data say of it: not an estimate.
     """
     if isinstance(value, Mapping):
-        if _finite(value.get("value")) and value.get("ci95") and not _is_held(value):
+        held = value.get("verdict") not in (None, "identifiable", "locally-identifiable", "weak", "at-bound")
+        if _finite(value.get("value")) and value.get("ci95") and not held:
             yield " ".join(path), value
         for key, inner in value.items():
             yield from _with_intervals(inner, (*path, str(key)))
@@ -380,10 +370,6 @@ def _with_intervals(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Ma
                 yield from _with_intervals(inner, path)
 
 
-def _is_held(entry: Mapping[str, Any]) -> bool:
-    return entry.get("verdict") not in (None, "identifiable", "locally-identifiable", "weak", "at-bound")
-
-
 def _contains(low: float | None, high: float | None, value: float) -> bool:
     slack = ROUNDING * max(abs(value), *(abs(end) for end in (low, high) if end is not None), 0.0)
     return (low is None or low <= value + slack) and (high is None or value - slack <= high)
@@ -391,7 +377,3 @@ def _contains(low: float | None, high: float | None, value: float) -> bool:
 
 def _finite(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _end(value: float | None) -> str:
-    return "open" if value is None else f"{value:.6g}"

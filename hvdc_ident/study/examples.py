@@ -85,7 +85,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Campaign:
-    """What to record.
+    """The experiments of a study to record.
 
     source: a shipped model. effects: hidden in it, as in a study file. kinds: set-points moved. count: experiments of
     each, every other a ramp. holdout: how many of these, the last ones, are not for the fit. sample, event, end: s.
@@ -122,7 +122,7 @@ class Campaign:
 
     @property
     def model(self) -> AnyModel:
-        """What makes the waveforms."""
+        """The model that makes the waveforms."""
         return apply_effects(load_model(self.source), self.effects)
 
 

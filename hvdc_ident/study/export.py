@@ -1,4 +1,4 @@
-"""Which value is which: a study's given, start and fitted values, each set under its name.
+"""Export of a study's model with one of its sets of values, and the letter with the augmented model beside it.
 
 given: the values the model came with, the vendor's; everything is simulated with them and compared with them.
 start: where a search begins. fitted: what a fit in the folder of results estimated, with what it held.
@@ -119,7 +119,7 @@ def _outcome(fit: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class FmuOptions:
-    """How an FMU is written. kinds: "model-exchange", "co-simulation". binary: None compiles where there is a compiler."""
+    """Options of an FMU to write. kinds: "model-exchange", "co-simulation". binary: None compiles where there is a compiler."""
 
     version: str = "2.0"
     kinds: tuple[str, ...] = ("model-exchange", "co-simulation")
@@ -199,7 +199,7 @@ def write(
     folder: str | Path | None = None,
     reduced: bool = False,
 ) -> Written:
-    """The same, with what is to be said of the file: which values it holds, whether an FMU holds a binary.
+    """Return the file as `export` writes it, with what is to be said of it: which values it holds, whether an FMU holds a binary.
 
     reduced: the reduced linear model that a study's [linearize] asks for.
     """
@@ -297,7 +297,7 @@ def _model(source: Study | Model, chosen: ValueSet | None) -> Model:
 
 
 def _described(source: Study | Model, chosen: ValueSet | None) -> Model:
-    """The same, with a description that says which values they are, for formats without comments."""
+    """Return the model with the chosen values, which its description names, for formats without comments."""
     model = _model(source, chosen)
     if chosen is None:
         return model

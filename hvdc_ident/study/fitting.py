@@ -48,7 +48,7 @@ def with_settings(study: Study, problem: Problem) -> Problem:
 
 
 def as_reported(study: Study) -> bool:
-    """Whether the fit is of the same data in the same way as the report's, so that its profiles are the fit's."""
+    """Return whether the fit is of the same data in the same way as the report's, so that its profiles are the fit's."""
     asked = asked_of(study)
     plain = asked.loss == "linear" and asked.whiten == "no" and asked.residual == "time" and not asked.guard
     return plain and not priors(study.settings, study.experiments)

@@ -253,7 +253,7 @@ def lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def _locus_lines(found: Mapping[str, Any]) -> list[str]:
-    """Where stability is lost or won along the locus."""
+    """Return a line for each place along the locus where stability is lost or won."""
     unit = f" {found['unit']}" if found["unit"] else ""
     span = f"{found['parameter']} from {found['values'][0]:g} to {found['values'][-1]:g}{unit}"
     lines = [

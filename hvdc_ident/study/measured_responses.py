@@ -12,10 +12,10 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import (
-    InputError,
     LinearizationError,
     SteadyStateError,
     StudyError,
+    located,
     require_known,
     unknown_name,
 )
@@ -62,10 +62,8 @@ def read_responses(
             raise StudyError("two experiments or responses of one name", where=place, expected="a name of its own")
         taken.add(table.name.lower())
         port = _checked(table, settings, model, place)
-        try:
+        with located(place):
             found.append(_response(table, port, folder / table.data))
-        except InputError as e:
-            raise e.at(place) from None
         path = folder / table.data
         for file in files_of(path) if table.signals else (path,):
             name = table.data if file == path else f"{Path(table.data).parent / file.name}"

@@ -138,7 +138,7 @@ def _wanted(kind: str, ctx: dict[str, Any], got: str) -> tuple[str, str]:
 
 
 def _is_branch(part: int | str) -> bool:
-    """Whether a part of pydantic's place is the name of a union's branch, not a key."""
+    """Return whether a part of pydantic's place is the name of a union's branch, not a key."""
     return isinstance(part, str) and (part.startswith(("literal[", "dict[", "list[", "constrained-", "function-")))
 
 

@@ -170,7 +170,7 @@ def _written(
 
 
 def heading_of(study: Study, seed: int) -> dict[str, Any]:
-    """What every JSON begins with: schema, study, model, software, seed, and the hashes of the files read."""
+    """Return the heading of every JSON: schema, study, model, software, seed, and the hashes of the files read."""
     return {
         "schema": SCHEMA,
         "study": study.name,

@@ -32,7 +32,7 @@ from hvdc_ident.data.three_phase import (
     phase_quantities,
     phasor_quantities,
 )
-from hvdc_ident.errors import InputError, StudyError, require_known
+from hvdc_ident.errors import InputError, StudyError, located, require_known
 from hvdc_ident.files import digest
 from hvdc_ident.fit.noise_model import FEWEST_QUIET
 from hvdc_ident.formats import files_of, read_waveforms
@@ -115,10 +115,8 @@ def read_experiments(
         _check_names(table, model, place)
         columns = raw_columns(table, [*(c for _, c in _channels(table)), *_noise_columns(table).values()])
         wanted.setdefault(table.data, {})[table.name] = list(dict.fromkeys(columns))
-    try:
+    with located(where):
         recordings.load(wanted)
-    except InputError as e:
-        raise e.at(where) from None
     found, notes = [], {}
     for table in tables:
         place = f"{where}, experiment '{table.name}'"
@@ -356,10 +354,8 @@ def _input(
             expected=f"a number in every row: the model needs its '{signal}' all along",
             hint="fill the gaps, or cut the record; only outputs may have them",
         )
-    try:
+    with located(f"{place}, signal '{signal}'"):
         return input_signal(time, values, chosen)
-    except InputError as e:
-        raise e.at(f"{place}, signal '{signal}'") from None
 
 
 def _check_recorded(output: str, column: str, values: Array, place: str) -> None:
@@ -449,7 +445,7 @@ def _noise(given: float | None, time: Array, values: Array, event: float | None,
 
 
 def _noise_dof(time: Array, event: float | None) -> float:
-    """What the rows behind an estimated standard deviation are worth: it is a median's, of efficiency 0.37."""
+    """Return the degrees of freedom of a standard deviation estimated before the event, by a median of efficiency 0.37."""
     assert event is not None
     return max(1.0, MEDIAN_EFFICIENCY * int((time < event).sum()))
 
@@ -477,7 +473,7 @@ def with_derived(table: schema.ExperimentTable, data: Trajectory, place: str) ->
 def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajectory:
     _check_new(line.gives, data, where)
     window = line.window if line.window is not None else 1.0 / line.frequency  # one cycle
-    try:
+    with located(where):
         return phase_quantities(
             data,
             line.voltage,
@@ -486,18 +482,14 @@ def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajec
             frequency=line.frequency,
             smoothing=PhaseFilter(line.filter, window),
         )
-    except InputError as e:
-        raise e.at(where) from None
 
 
 def _of_phasors(line: schema.PhasorsTable, data: Trajectory, where: str) -> Trajectory:
     _check_new(line.gives, data, where)
     how = PhasorSettings(line.frequency, line.window, line.magnitudes or "", line.reference or "")
     current = _columns(line.current) if line.current is not None else None
-    try:
+    with located(where):
         made = phasor_quantities(data, _columns(line.voltage), current, list(line.gives.values()), how)
-    except InputError as e:
-        raise e.at(where) from None
     told = tuple(
         f"{name}: mean frequency over the last {line.window:g} s, from the angle; noise of 1 deg in it is "
         f"{frequency_noise(np.pi / 180.0, line.window):.3g} Hz here"

@@ -138,7 +138,7 @@ class ModelTable(TomlTable):
 
 
 class PriorTable(TomlTable):
-    """What is known of a candidate beforehand: a normal distribution in the parameter's unit."""
+    """Prior knowledge of a candidate: a normal distribution in the parameter's unit."""
 
     mean: FiniteFloat
     std: Positive

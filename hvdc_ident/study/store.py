@@ -186,7 +186,7 @@ class Job:
         self._store, self.name = store, name
 
     def get(self, keys: Sequence[bytes]) -> Mapping[bytes, bytes]:
-        """What is kept under the keys; a key without a result is missing."""
+        """Return what is kept under the keys; a key without a result is missing."""
         return self._store._get(self.name, keys)
 
     def put(self, key: bytes, value: bytes) -> None:

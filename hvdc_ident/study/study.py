@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.effects import apply_effects
-from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
+from hvdc_ident.errors import StudyError, located, require_known, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
 from hvdc_ident.fit import FitParameter
@@ -184,25 +184,21 @@ def _read(file: Path) -> bytes:
 
 def _model(settings: schema.StudyFile, file: Path, trust: bool) -> tuple[AnyModel, dict[str, str]]:
     """Return the model as the study wants it, and the hash of the file it comes from."""
-    table = settings.model
+    table, place = settings.model, f"{file.name}, model"
     source, sources = _source(table.source, file, "model.source")
-    place = "model.source"
-    try:
+    with located(f"{place}.source"):
         model = load_model(source, trust=trust, interface=table.interface, limits=_limits(table))
-        if table.parameterisation is not None:
-            place = "model.parameterisation"
+    if table.parameterisation is not None:
+        with located(f"{place}.parameterisation"):
             model = model.parameterised(table.parameterisation)
-        for asked, names in _recorded(settings):  # before the effects, which may sit at what is recorded
-            place = asked
-            model = recording(model, names)
-        if table.effect:
-            place = "model.effect"
+    for table_name, outputs in _recorded(settings):  # before the effects, which may sit at what is recorded
+        with located(f"{file.name}, {table_name}"):
+            model = recording(model, outputs)
+    if table.effect:
+        with located(f"{place}.effect"):
             model = apply_effects(model, [e.model_dump(by_alias=True, exclude_none=True) for e in table.effect])
-        place = "model.values"
-        model = model.with_values(table.values) if table.values else model
-    except InputError as e:
-        raise e.at(f"{file.name}, {place}") from None
-    return model, sources
+    with located(f"{place}.values"):
+        return (model.with_values(table.values) if table.values else model), sources
 
 
 def _limits(table: schema.ModelTable) -> dict[str, float] | None:
@@ -245,10 +241,8 @@ def _other_model(
     if name is None:
         return None, {}
     source, sources = _source(name, file, place)
-    try:
+    with located(f"{file.name}, {place}"):
         model = load_model(source, trust=trust, limits=_limits(settings.model) if name.endswith(".fmu") else None)
-    except InputError as e:
-        raise e.at(f"{file.name}, {place}") from None
     if not isinstance(model, Model):  # it is compared where it has the same variables
         model = model.recording([n for _, names in _recorded(settings) for n in names if model.records(n)])
     return model, sources
@@ -270,16 +264,14 @@ def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> Fr
                 hint = "an experiment's inputs, or its values"
                 raise StudyError(f"'{name}' is an input, not a parameter", where=f"{where}, parameters", hint=hint)
             raise unknown_name("parameter", name, model.parameters, where=f"{where}, parameters")
-        own = model.parameters[name]
-        try:
+        parameter = model.parameters[name]
+        with located(place):
             free = free_of(name, line, model)
-        except InputError as e:
-            raise e.at(place) from None
-        if free.min < own.min or free.max > own.max:
+        if free.min < parameter.min or free.max > parameter.max:
             raise StudyError(
                 "the bounds go beyond the model's own",
                 where=place,
-                expected=f"bounds within [{own.min:g}, {own.max:g}]",
+                expected=f"bounds within [{parameter.min:g}, {parameter.max:g}]",
                 got=f"[{free.min:g}, {free.max:g}]",
             )
         found[name] = free
@@ -293,17 +285,15 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
     """
     for name, line in settings.parameters.items():
         if line.given is not None and name in model.parameters:
-            try:
+            with located(f"{where}, parameters.{name}.given"):
                 model = model.with_values({name: line.given})
-            except InputError as e:
-                raise e.at(f"{where}, parameters.{name}.given") from None
     ties = {n: line.tie for n, line in settings.parameters.items() if line.tie is not None}
-    own = [n for n, line in settings.parameters.items() if line.per_experiment]
-    require_known("parameter", (*ties, *own), model.parameters, f"{where}, parameters")
-    if not ties and not own:
+    local = [n for n, line in settings.parameters.items() if line.per_experiment]
+    require_known("parameter", (*ties, *local), model.parameters, f"{where}, parameters")
+    if not ties and not local:
         return model
     if not isinstance(model, Model):
-        first = next(iter((*ties, *own)))
+        first = [*ties, *local][0]
         raise StudyError(
             f"'{first}' cannot be tied or given to each experiment",
             where=f"{where}, parameters.{first}",
@@ -314,14 +304,10 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
         return model
     expressions = {}
     for name, tie in ties.items():
-        try:
+        with located(f"{where}, parameters.{name}.tie"):
             expressions[name] = parse(tie)
-        except InputError as e:
-            raise e.at(f"{where}, parameters.{name}.tie") from None
-    try:
+    with located(f"{where}, parameters"):
         return model.tied(expressions)
-    except InputError as e:
-        raise e.at(f"{where}, parameters") from None
 
 
 def with_nuisances(
@@ -336,20 +322,18 @@ def with_nuisances(
     A start that is "free" is unknown: it is estimated in every experiment unless it is a candidate, one for all. Raises StudyError
     where the bounds of one do not hold its start.
     """
-    own = [n for n, line in settings.parameters.items() if line.per_experiment]
+    local = [n for n, line in settings.parameters.items() if line.per_experiment]
     if isinstance(model, Model):
         free = [f"{n}_start" for n, s in model.states.items() if s.start == "free"]
-        own += [n for n in free if n not in candidates and n not in own]
-    if not own:
+        local += [n for n in free if n not in candidates and n not in local]
+    if not local:
         return tuple(experiments)
     search = {}
-    for name in (n for n in own if n in settings.parameters):
-        try:
+    for name in (n for n in local if n in settings.parameters):
+        with located(f"{where}, parameters.{name}"):
             found = free_of(name, settings.parameters[name], model)
-        except InputError as e:
-            raise e.at(f"{where}, parameters.{name}") from None
         search[name] = (found.start, found.min, found.max)
-    return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *own))), search=search) for e in experiments)
+    return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *local))), search=search) for e in experiments)
 
 
 def free_of(name: str, line: schema.ParameterTable, model: AnyModel) -> FitParameter:

@@ -93,7 +93,7 @@ def _noise(output: str, note: dict[str, Any]) -> str:
 
 
 def _given_by(study: Study, name: str) -> str:
-    """Where a candidate's given value comes from; a value of [model.values] that does not count is named too."""
+    """Return the source of a candidate's given value; a value of [model.values] that does not count is named too."""
     line, stated = study.settings.parameters[name], study.settings.model.values
     if line.given is not None:
         unused = f", not {stated[name]:g} of [model.values]" if stated.get(name, line.given) != line.given else ""

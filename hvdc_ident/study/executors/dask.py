@@ -97,7 +97,7 @@ class DaskPool:
                 send(following)
 
     def _shared(self, name: str, content: bytes) -> Any:
-        """Where the cluster has the function. One sent again is not sent: its release would race with the sending."""
+        """Return the function as the cluster has it. One sent again is not sent: its release would race with the sending."""
         if self._sent[0] != name:
             [future] = self._client.scatter([content], broadcast=True, hash=False)
             self._sent = name, future

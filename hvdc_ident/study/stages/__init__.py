@@ -31,7 +31,7 @@ def unheard(lines: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class StageOptions:
-    """How stages run. workers: processes; seed: of every random number; progress: who is told.
+    """Options of a run. workers: processes; seed: of every random number; progress: who is told.
 
     announce: who is told, in lines, what to know before the work begins, or while a long one goes on.
     keep: who writes a first answer, so that it stands where the work is interrupted; the stage runner sets it.
@@ -62,7 +62,7 @@ class StageResult:
 
 
 def no_lines(data: Mapping[str, Any]) -> Sequence[str]:
-    """Nothing: a result that is told by where it stands."""
+    """Return no lines, for a result that is told by where it stands."""
     return ()
 
 

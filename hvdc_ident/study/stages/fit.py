@@ -48,7 +48,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
 def _context(
     study: Study, problem: Problem, options: StageOptions, report: Mapping[str, Any], result: FitResult
 ) -> dict[str, Any]:
-    """What a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
+    """Return what a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
     from hvdc_ident.study.recordings import noise_line
     from hvdc_ident.study.study import candidate_lines
 

@@ -116,7 +116,7 @@ def swept_names(tables: Sequence[schema.SweepTable]) -> tuple[Want, ...]:
 
 
 def told(data: Mapping[str, Any]) -> Sequence[str]:
-    """How many points, the reason of the first that failed, and where the error of each series is smallest."""
+    """Return the number of points, the reason of the first that failed, and where the error of each series is smallest."""
     best: dict[tuple[str, str], tuple[float, Mapping[str, float]]] = {}
     reason = ""
     for point in data["points"]:
