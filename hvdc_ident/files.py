@@ -10,7 +10,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -84,7 +84,12 @@ def csv_cell(text: str) -> str:
     return f"'{flat}" if text.startswith(FORMULA) else flat
 
 
-def csv_text(header: list[str], rows: list[list[Any]]) -> str:
+def csv_columns(columns: Mapping[str, Any]) -> str:
+    """Return CSV text of columns by name: arrays of one length."""
+    return csv_text(list(columns), zip(*(c.tolist() for c in columns.values()), strict=True))
+
+
+def csv_text(header: list[str], rows: Iterable[Sequence[Any]]) -> str:
     """Return CSV text: every digit of every number, nothing for None and NaN, no text that a spreadsheet takes for a formula."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")

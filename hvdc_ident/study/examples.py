@@ -17,7 +17,7 @@ from hvdc_ident.data import Array, Experiment, InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError
 from hvdc_ident.executor import Progress, silent
-from hvdc_ident.files import csv_text, write_text
+from hvdc_ident.files import csv_columns, write_text
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import load_model
@@ -190,8 +190,8 @@ def _driven(campaign: Campaign, kind: Kind, number: int) -> Experiment:
 def _csv(e: Experiment) -> str:
     assert e.measured is not None
     ((setpoint, signal),) = e.inputs.items()
-    columns = [e.time, signal(e.time), *(np.round(e.measured[o], 9) for o in e.outputs)]
-    return csv_text(["time", setpoint, *e.outputs], np.column_stack(columns).tolist())
+    outputs = {o: np.round(e.measured[o], 9) for o in e.outputs}
+    return csv_columns({"time": e.time, setpoint: signal(e.time), **outputs})
 
 
 def _head(campaign: Campaign) -> str:
@@ -356,4 +356,4 @@ def _recording(name: str, signal: InputSignal, random: np.random.Generator) -> s
     time = np.round(np.arange(1801) * 5e-4, 9)
     run = simulate(load_model("vsc-hvdc-link"), experiment(name, time, {"Vdcref1": signal})).trajectory
     noisy = np.round(run["Irorder1"] + NOISE * random.standard_normal(time.size), 8)
-    return csv_text(["time", "Vdcref1", "Irorder1"], np.column_stack([time, signal(time), noisy]).tolist())
+    return csv_columns({"time": time, "Vdcref1": signal(time), "Irorder1": noisy})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -57,11 +57,6 @@ class NoiseNote:
     std: float
     source: Literal["given", "estimated", "floor", "residual"]
     by_row: bool = False
-
-
-def noise_line(note: NoiseNote) -> dict[str, Any]:
-    """The note as JSON has it."""
-    return {"std": note.std, "source": note.source, "by_row": note.by_row}
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from typing import Any
 
@@ -12,7 +12,6 @@ from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.measured_responses import described
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.quiescent_levels import quiescent_levels
-from hvdc_ident.study.recordings import noise_line
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
 
@@ -112,5 +111,5 @@ def _experiment(e: Experiment, study: Study) -> dict[str, Any]:
         "inputs": [n for n in e.inputs if n not in e.drive],
         "outputs": list(e.outputs),
         "recording": e.recording,
-        "noise": {o: noise_line(n) for o, n in notes.items()},
+        "noise": {o: asdict(n) for o, n in notes.items()},
     }

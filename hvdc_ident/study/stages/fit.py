@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
@@ -49,7 +50,6 @@ def _context(
     study: Study, problem: Problem, options: StageOptions, report: Mapping[str, Any], result: FitResult
 ) -> dict[str, Any]:
     """Return what a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
-    from hvdc_ident.study.recordings import noise_line
     from hvdc_ident.study.study import candidate_lines
 
     return {
@@ -60,7 +60,7 @@ def _context(
             e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording}
             for e in problem.experiments
         },
-        "noise": {e: {o: noise_line(n) for o, n in notes.items()} for e, notes in study.noise.items()},
+        "noise": {e: {o: asdict(n) for o, n in notes.items()} for e, notes in study.noise.items()},
         "ties": {n: line.tie for n, line in study.settings.parameters.items() if line.tie is not None},
     }
 
@@ -87,18 +87,14 @@ def _curves_csv(experiment: Experiment, curves: Mapping[str, Curve]) -> str:
 
     The columns OUTPUT.low and OUTPUT.high are left out where no estimate has a standard deviation.
     """
-    import numpy as np
+    from hvdc_ident.files import csv_columns
 
-    from hvdc_ident.files import csv_text
-
-    header, columns = ["time"], [experiment.time]
+    columns = {"time": experiment.time}
     for output, c in curves.items():
-        header += [output, f"{output}.measured"]
-        columns += [c.model, c.measured]
+        columns |= {output: c.model, f"{output}.measured": c.measured}
         if c.band is not None:
-            header += [f"{output}.low", f"{output}.high"]
-            columns += [c.model - c.band, c.model + c.band]
-    return csv_text(header, np.column_stack(columns).tolist())
+            columns |= {f"{output}.low": c.model - c.band, f"{output}.high": c.model + c.band}
+    return csv_columns(columns)
 
 
 def values_csv(

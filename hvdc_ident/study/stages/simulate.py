@@ -92,16 +92,13 @@ def _rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
 
 def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
     """CSV text: time, then for each measured output the simulated column OUTPUT and the recorded OUTPUT.measured."""
-    import numpy as np
-
-    from hvdc_ident.files import csv_text
+    from hvdc_ident.files import csv_columns
 
     assert experiment.measured is not None
-    header, columns = ["time"], [experiment.time]
+    columns = {"time": experiment.time}
     for output in experiment.outputs:
-        header += [output, f"{output}.measured"]
-        columns += [simulated[output], experiment.measured[output]]
-    return csv_text(header, np.column_stack(columns).tolist())
+        columns |= {output: simulated[output], f"{output}.measured": experiment.measured[output]}
+    return csv_columns(columns)
 
 
 STAGE = Stage(
