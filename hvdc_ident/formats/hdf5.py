@@ -14,9 +14,9 @@ import numpy as np
 
 from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import once, pick
+from hvdc_ident.formats import pick
 from hvdc_ident.formats._apart import read_apart
-from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
+from hvdc_ident.formats._columns import check_size, checked, damaged, joined, package, time_name
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -81,7 +81,7 @@ def waveforms_here(path: Path) -> Trajectory:
         raise damaged(path, f"the file cannot be read: {error}") from None
     if not parts:
         raise damaged(path, "no waveforms", expected="a data set 'time' and others of as many rows")
-    return joined([_checked(part, path) for part in parts], path)
+    return joined([checked(part, path) for part in parts], path)
 
 
 def _hdf5(path: Path) -> list[Trajectory]:
@@ -127,7 +127,10 @@ def _in_seconds(clock: Array, unit: str, path: Path) -> Array:
 
 
 def _unit(item: Any) -> str:
-    text = item.attrs.get("units", item.attrs.get("unit", ""))
+    return _text(item.attrs.get("units", item.attrs.get("unit", "")))
+
+
+def _text(text: Any) -> str:
     return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
 
@@ -139,18 +142,10 @@ def _netcdf3(path: Path) -> list[Trajectory]:
         name = time_name(list(sets))
         if name is None:
             return []
-        unit = getattr(sets[name], "units", b"")
-        text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
-        clock = _in_seconds(np.array(sets[name].data, dtype=float).ravel(), text, path)
+        unit = getattr(sets[name], "units", "")
+        clock = _in_seconds(np.array(sets[name].data, dtype=float).ravel(), _text(unit), path)
         columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
-        units = [getattr(sets[k], "units", b"") for k in columns]
+        units = tuple(_text(getattr(sets[k], "units", "")) for k in columns)
     if not columns:
         return []
-    texts = tuple(u.decode("utf-8", "replace") if isinstance(u, bytes) else str(u) for u in units)
-    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), texts)]
-
-
-def _checked(part: Trajectory, path: Path) -> Trajectory:
-    if len(part) < 2 or not np.isfinite(part.time).all() or (np.diff(part.time) < 0).any():
-        raise damaged(path, "a time vector is too short, not finite, or goes back")
-    return once(part)
+    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units)]

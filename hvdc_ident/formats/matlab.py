@@ -17,9 +17,9 @@ import numpy as np
 
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import once, pick
+from hvdc_ident.formats import pick
 from hvdc_ident.formats._apart import read_apart
-from hvdc_ident.formats._columns import check_size, damaged, joined, package, time_name
+from hvdc_ident.formats._columns import check_size, checked, damaged, joined, package, time_name
 from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
 from hvdc_ident.formats.dymola_mat import matrices_of, starts_as_version_4
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
@@ -83,7 +83,7 @@ def _joined(found: Mapping[str, Any], path: Path) -> Trajectory:
     parts = list(_parts(found, path))
     if not parts:
         raise _no_time(found, path)
-    return joined([_once(part, path) for part in parts], path)
+    return joined([checked(part, path) for part in parts], path)
 
 
 def _version_4(path: Path) -> dict[str, Any]:
@@ -175,7 +175,12 @@ def _no_time(found: Mapping[str, Any], path: Path) -> WaveformError:
     arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
     opaque = next((name for name, value in found.items() if isinstance(value, Opaque)), None)
     if opaque is not None and not arrays:
-        return _object(path, opaque)
+        return WaveformError(
+            f"'{opaque}' is a MATLAB object, whose form is not published",
+            where=str(path),
+            expected="vectors, matrices or structures with time",
+            hint=_ADVICE,
+        )
     shapes = ", ".join(f"{k} {'x'.join(map(str, v.shape)) or '1'}" for k, v in list(arrays.items())[:8])
     likely = [k for k, v in arrays.items() if v.ndim == 1 and v.size > 1 and _increases(v)]
     return WaveformError(
@@ -274,21 +279,3 @@ def _numeric(value: Any) -> bool:
 
 def _increases(values: Array) -> bool:
     return bool(values.size > 1 and np.isfinite(values).all() and (np.diff(values) >= 0).all() and np.ptp(values) > 0)
-
-
-def _once(part: Trajectory, path: Path) -> Trajectory:
-    """The record with the first and last row of every instant alone."""
-    if len(part) < 2 or not np.isfinite(part.time).all():
-        raise damaged(path, "a time vector is too short or not finite", expected="at least 2 times")
-    if (np.diff(part.time) < 0).any():
-        raise damaged(path, "the time goes back", expected="increasing times")
-    return once(part)
-
-
-def _object(path: Path, name: str) -> WaveformError:
-    return WaveformError(
-        f"'{name}' is a MATLAB object, whose form is not published",
-        where=str(path),
-        expected="vectors, matrices or structures with time",
-        hint=_ADVICE,
-    )

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Trajectory
-from hvdc_ident.formats import once, pick
-from hvdc_ident.formats._columns import check_size, damaged, package, time_name
+from hvdc_ident.formats import pick
+from hvdc_ident.formats._columns import check_size, checked, damaged, package, time_name
 
 NAME = "parquet"
 SUMMARY = "Parquet tables with a column `time`"
@@ -40,10 +40,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     time = _seconds(table.column(clock).to_numpy(), path)
     columns = [np.asarray(table.column(names[i]).to_numpy(), dtype=float) for i in wanted]
     values = np.column_stack(columns) if columns else np.empty((time.size, 0))
-    if not np.isfinite(time).all() or (np.diff(time) < 0).any():
-        raise damaged(path, f"column '{clock}' is not finite or goes back", expected="increasing times")
-    found = Trajectory(time, values, tuple(names[i] for i in wanted), tuple(units[i] for i in wanted))
-    return once(found)
+    return checked(Trajectory(time, values, tuple(names[i] for i in wanted), tuple(units[i] for i in wanted)), path)
 
 
 def write(trajectory: Trajectory, path: Path) -> None:

@@ -17,8 +17,8 @@ import numpy as np
 
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import once, pick
-from hvdc_ident.formats._columns import check_size, damaged, own_names
+from hvdc_ident.formats import pick
+from hvdc_ident.formats._columns import check_size, checked, damaged, own_names
 
 NAME = "pscad"
 SUMMARY = "PSCAD output: the .inf, with its numbered .out files beside it"
@@ -74,10 +74,8 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
             raise damaged(_out_file(path, number + 1), "its times differ from those of the other .out files")
     check_size(len(first), len(wanted), path)
     values = np.column_stack([tables[(c.number - 1) // _PER_FILE][:, (c.number - 1) % _PER_FILE + 1] for c in wanted])
-    if (np.diff(first[:, 0]) < 0).any():
-        raise damaged(path, "the time goes back in the .out files")
-    units = tuple(c.unit for c in wanted)
-    return once(Trajectory(first[:, 0], values, tuple(c.name for c in wanted), units, Origin(time_unit="s")))
+    names, units = tuple(c.name for c in wanted), tuple(c.unit for c in wanted)
+    return checked(Trajectory(first[:, 0], values, names, units, Origin(time_unit="s")), path)
 
 
 def files(path: Path) -> list[Path]:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
-MOST_NORMS = 12
-"""Channels up to which the norms of each are given beside those of the whole."""
+MOST_CHANNELS = 12
+"""Channels up to which the norms of each are given beside those of the whole, and the frequency response for the report."""
 
 
 def operating_point(study: Study, values: Mapping[str, float] | None = None) -> OperatingPoint:
@@ -94,7 +94,7 @@ def _norms(linear: LinearModel) -> dict[str, Any]:
     """Norms of the whole, and of each channel where these are few."""
     pairs = [(i, o) for o in linear.output_names for i in linear.input_names]
     found: dict[str, Any] = {"whole": linear.norms()}
-    if len(pairs) <= MOST_NORMS:
+    if len(pairs) <= MOST_CHANNELS:
         found["channels"] = [{"input": i, "output": o, **linear.channel(i, o).norms()} for i, o in pairs]
     return found
 

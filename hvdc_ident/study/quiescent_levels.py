@@ -64,8 +64,6 @@ SMALLEST_FACTOR = math.sqrt(2.0)
 """The smallest factor between two ways of counting a quantity (peak and rms); a smaller one is another operating point."""
 POSITIVE = math.log(3.0)
 """Log odds from which evidence is positive (Kass, Raftery 1995): enough for a question, which is all that is asked."""
-CHOICE = math.log(2.0)
-"""Log odds that a comparison has to gain by a mistake in which it may take part or not."""
 TIMES = ((1e-3, "ms"), (1e-6, "us"), (60.0, "min"), (3600.0, "h"))
 """Units of time other than s that a recording may be in."""
 
@@ -225,14 +223,14 @@ def _likely_conversions(
     """Return the conversion of each comparison of one output, where one is more likely than not, with its log odds.
 
     One mistake may have been made in all experiments, in some or in one: each that takes part has to gain by it more than
-    the choice costs.
+    the choice costs, ln 2.
     """
     found: dict[Comparison, tuple[Conversion, float]] = {}
     rest = list(comparisons)
     while rest:
         tried = []
         for conversion in (*known, *(f for c in rest if (f := _free_factor(c)) is not None)):
-            gains = {c: c.log_odds(conversion) - CHOICE for c in rest if c.is_matched(conversion)}
+            gains = {c: c.log_odds(conversion) - math.log(2.0) for c in rest if c.is_matched(conversion)}
             members = {c: gain for c, gain in gains.items() if gain > 0.0}
             tried.append((math.log(conversion.prior) + sum(members.values()), conversion, members))
         # A unit is suspected only where that is clearly more likely than a gain of the model.
@@ -358,14 +356,14 @@ def _exchanged(
     """Return the two outputs of one experiment whose columns seem to be exchanged, by comparison, with the log odds.
 
     odds: log odds of what each suggests by itself. Both outputs have to differ, and each has to gain by the exchange more
-    than the choice costs, as by a conversion.
+    than the choice costs, ln 2, as by a conversion.
     """
     off = [c for c in comparisons if c.differs(quantile) or c.moves_otherwise(quantile)]
     tried = []
     for a, b in combinations(off, 2):
         one, other = Comparison.of(a.record, b.simulated), Comparison.of(b.record, a.simulated)
         if a.is_matched_by(one) and b.is_matched_by(other):
-            gain = a.log_odds_by(one) + b.log_odds_by(other) - 2.0 * CHOICE
+            gain = a.log_odds_by(one) + b.log_odds_by(other) - 2.0 * math.log(2.0)
             total = gain + math.log(EXCHANGE_SHARE / math.comb(len(comparisons), 2))
             if total > max(POSITIVE, odds.get(a, 0.0) + odds.get(b, 0.0)):
                 tried.append((total, a, b))

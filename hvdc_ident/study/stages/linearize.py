@@ -18,8 +18,6 @@ CHECKS = {
     "directional": "central differences of the FMU's derivatives, relative to each row's largest entry",
     "finite-difference": "two step sizes of central differences, relative to each row's largest entry",
 }
-MOST_DRAWN = 12
-"""Channels up to which the frequency response is written too, for the report to draw."""
 
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
@@ -51,7 +49,7 @@ def _described(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
-    from hvdc_ident.study.linear_analysis import analyses, modes_of
+    from hvdc_ident.study.linear_analysis import MOST_CHANNELS, analyses, modes_of
     from hvdc_ident.study.measured_responses import compared
 
     point = model.point
@@ -72,7 +70,7 @@ def _described(
         "jacobian_error": jacobian_error(point.model, point, model.output_names),
         "jacobian_check": CHECKS[model.provenance["method"]],
     }
-    if len(functions) <= MOST_DRAWN:
+    if len(functions) <= MOST_CHANNELS:
         data["frequency_response"] = model.bode().to_dict()
     options.progress(2, 3, "norms, margins, ports and comparisons")
     more, files = analyses(study, model)
