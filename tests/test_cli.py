@@ -181,6 +181,24 @@ def test_convert_cuts_by_time_and_counts(tmp_path: Path) -> None:
     assert call("convert", data, "--list", "", "--window", "0", "1").exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("export", "--to", "x.mat", "--values", "best"), "no set of values has this name"),
+        (("export", "--to", "x.fmu", "--fmi", "1"), "no FMU is written in this version of FMI"),
+        (("export", "--to", "x.mo", "--kind", "me"), "this ending is another format's"),
+        (("fit", "--executor", "spark://h:1"), "on this machine or by a dask scheduler"),
+        (("fit", "--force", "gain"), "no candidate 'gain'"),
+    ],
+)
+def test_a_refused_option_says_why_and_what_to_try(study: Path, words: tuple[str, ...], reason: str) -> None:
+    before = sorted(study.parent.iterdir())
+    refused = call(words[0], study, *words[1:])
+    assert refused.exit_code == 2 and reason in refused.stderr and "expected" in refused.stderr
+    assert ". Try: " in refused.stderr
+    assert sorted(study.parent.iterdir()) == before
+
+
 def test_new_writes_a_study_that_passes_check(tmp_path: Path) -> None:
     assert call("new", tmp_path / "n").exit_code == 0
     assert call("check", tmp_path / "n" / "study.toml").exit_code == 0
