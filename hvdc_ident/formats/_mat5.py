@@ -1,7 +1,7 @@
 """The variables of a MATLAB version 5 to 7.2 file, every length checked before it is believed.
 
-scipy reads these files too, but believes the lengths in them: a damaged file ends its process, so it would need one of
-its own for every file, which takes a second where this reader takes milliseconds. Numbers, text, structures and cells
+scipy reads these files too, but believes the lengths in them: a damaged file ends its process, so that each would have
+to be read in a process of its own, which takes a second and a half more. Numbers, text, structures and cells
 are understood, which is what waveforms come in; objects are named and left.
 Source: MathWorks, "MAT-File Format", the level 5 format.
 """

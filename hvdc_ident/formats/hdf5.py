@@ -15,8 +15,8 @@ import numpy as np
 from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._apart import read_apart
 from hvdc_ident.formats._columns import check_size, checked, damaged, joined, package, time_name
+from hvdc_ident.formats._guarded import read_guarded
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -57,10 +57,10 @@ def sample(path: Path) -> None:
 
 def _waveforms(path: Path) -> Trajectory:
     package("h5py", path)
-    return read_apart("hdf5", path)
+    return read_guarded("hdf5", path)
 
 
-def waveforms_here(path: Path) -> Trajectory:
+def waveforms_unguarded(path: Path) -> Trajectory:
     """All waveforms of the file, read in this process, which a damaged file may hang or end."""
     with open(path, "rb") as file:
         newest = file.read(8) == _HDF5

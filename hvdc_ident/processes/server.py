@@ -151,21 +151,21 @@ class _Server:
 
     def _start(self, number: int, begun: object, descriptors: Sequence[int]) -> None:
         """Fork a worker. descriptors: its connection to the owner, its progress, and what its messages go to."""
-        here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        here.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-        there.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the least: a few lines, then it waits to be read
-        own = os.getpid()
+        dumped, dumping = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        dumped.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+        dumping.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the least: a few lines, then it waits to be read
+        server = os.getpid()
         pid = os.fork()
         if pid == 0:
             self.owner.close()
-            for other in (here, *(c.dumps for c in self.children.values())):
+            for other in (dumped, *(c.dumps for c in self.children.values())):
                 other.close()
-            self._become_worker(own, begun, descriptors, there)
-        there.close()
+            self._become_worker(server, begun, descriptors, dumping)
+        dumping.close()
         progress = progress_in(descriptors[1])
         for descriptor in descriptors:
             os.close(descriptor)
-        self.children[number] = _Child(number, pid, here, progress)
+        self.children[number] = _Child(number, pid, dumped, progress)
 
     def _become_worker(self, parent: int, begun: object, descriptors: Sequence[int], dumps: socket.socket) -> NoReturn:
         """Do the owner's work in this new process. dumps: takes the frames when it crashes."""

@@ -169,23 +169,23 @@ class Supervisor:
         prints: bool = False,
     ) -> None:
         self.owner, self.memory, self.prints = os.getpid(), memory, prints
-        here, there = socket.socketpair()
+        near_end, far_end = socket.socketpair()
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
         # There is a worker for every core: further threads of linear algebra would wait for each other.
-        one = {} if any(n in os.environ for n in THREADS) else dict.fromkeys(THREADS, "1")
+        one_thread = {} if any(n in os.environ for n in THREADS) else dict.fromkeys(THREADS, "1")
         self.printed: IO[bytes] | None = None if prints else tempfile.TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "hvdc_ident.processes.server", str(there.fileno())],
+            [sys.executable, "-P", "-m", "hvdc_ident.processes.server", str(far_end.fileno())],
             stdin=subprocess.DEVNULL,
             stdout=None if prints else subprocess.DEVNULL,
             stderr=self.printed,
-            pass_fds=(there.fileno(), *keeps),
-            env={**os.environ, **one, "PYTHONPATH": path},
+            pass_fds=(far_end.fileno(), *keeps),
+            env={**os.environ, **one_thread, "PYTHONPATH": path},
             start_new_session=True,  # what a terminal sends to all its processes is for this one
         )
-        there.close()
-        self.connection = Connection(here.detach())
+        far_end.close()
+        self.connection = Connection(near_end.detach())
         self.last = ""  # line that it wrote
         self._lock = threading.Lock()
         self._ended: dict[int, Ending] = {}
@@ -195,17 +195,17 @@ class Supervisor:
 
     def start(self, begun: object = None) -> ChildProcess:
         """Return a worker that begins now. begun: what it begins with. Raises OSError where the supervisor is gone."""
-        here, there = socket.socketpair()
+        near_end, far_end = socket.socketpair()
         progress = progress_file()
         printed = None if self.prints else tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the worker
-        with there, progress, self._lock, socket.socket(fileno=os.dup(self.connection.fileno())) as passing:
+        with far_end, progress, self._lock, socket.socket(fileno=os.dup(self.connection.fileno())) as passing:
             self._started += 1
             view = progress_in(progress.fileno())
-            child = ChildProcess(self._started, Connection(here.detach()), view, self.memory, printed)
+            child = ChildProcess(self._started, Connection(near_end.detach()), view, self.memory, printed)
             child.begin()
             view[NOW] = math.nan
             self.connection.send_bytes(pickle.dumps(("start", child.number, begun)))
-            reduction.sendfds(passing, [f.fileno() for f in (there, progress, printed) if f is not None])
+            reduction.sendfds(passing, [f.fileno() for f in (far_end, progress, printed) if f is not None])
         return child
 
     def end(self, child: ChildProcess, *, trace: bool = True) -> Ending | None:

@@ -1,7 +1,7 @@
-"""A reader run in a process of its own, for libraries that damaged files can hang or crash.
+"""Guarded reading in a process of its own, for libraries that damaged files can hang or crash.
 
 The HDF5 library believes what a file says of itself: some spoilt files end the process or never end. Here that costs
-one error message. As a program: `python -m hvdc_ident.formats._apart MODULE PATH` writes what it read to stdout.
+one error message. As a program: `python -m hvdc_ident.formats._guarded MODULE PATH` writes what it read to stdout.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ START = 20.0  # s for a process to begin and a small file to be read
 RATE = 5e6  # bytes a second, at least
 
 
-def read_apart(module: str, path: Path) -> Trajectory:
-    """Return the result of `waveforms_here(path)` of a module of this folder, run in a process of its own.
+def read_guarded(module: str, path: Path) -> Trajectory:
+    """Return the result of `waveforms_unguarded(path)` of a module of this folder, run in a process of its own.
 
     Raises WaveformError: its own, or where the process ends or hangs.
     """
@@ -52,7 +52,7 @@ def read_apart(module: str, path: Path) -> Trajectory:
 def _main(module: str, path: str) -> None:
     out = sys.stdout.buffer
     try:
-        found = importlib.import_module(f"hvdc_ident.formats.{module}").waveforms_here(Path(path))
+        found = importlib.import_module(f"hvdc_ident.formats.{module}").waveforms_unguarded(Path(path))
     except WaveformError as error:
         said = {"what": error.what, "expected": error.expected, "got": error.got, "hint": error.hint}
         out.write(json.dumps(said).encode() + b"\n")
