@@ -350,15 +350,15 @@ def convert(
     written = to_csv(data, to, signal, window)
     gaps = {n: k for n in written.names if (k := written.gaps(n))}
     start, end = float(written.time[0]), float(written.time[-1])
-    total, left = written.origin.rows, written.origin.dropped
+    total, omitted = written.origin.rows, written.origin.dropped
     console.print_json(
         {
             "schema": 1, "file": to.as_posix(), "rows": len(written), "signals": list(written.names),
-            "rows_in_file": total or len(written), "dropped": left, "time": [start, end], "not_recorded": gaps,
+            "rows_in_file": total or len(written), "dropped": omitted, "time": [start, end], "not_recorded": gaps,
         }
     )  # fmt: skip
     rows = f"{len(written)} rows" if len(written) == total else f"{len(written)} of {total} rows"
-    dropped = f" ({left} of the file dropped: a third of one instant, or outside another record)" if left else ""
+    dropped = f" ({omitted} of the file dropped: a third of one instant, or outside another record)" if omitted else ""
     console.say(f"{to}: {rows}{dropped}, {start:g} to {end:g} s, {len(written.names)} signals")
     console.say(*(f"{name}: {number} of {len(written)} rows not recorded" for name, number in gaps.items()))
 

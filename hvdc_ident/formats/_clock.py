@@ -47,24 +47,24 @@ class Clock:
             raise ValueError("no date or time of day")
         if int(match["h"]) > 23 or int(match["m"]) > 59 or int(match["s"]) > 60:
             raise ValueError("no time of day")
-        here = 3600.0 * int(match["h"]) + 60 * int(match["m"]) + int(match["s"]) - _zone(match["zone"])
-        here += float(f"0.{match['fraction']}") if match["fraction"] else 0.0
+        time_of_day = 3600.0 * int(match["h"]) + 60 * int(match["m"]) + int(match["s"]) - _zone(match["zone"])
+        time_of_day += float(f"0.{match['fraction']}") if match["fraction"] else 0.0
         if match["half"]:  # 12:30 AM is half past midnight
-            here += 43200.0 * ((match["half"].upper() == "PM") - (int(match["h"]) == 12))
+            time_of_day += 43200.0 * ((match["half"].upper() == "PM") - (int(match["h"]) == 12))
         date = match["date"] or ""
-        day = self._day_of(here) if not date else 0
+        day = self._day_of(time_of_day) if not date else 0
         if self._first is None:
             if date:
                 _days_between(date, date)  # refuses what is none
-            self._first = (date, here)
+            self._first = (date, time_of_day)
         elif date:
             day = _days_between(self._first[0], date)
-        return day * _DAY + (here - self._first[1])
+        return day * _DAY + (time_of_day - self._first[1])
 
-    def _day_of(self, here: float) -> int:
-        if here < self._last - _DAY / 2:
+    def _day_of(self, time_of_day: float) -> int:
+        if time_of_day < self._last - _DAY / 2:
             self._midnights += 1
-        self._last = here
+        self._last = time_of_day
         return self._midnights
 
 

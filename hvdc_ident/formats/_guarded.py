@@ -57,12 +57,12 @@ def _main(module: str, path: str) -> None:
         said = {"what": error.what, "expected": error.expected, "got": error.got, "hint": error.hint}
         out.write(json.dumps(said).encode() + b"\n")
         return
-    told = io.BytesIO()  # numpy writes to a buffered file by its position, and a pipe has none
+    reply = io.BytesIO()  # numpy writes to a buffered file by its position, and a pipe has none
     heading = {"names": found.names, "units": found.units, "origin": asdict(found.origin)}
-    told.write(json.dumps(heading).encode() + b"\n")
-    np.save(told, found.time, allow_pickle=False)
-    np.save(told, found.values, allow_pickle=False)
-    out.write(told.getbuffer())
+    reply.write(json.dumps(heading).encode() + b"\n")
+    np.save(reply, found.time, allow_pickle=False)
+    np.save(reply, found.values, allow_pickle=False)
+    out.write(reply.getbuffer())
 
 
 if __name__ == "__main__":

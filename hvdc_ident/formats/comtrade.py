@@ -207,12 +207,14 @@ def _rows(record: _Record) -> int:
     header = record.header
     claimed = int(header.sample_rates[-1][1])
     if header.ft.upper() == "ASCII":
-        there = sum(1 for line in record.data.splitlines() if line.strip(b" \t\x1a"))
+        available = sum(1 for line in record.data.splitlines() if line.strip(b" \t\x1a"))
     else:
         width = 8 + _BYTES[header.ft.upper()] * header.analog_count + 2 * math.ceil(header.status_count / 16)
-        there = len(record.data) // width
-    if there < claimed:
-        raise damaged(record.path, "the data end early", expected=f"{claimed} samples as in the header", got=f"{there}")
+        available = len(record.data) // width
+    if available < claimed:
+        raise damaged(
+            record.path, "the data end early", expected=f"{claimed} samples as in the header", got=f"{available}"
+        )
     return claimed
 
 

@@ -105,10 +105,10 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         )
     values = np.empty((int(keep.sum()), wanted.size))
     for number in np.unique(result.table[wanted]):
-        here = np.flatnonzero(result.table[wanted] == number)
-        signed = result.column[wanted[here]]
+        places = np.flatnonzero(result.table[wanted] == number)
+        signed = result.column[wanted[places]]
         columns = _resampled(result, int(number), np.abs(signed) - 1, time, path)
-        values[:, here] = columns[keep if len(columns) == time.size else slice(None)] * np.sign(signed)
+        values[:, places] = columns[keep if len(columns) == time.size else slice(None)] * np.sign(signed)
     names = tuple(result.names[i] for i in wanted)
     origin = Origin(rows=time.size, dropped=int(np.count_nonzero(~keep)), time_unit="s")
     return Trajectory(time[keep], values, names, tuple(result.units[i] for i in wanted), origin)
@@ -219,15 +219,15 @@ def _resampled(result: _Result, number: int, columns: NDArray[np.int64], time: A
     table = result.tables[number]
     if number == 2:
         return np.asarray(table[:, columns], dtype=float)
-    own = np.asarray(table[:, 0], dtype=float)
-    if np.array_equal(own, time):
+    times = np.asarray(table[:, 0], dtype=float)
+    if np.array_equal(times, time):
         return np.asarray(table[:, columns], dtype=float)
     found = np.asarray(table[:, columns], dtype=float)
-    if len(own) and (found == found[0]).all():
+    if len(times) and (found == found[0]).all():
         return found[:1]
-    if len(own) < 2 or not np.isfinite(own).all() or (np.diff(own) <= 0).any():
+    if len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise _damaged(path, f"matrix 'data_{number}' has times of its own that do not increase", got=_shape(table))
-    return np.column_stack([np.interp(time, own, found[:, j]) for j in range(columns.size)])
+    return np.column_stack([np.interp(time, times, found[:, j]) for j in range(columns.size)])
 
 
 def matrices_of(path: Path) -> dict[str, _Matrix]:

@@ -36,7 +36,7 @@ def check_questions(study: Study, where: str) -> None:
         require_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
         check_linear(study, where)
     for line in s.sweep:
-        _free_line(line.parameter, s.parameters, f"{where}, sweep", own=True)
+        _free_line(line.parameter, s.parameters, f"{where}, sweep", local=True)
         require_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
         _check_sweep(line, model, where)
     if s.sweep:
@@ -94,13 +94,13 @@ def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> No
         require_known("candidate", [name], study.candidates, where)
 
 
-def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, own: bool = False) -> None:
-    """Raise StudyError for a parameter that follows others by its tie or, unless `own`, has a value in each experiment."""
+def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, local: bool = False) -> None:
+    """Raise StudyError for a parameter that follows others by its tie or, unless `local`, has a value in each experiment."""
     line = lines.get(name)
     if line is not None and line.tie is not None:
         what, why = "follows other parameters", f"tie = {line.tie!r}"
         hint = "name one that it follows, or leave the tie out"
-    elif line is not None and line.per_experiment and not own:
+    elif line is not None and line.per_experiment and not local:
         what, why = "has a value in each experiment", "per-experiment = true"
         hint = "leave that out for one value in all experiments"
     else:
@@ -320,10 +320,10 @@ def fit_is_judged(data: Mapping[str, Any]) -> Iterator[str]:
         return
     judged = data.get("adequacy") or {}
     sources = (data.get("noise_source") or {}).values()
-    told = any(not str(s).startswith("misfit") for s in sources)
+    stated_noise = any(not str(s).startswith("misfit") for s in sources)
     if not judged.get("verdict"):
         yield f"the intervals of {', '.join(stated)} stand without a verdict on the residuals"
-    elif told and not _finite(judged.get("chi2_per_dof")) and judged["verdict"] != "not-judged":
+    elif stated_noise and not _finite(judged.get("chi2_per_dof")) and judged["verdict"] != "not-judged":
         yield f"the intervals of {', '.join(stated)} stand without chi2/dof"
     elif judged["verdict"] == "does-not-fit" and not (judged.get("text") and judged.get("next")):
         yield "the model does not fit, and neither by how much nor what to do is said"

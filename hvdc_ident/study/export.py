@@ -221,16 +221,18 @@ def write(
         raise StudyError("no export has this ending", where=str(path), expected=f"one of {', '.join(known)}")
     if values is not None and not isinstance(source, Study):
         raise StudyError("a model has one set of values: its own", where="values", expected="a study", got=repr(values))
-    chosen = value_set(source, values, None if folder is None else Path(folder)) if isinstance(source, Study) else None
+    selected = (
+        value_set(source, values, None if folder is None else Path(folder)) if isinstance(source, Study) else None
+    )
     if nonlinear and ending in _WRITERS:
         assert isinstance(source, Study | Model)
-        written = _WRITERS[ending](source, chosen, path, fmu or FmuOptions())
+        written = _WRITERS[ending](source, selected, path, fmu or FmuOptions())
     else:
-        model = _linear(source, chosen)
+        model = _linear(source, selected)
         written = Written(write_linear(_reduced(source, model) if reduced else model, path))
-    if chosen is None:
+    if selected is None:
         return written
-    return Written(written.path, "; ".join(t for t in (written.note, chosen.note) if t), chosen.name)
+    return Written(written.path, "; ".join(t for t in (written.note, selected.note) if t), selected.name)
 
 
 def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearModel:
@@ -246,37 +248,42 @@ def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearM
     return small.scaled({n: 1.0 / size for n, size in asked.scale.items()})
 
 
-def _card(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
+def _card(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.files import write_text
     from hvdc_ident.model import write_card
 
-    head = f"# {' '.join(chosen.note.split())}\n" if chosen else ""
-    return Written(write_text(path, head + write_card(_model(source, chosen))))
+    head = f"# {' '.join(selected.note.split())}\n" if selected else ""
+    return Written(write_text(path, head + write_card(_model(source, selected))))
 
 
-def _fmu(source: Study | Model, chosen: ValueSet | None, path: Path, options: FmuOptions) -> Written:
+def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: FmuOptions) -> Written:
     from hvdc_ident.fmu.export import export_fmu
 
     ends = [float(e.time[-1]) for e in source.experiments] if isinstance(source, Study) else []
     stop = max((t for t in ends if t > 0.0), default=1.0)
     found = export_fmu(
-        _described(source, chosen), path, version=options.version, kinds=options.kinds, binary=options.binary, stop=stop
+        _described(source, selected),
+        path,
+        version=options.version,
+        kinds=options.kinds,
+        binary=options.binary,
+        stop=stop,
     )
     return Written(found.path, f"FMI {found.version}, {' and '.join(found.kinds)}; {found.note}")
 
 
-def _modelica(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
+def _modelica(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.fmu.export.modelica_model import save_modelica
 
-    return Written(save_modelica(_described(source, chosen), path))
+    return Written(save_modelica(_described(source, selected), path))
 
 
-def _parameters(source: Study | Model, chosen: ValueSet | None, path: Path, _: FmuOptions) -> Written:
+def _parameters(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     from hvdc_ident.files import write_text
 
     model = source.model if isinstance(source, Study) else source
-    values = {n: q.value for n, q in model.parameters.items()} | (dict(chosen.values) if chosen else {})
-    return Written(write_text(path, ssv(values, source.name, chosen.note if chosen else "")))
+    values = {n: q.value for n, q in model.parameters.items()} | (dict(selected.values) if selected else {})
+    return Written(write_text(path, ssv(values, source.name, selected.note if selected else "")))
 
 
 _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions], Written]] = {
@@ -287,30 +294,30 @@ _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions],
 }
 
 
-def _model(source: Study | Model, chosen: ValueSet | None) -> Model:
-    """The model with the chosen values."""
+def _model(source: Study | Model, selected: ValueSet | None) -> Model:
+    """The model with the selected values."""
     if isinstance(source, Model):
         return source
     if not isinstance(source.model, Model):
         raise StudyError("the model's equations are not here to be written", where=source.path.name, got="an FMU")
-    return source.model.with_values(dict(chosen.values)) if chosen and chosen.values else source.model
+    return source.model.with_values(dict(selected.values)) if selected and selected.values else source.model
 
 
-def _described(source: Study | Model, chosen: ValueSet | None) -> Model:
-    """Return the model with the chosen values, which its description names, for formats without comments."""
-    model = _model(source, chosen)
-    if chosen is None:
+def _described(source: Study | Model, selected: ValueSet | None) -> Model:
+    """Return the model with the selected values, which its description names, for formats without comments."""
+    model = _model(source, selected)
+    if selected is None:
         return model
-    return replace(model, description=f"{(model.description or model.name).rstrip('. ')}; {chosen.note}")
+    return replace(model, description=f"{(model.description or model.name).rstrip('. ')}; {selected.note}")
 
 
-def _linear(source: Study | Model | LinearModel, chosen: ValueSet | None) -> LinearModel:
+def _linear(source: Study | Model | LinearModel, selected: ValueSet | None) -> LinearModel:
     from hvdc_ident.linearize import linearize
     from hvdc_ident.study.stages.linearize import linear_model
 
     if isinstance(source, Study):
-        assert chosen is not None
-        return linear_model(source, chosen)
+        assert selected is not None
+        return linear_model(source, selected)
     return linearize(source) if isinstance(source, Model) else source
 
 

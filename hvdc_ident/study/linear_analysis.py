@@ -104,9 +104,9 @@ def _trimmed(trim: schema.TrimTable, linear: LinearModel) -> dict[str, Any]:
     assert point is not None
     free = trim.free
     if free is None:
-        own = point.search
+        search = point.search
         moved = [n for n, i in point.model.inputs.items() if n not in trim.inputs and point.inputs[n] != i.value]
-        free = moved if own is None else [own.system.inputs[k] for k in own.freed_u]
+        free = moved if search is None else [search.system.inputs[k] for k in search.freed_u]
     found = {**point.inputs, **point.parameters}
     return {"outputs": dict(trim.outputs), "inputs": dict(trim.inputs), "found": {n: found[n] for n in free}}
 

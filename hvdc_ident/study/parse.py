@@ -144,21 +144,21 @@ def _is_branch(part: int | str) -> bool:
 
 def _place(loc: typing.Sequence[int | str], table: Any) -> str:
     """`experiment 'step-up'.window`: the place in the words of the file."""
-    text, here = "", table
+    text, inner = "", table
     for part in loc:
-        here = _inner(here, part)
+        inner = _inner(inner, part)
         if isinstance(part, int):
-            name = here.get("name") if isinstance(here, dict) else None
+            name = inner.get("name") if isinstance(inner, dict) else None
             text += f" '{name}'" if isinstance(name, str) else f" number {part + 1}"
         elif part != "[key]":
             text += f".{part}" if text else str(part)
     return text
 
 
-def _inner(here: Any, part: int | str) -> Any:
-    if isinstance(here, dict):
-        return here.get(part)
-    return here[part] if isinstance(here, list) and isinstance(part, int) and part < len(here) else None
+def _inner(inner: Any, part: int | str) -> Any:
+    if isinstance(inner, dict):
+        return inner.get(part)
+    return inner[part] if isinstance(inner, list) and isinstance(part, int) and part < len(inner) else None
 
 
 def _unknown_key(key: str, outer: tuple[int | str, ...], table: dict[str, Any], where: str) -> StudyError:

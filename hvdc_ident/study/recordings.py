@@ -340,7 +340,7 @@ def _input(
     table: schema.ExperimentTable, signal: str, column: str, time: Array, values: Array, place: str
 ) -> InputSignal:
     kind = table.interpolation
-    chosen = kind.get(signal) if isinstance(kind, dict) else kind
+    interpolation = kind.get(signal) if isinstance(kind, dict) else kind
     missing = np.flatnonzero(np.isnan(values))
     if missing.size:
         raise StudyError(
@@ -350,7 +350,7 @@ def _input(
             hint="fill the gaps, or cut the record; only outputs may have them",
         )
     with located(f"{place}, signal '{signal}'"):
-        return input_signal(time, values, chosen)
+        return input_signal(time, values, interpolation)
 
 
 def _check_recorded(output: str, column: str, values: Array, place: str) -> None:
@@ -416,8 +416,8 @@ def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, fl
             got=f"'{unit}'",
         )
     found = data[column] * by[0] * abs(mapping[0])
-    there = ~np.isnan(data[of])
-    bad = np.flatnonzero(there & ~(found > 0))
+    recorded = ~np.isnan(data[of])
+    bad = np.flatnonzero(recorded & ~(found > 0))
     if bad.size:
         raise StudyError(
             f"no standard deviation in column '{column}' at {data.time[bad[0]]:g} s",
@@ -425,7 +425,7 @@ def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, fl
             expected=f"a number above 0 wherever '{of}' is recorded",
             got=f"{data[column][bad[0]]:g}",
         )
-    return np.where(there, found, np.nan)
+    return np.where(recorded, found, np.nan)
 
 
 def _noise(given: float | None, time: Array, values: Array, event: float | None, *, by_row: bool = False) -> NoiseNote:
@@ -485,13 +485,13 @@ def _of_phasors(line: schema.PhasorsTable, data: Trajectory, where: str) -> Traj
     current = _columns(line.current) if line.current is not None else None
     with located(where):
         made = phasor_quantities(data, _columns(line.voltage), current, list(line.gives.values()), how)
-    told = tuple(
+    converted = tuple(
         f"{name}: mean frequency over the last {line.window:g} s, from the angle; noise of 1 deg in it is "
         f"{frequency_noise(np.pi / 180.0, line.window):.3g} Hz here"
         for name, quantity in line.gives.items()
         if quantity == "f"
     )
-    return replace(made, origin=replace(made.origin, converted=told))
+    return replace(made, origin=replace(made.origin, converted=converted))
 
 
 def _columns(phasor: schema.PhasorTable) -> PhasorColumns:

@@ -118,9 +118,9 @@ def _checked(client: Any, address: str) -> int:
     client.wait_for_workers(1, timeout=CONNECT)
     from hvdc_ident.study.store import code_version
 
-    here = code_version()
+    expected = code_version()
     try:
-        there = client.run(code_version)
+        versions = client.run(code_version)
     except Exception as error:  # whatever the workers' environment lacks
         raise InputError(
             "the workers cannot run this package",
@@ -128,10 +128,10 @@ def _checked(client: Any, address: str) -> int:
             got=" ".join(f"{type(error).__name__}: {error}".split())[:200],
             hint="install the same version of hvdc_ident on every machine",
         ) from None
-    other = sorted(worker for worker, version in there.items() if version != here)
+    other = sorted(worker for worker, version in versions.items() if version != expected)
     if other:
         raise InputError(
-            f"{len(other)} of {len(there)} workers have another version of this package or of numpy, scipy, sympy, numba",
+            f"{len(other)} of {len(versions)} workers have another version of this package or of numpy, scipy, sympy, numba",
             where=f"--executor {address}",
             got=other[0],
             hint="the same environment on every machine: results are the same bit for bit or not given",

@@ -90,7 +90,7 @@ def diagnosed(
     return replace(found, notes=(*found.notes, note))
 
 
-def told(data: Mapping[str, Any]) -> Sequence[str]:
+def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The verdict, what is missing, what it changes, and what to measure to be sure."""
     if "verdict" not in data:
         return [str(data.get("message", ""))]
@@ -125,6 +125,6 @@ STAGE = Stage(
     wanted=lambda study: study.settings.diagnose is not None,
     order=50,
     after=("identify", "fit"),
-    tell=told,
+    tell=lines_of,
     searches=True,
 )

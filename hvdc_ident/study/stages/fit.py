@@ -121,7 +121,7 @@ def _head(study: Study, values: Mapping[str, float]) -> str:
     )
 
 
-def told(data: Mapping[str, Any]) -> list[str]:
+def lines_of(data: Mapping[str, Any]) -> list[str]:
     """The status and the verdict on the residuals, then every estimate beside its given value, then what is held."""
     from hvdc_ident.fit.result import FIT_WORDS
 
@@ -210,6 +210,6 @@ STAGE = Stage(
     order=40,
     after=("identify",),
     takes=("force",),
-    tell=told,
+    tell=lines_of,
     searches=True,
 )

@@ -97,7 +97,7 @@ def groups_of(study: Study) -> list[Group]:
     return [Group(tuple(g.parameters), tuple(g.outputs or ()), tuple(g.experiments or ())) for g in asked]
 
 
-def told(data: Mapping[str, Any]) -> Sequence[str]:
+def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """Return whether the model explains the data, every verdict in a line, the remarks, and what to measure next.
 
     A misfit comes first and its size stands beside every interval: what is read alone is to be believed alone.
@@ -125,6 +125,6 @@ STAGE = Stage(
     run=run,
     wanted=lambda study: study.settings.identifiability is not None or study.settings.fit is not None,
     order=30,
-    tell=told,
+    tell=lines_of,
     searches=True,
 )

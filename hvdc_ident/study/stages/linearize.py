@@ -45,7 +45,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
 
 
 def _described(
-    study: Study, model: LinearModel, chosen: ValueSet, options: StageOptions, like: Sequence[Mapping[str, Any]] = ()
+    study: Study, model: LinearModel, selected: ValueSet, options: StageOptions, like: Sequence[Mapping[str, Any]] = ()
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
@@ -57,8 +57,8 @@ def _described(
     options.progress(1, 3, "modes and transfer functions")
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     data = {
-        "values": chosen.name,
-        "parameters": dict(chosen.values),
+        "values": selected.name,
+        "parameters": dict(selected.values),
         **model.to_dict(),
         "operating_point": point.to_dict(),
         "stable": point.stable,
@@ -76,7 +76,7 @@ def _described(
     more, files = analyses(study, model)
     data |= more
     if study.responses:
-        data["responses"] = compared(study, {chosen.name: chosen.values})
+        data["responses"] = compared(study, {selected.name: selected.values})
     for key in ("schema", "kind", "model"):
         data.pop(key, None)
     return data, files
@@ -89,12 +89,12 @@ def _ordered(modes: list[dict[str, Any]], like: Sequence[Mapping[str, Any]]) -> 
 
     if len(modes) != len(like) or not modes:
         return modes
-    own, other = (np.array([complex(*m["eigenvalue"]) for m in some]) for some in (modes, like))
-    size = np.maximum(np.maximum(np.abs(own)[None, :], np.abs(other)[:, None]), np.finfo(float).tiny)
-    return [modes[k] for k in linear_sum_assignment(np.abs(other[:, None] - own[None, :]) / size)[1]]
+    eigenvalues, others = (np.array([complex(*m["eigenvalue"]) for m in some]) for some in (modes, like))
+    size = np.maximum(np.maximum(np.abs(eigenvalues)[None, :], np.abs(others)[:, None]), np.finfo(float).tiny)
+    return [modes[k] for k in linear_sum_assignment(np.abs(others[:, None] - eigenvalues[None, :]) / size)[1]]
 
 
-def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
+def linear_model(study: Study, selected: ValueSet) -> LinearModel:
     """The linear model that a study's [linearize] asks for, at these values; without that table between all inputs and outputs."""
     from hvdc_ident.linearize import linearize
     from hvdc_ident.study.linear_analysis import operating_point
@@ -102,16 +102,16 @@ def linear_model(study: Study, chosen: ValueSet) -> LinearModel:
     asked = study.settings.linearize
     model = linearize(
         study.model,
-        operating_point(study, chosen.values),
+        operating_point(study, selected.values),
         inputs=asked.inputs if asked else None,
         outputs=asked.outputs if asked else None,
         side=asked.side if asked else "refuse",
         sensitivities=list(study.candidates),
     )
-    return replace(model, provenance=model.provenance | {"values": chosen.note})
+    return replace(model, provenance=model.provenance | {"values": selected.note})
 
 
-def told(data: Mapping[str, Any]) -> list[str]:
+def lines_of(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
     from hvdc_ident.study.linear_analysis import lines
     from hvdc_ident.study.measured_responses import response_lines
@@ -137,5 +137,5 @@ STAGE = Stage(
     wanted=lambda study: study.settings.linearize is not None or bool(study.responses),
     order=45,
     uses=("fit",),
-    tell=told,
+    tell=lines_of,
 )

@@ -56,7 +56,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     return StageResult(data)
 
 
-def told(data: Mapping[str, Any]) -> Sequence[str]:
+def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The parameters of each output and experiment, the one that matters most first."""
     name, text = ("mu_star", "mean effect") if data["method"] == "morris" else ("ST", "total share")
     found = [f"{data['evaluations']} runs, {data['failed']} failed"]
@@ -76,5 +76,5 @@ STAGE = Stage(
     run=run,
     wanted=lambda study: study.settings.screening is not None,
     order=27,
-    tell=told,
+    tell=lines_of,
 )

@@ -37,8 +37,8 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         if ended:
             experiment = _until(experiment, simulated.time.size)
         for output in experiment.outputs:
-            told = not ended or _comparable(experiment, output)
-            table.setdefault(output, {})[experiment.name] = _rmse(experiment, simulated, output) if told else None
+            comparable = not ended or _comparable(experiment, output)
+            table.setdefault(output, {})[experiment.name] = _rmse(experiment, simulated, output) if comparable else None
         files[f"simulation.{experiment.name}.csv"] = _comparison_csv(experiment, simulated)
     failed = [name for name, s in status.items() if s["status"] != "converged"]
     data = {

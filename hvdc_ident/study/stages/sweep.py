@@ -115,7 +115,7 @@ def swept_names(tables: Sequence[schema.SweepTable]) -> tuple[Want, ...]:
     return tuple(k for k in kinds if k in asked)
 
 
-def told(data: Mapping[str, Any]) -> Sequence[str]:
+def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """Return the number of points, the reason of the first that failed, and where the error of each series is smallest."""
     best: dict[tuple[str, str], tuple[float, Mapping[str, float]]] = {}
     reason = ""
@@ -142,5 +142,5 @@ STAGE = Stage(
     run=run,
     wanted=lambda study: bool(study.settings.sweep),
     order=25,
-    tell=told,
+    tell=lines_of,
 )
