@@ -59,7 +59,9 @@ def _write(path: Path, pieces: Iterable[bytes]) -> Path:
                 stream.write(piece)
             stream.flush()
             os.fsync(stream.fileno())
-        temporary.chmod(0o666 & ~_umask())
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
         temporary.replace(path)
     except OSError as e:
         raise _cannot_write(path, e) from None
@@ -187,9 +189,3 @@ def _cannot_write(path: Path, error: OSError) -> InputError:
         where=str(path),
         hint="a folder that can be written to, with --out DIR",
     )
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -289,9 +289,11 @@ def intervals_contain(data: Mapping[str, Any]) -> Iterator[str]:
     for place, entry in _with_intervals(data, ()):
         for key in ("ci95", "ci95_independent"):
             low, high = entry.get(key) or (None, None)
-            if not _contains(low, high, entry["value"]):
+            value = entry["value"]
+            slack = ROUNDING * max(abs(value), *(abs(end) for end in (low, high) if end is not None), 0.0)
+            if (low is not None and low > value + slack) or (high is not None and value - slack > high):
                 ends = " to ".join("open" if end is None else f"{end:.6g}" for end in (low, high))
-                yield f"{place} = {entry['value']:.6g} lies outside its own interval {ends}"
+                yield f"{place} = {value:.6g} lies outside its own interval {ends}"
 
 
 def best_cost_is_told(data: Mapping[str, Any]) -> Iterator[str]:
@@ -368,11 +370,6 @@ def _with_intervals(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Ma
         for inner in value:
             if isinstance(inner, Mapping | list | tuple):
                 yield from _with_intervals(inner, path)
-
-
-def _contains(low: float | None, high: float | None, value: float) -> bool:
-    slack = ROUNDING * max(abs(value), *(abs(end) for end in (low, high) if end is not None), 0.0)
-    return (low is None or low <= value + slack) and (high is None or value - slack <= high)
 
 
 def _finite(value: Any) -> bool:

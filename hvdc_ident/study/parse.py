@@ -162,7 +162,8 @@ def _inner(inner: Any, part: int | str) -> Any:
 
 
 def _unknown_key(key: str, outer: tuple[int | str, ...], table: dict[str, Any], where: str) -> StudyError:
-    known = _keys(outer)
+    kind = _table_at(outer)
+    known = [field.alias or name for name, field in kind.model_fields.items()] if kind else []
     near = difflib.get_close_matches(key, known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
     place = _place(outer, table)
@@ -173,12 +174,6 @@ def _unknown_key(key: str, outer: tuple[int | str, ...], table: dict[str, Any], 
         expected=f"one of {', '.join(known)}" if known else "no keys at all",
         hint=hint,
     )
-
-
-def _keys(outer: tuple[int | str, ...]) -> list[str]:
-    """The keys known at a place of the study file."""
-    kind = _table_at(outer)
-    return [field.alias or name for name, field in kind.model_fields.items()] if kind else []
 
 
 def _describe_key(loc: typing.Sequence[int | str]) -> str:

@@ -142,7 +142,8 @@ def with_noise(
         for o in e.outputs
     }
     estimated = [o for o, n in notes.items() if n.source == "estimated"]
-    dof = {o: _noise_dof(e.time[np.isfinite(table[o])], event) for o in estimated}
+    before = e.time < (event if event is not None else -np.inf)
+    dof = {o: max(1.0, MEDIAN_EFFICIENCY * int((before & np.isfinite(table[o])).sum())) for o in estimated}
     noise = {o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}
     profile = {o: v for o, v in e.noise_profile.items() if o in noise}
     return e.with_(event=event, noise=noise, noise_dof=e.noise_dof | dof, noise_profile=profile), FrozenMap(notes)
@@ -199,11 +200,17 @@ def _experiment(
     data = with_derived(table, data, place)
     time = _time(table, data, place)
     mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
-    mapped = {s: _mapped(data[c], mappings[s]) for s, c in columns.items()}
+    mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
+    mapped |= {s: mapped[s] + offset for s, (_, offset) in mappings.items() if offset != 0.0}
     inputs = {s: _input(table, s, columns[s], time, mapped[s], place) for s in (*table.inputs, *table.drive)}
     outputs = tuple(table.outputs)
-    for o in outputs:
-        _check_recorded(o, columns[o], mapped[o], f"{place}, {table.data}")
+    if empty := [o for o in outputs if np.isnan(mapped[o]).all()]:
+        raise StudyError(
+            f"column '{columns[empty[0]]}' of output '{empty[0]}' is not recorded in any row",
+            where=f"{place}, {table.data}",
+            expected="numbers",
+            hint="take it out of outputs",
+        )
     deviations = {
         o: _deviations(data, c, columns[o], mappings[o], f"{place}, {table.data}")
         for o, c in _noise_columns(table).items()
@@ -322,13 +329,6 @@ def _conversion_words(
     return f"{signal}: from {line.unit or data.unit(column)} to {_unit(model, signal)}"
 
 
-def _mapped(values: Array, mapping: tuple[float, float]) -> Array:
-    """The values in the model's unit, untouched where nothing is to be done."""
-    scale, offset = mapping
-    found = scaled(values, scale)
-    return found if offset == 0.0 else found + offset
-
-
 def _unit(model: AnyModel, signal: str) -> str:
     for table in (model.inputs, model.outputs, model.signals, model.states, model.algebraic):
         if signal in table:
@@ -351,16 +351,6 @@ def _input(
         )
     with located(f"{place}, signal '{signal}'"):
         return input_signal(time, values, interpolation)
-
-
-def _check_recorded(output: str, column: str, values: Array, place: str) -> None:
-    if np.isnan(values).all():
-        raise StudyError(
-            f"column '{column}' of output '{output}' is not recorded in any row",
-            where=place,
-            expected="numbers",
-            hint="take it out of outputs",
-        )
 
 
 def _time_unit(table: schema.ExperimentTable, origin: Origin) -> str:
@@ -437,12 +427,6 @@ def _noise(given: float | None, time: Array, values: Array, event: float | None,
     if std <= floor:
         return NoiseNote(floor, "floor")
     return NoiseNote(std, "given" if given is not None else "estimated", by_row)
-
-
-def _noise_dof(time: Array, event: float | None) -> float:
-    """Return the degrees of freedom of a standard deviation estimated before the event, by a median of efficiency 0.37."""
-    assert event is not None
-    return max(1.0, MEDIAN_EFFICIENCY * int((time < event).sum()))
 
 
 def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[str]:

@@ -160,23 +160,11 @@ class Store:
                 hint = "remove this file: what it keeps can be computed again"
             raise InputError(f"the store cannot be used: {text}", where=str(self.path), hint=hint) from None
 
-    def _get(self, job: str, keys: Sequence[bytes]) -> dict[bytes, bytes]:
-        assert self._base is not None
-        found: dict[bytes, bytes] = {}
-        with self._clear():
-            for start in range(0, len(keys), MOST_KEYS):
-                part = keys[start : start + MOST_KEYS]
-                marks = ",".join("?" * len(part))
-                rows = self._base.execute(
-                    f"SELECT key, value FROM kept WHERE job = ? AND key IN ({marks})", [job, *part]
-                )
-                found.update((bytes(k), bytes(v)) for k, v in rows)
-        return found
-
-    def _put(self, job: str, key: bytes, value: bytes) -> None:
+    def execute(self, statement: str, values: Sequence[Any]) -> list[Any]:
+        """Return the rows of an SQL statement. Raises InputError where the store cannot be used."""
         assert self._base is not None
         with self._clear():
-            self._base.execute("INSERT OR REPLACE INTO kept VALUES (?, ?, ?)", (job, key, value))
+            return self._base.execute(statement, values).fetchall()
 
 
 class Job:
@@ -187,11 +175,17 @@ class Job:
 
     def get(self, keys: Sequence[bytes]) -> Mapping[bytes, bytes]:
         """Return what is kept under the keys; a key without a result is missing."""
-        return self._store._get(self.name, keys)
+        found: dict[bytes, bytes] = {}
+        for start in range(0, len(keys), MOST_KEYS):
+            part = keys[start : start + MOST_KEYS]
+            marks = ",".join("?" * len(part))
+            select = f"SELECT key, value FROM kept WHERE job = ? AND key IN ({marks})"
+            found.update((bytes(k), bytes(v)) for k, v in self._store.execute(select, [self.name, *part]))
+        return found
 
     def put(self, key: bytes, value: bytes) -> None:
         """Keep the value: a kill of this process at any instant afterwards does not lose it."""
-        self._store._put(self.name, key, value)
+        self._store.execute("INSERT OR REPLACE INTO kept VALUES (?, ?, ?)", (self.name, key, value))
 
 
 class CachingExecutor:

@@ -221,7 +221,8 @@ def _recorded(settings: schema.StudyFile) -> Iterable[tuple[str, Iterable[str]]]
 
 def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, str]]:
     """Return a shipped model's name, or a file's path from the study's folder, with that file's hash."""
-    if is_shipped(name) or not _is_path(name):
+    is_path = "/" in name or "\\" in name or Path(name).suffix in (".toml", ".fmu", ".py")
+    if is_shipped(name) or not is_path:
         return name, {}
     source = file.parent / name
     if not source.is_file():
@@ -246,10 +247,6 @@ def _other_model(
     if not isinstance(model, Model):  # it is compared where it has the same variables
         model = model.recording([n for _, names in _recorded(settings) for n in names if model.records(n)])
     return model, sources
-
-
-def _is_path(source: str) -> bool:
-    return "/" in source or "\\" in source or Path(source).suffix in (".toml", ".fmu", ".py")
 
 
 def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[FitParameter]:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """The RMSE of each output in each experiment, and a CSV of measured and simulated outputs for each experiment."""
+    import numpy as np
+
     from hvdc_ident.errors import ComputationError
     from hvdc_ident.simulate import simulate
     from hvdc_ident.study.checks import at_given, need_experiments
@@ -36,8 +38,9 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         status[experiment.name] = {"status": one.status, "reason": one.notes.get("end", "")}
         if ended:
             experiment = _until(experiment, simulated.time.size)
+        assert experiment.measured is not None  # a study's experiments have outputs
         for output in experiment.outputs:
-            comparable = not ended or _comparable(experiment, output)
+            comparable = not ended or np.isfinite(experiment.measured[output][experiment.compared]).any()
             table.setdefault(output, {})[experiment.name] = _rmse(experiment, simulated, output) if comparable else None
         files[f"simulation.{experiment.name}.csv"] = _comparison_csv(experiment, simulated)
     failed = [name for name, s in status.items() if s["status"] != "converged"]
@@ -65,14 +68,6 @@ def _until(experiment: Experiment, rows: int) -> Experiment:
         measured=Trajectory(m.time[:rows], m.values[:rows], m.names, m.units, m.origin),
         noise_profile=FrozenMap({o: p[:rows] for o, p in experiment.noise_profile.items()}),
     )
-
-
-def _comparable(experiment: Experiment, output: str) -> bool:
-    """Return whether any row of a measured output can be compared."""
-    import numpy as np
-
-    assert experiment.measured is not None
-    return bool(np.isfinite(experiment.measured[output][experiment.compared]).any())
 
 
 def _rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
