@@ -184,7 +184,7 @@ def test_convert_cuts_by_time_and_counts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (("export", "--to", "x.mat", "--values", "best"), "no set of values has this name"),
+        (("export", "--to", "x.mat", "--values", "best"), "no such set of values"),
         (("export", "--to", "x.fmu", "--fmi", "1"), "no FMU is written in this version of FMI"),
         (("export", "--to", "x.mo", "--kind", "me"), "this ending is another format's"),
         (("fit", "--executor", "spark://h:1"), "on this machine or by a dask scheduler"),
