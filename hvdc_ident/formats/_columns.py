@@ -97,6 +97,14 @@ def package(name: str, path: Path) -> Any:
         ) from None
 
 
+def decoded(content: bytes) -> str:
+    """Return text of bytes in UTF-8, else in the code page of Western Europe."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
 def damaged(path: Path, what: str, expected: str = "", got: str = "") -> WaveformError:
     """An error for a file whose content does not hold together."""
     return WaveformError(

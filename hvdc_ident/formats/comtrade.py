@@ -23,7 +23,7 @@ import numpy as np
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, damaged, own_names, package
+from hvdc_ident.formats._columns import check_size, damaged, decoded, own_names, package
 
 NAME = "comtrade"
 SUMMARY = "COMTRADE 1991, 1999 and 2013 of recorders and relays, ASCII, binary, float32, or all in one .cff"
@@ -60,7 +60,7 @@ def recognises(path: Path) -> bool:
     if suffix == ".cff":
         found = _SECTION.search(top)
         return found is not None and found[1].upper() == b"CFG"
-    return _counts(_decoded(top)) is not None
+    return _counts(decoded(top)) is not None
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -128,7 +128,7 @@ def _parts(path: Path, data: bool = True) -> tuple[str, bytes, str]:
         return _sections(path)
     if path.stat().st_size > _MAX_HEADER:
         raise damaged(path, "the header is too long", expected=f"at most {_MAX_HEADER >> 20} MiB")
-    text = _decoded(path.read_bytes())
+    text = decoded(path.read_bytes())
     return text, _beside(path).read_bytes() if data else b"", ""
 
 
@@ -161,7 +161,7 @@ def _sections(path: Path) -> tuple[str, bytes, str]:
     for kind in ("CFG", "DAT"):
         if kind not in found:
             raise damaged(path, f"no section {kind}", expected=f"a line '--- file type: {kind} ---'")
-    return _decoded(found["CFG"][0]), *found["DAT"]
+    return decoded(found["CFG"][0]), *found["DAT"]
 
 
 def _header(path: Path, text: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
@@ -272,14 +272,7 @@ def _filled(record: _Record) -> str:
 
 
 def _lines(data: bytes) -> str:
-    return "\n".join(line for line in _decoded(data).replace("\x1a", "").splitlines() if line.strip())
-
-
-def _decoded(content: bytes) -> str:
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
+    return "\n".join(line for line in decoded(data).replace("\x1a", "").splitlines() if line.strip())
 
 
 @contextlib.contextmanager

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
-from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import MAX_BYTES, event_rows, pick
+from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats._columns import check_size, damaged, decoded
 
 NAME = "dymola-mat"
 SUMMARY = "result files of Dymola and OpenModelica (MATLAB v4)"
@@ -32,7 +32,6 @@ _HEADER = 20  # bytes: type, rows, columns, imaginary part, length of the name
 _MAX_MATRICES = 64
 _MAX_NAME = 64
 _UNIT = re.compile(r"\[([^\[\]]*)\]\s*$")
-_HINT = "write the result again; the simulation or the copy may have been cut off"
 
 
 @dataclass(frozen=True)
@@ -95,14 +94,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     wanted = known[pick(path, signals, [result.names[i] for i in known])]
     time = _time(result, path)
     keep = event_rows(time)
-    size = int(keep.sum()) * wanted.size * 8
-    if size > MAX_BYTES:
-        raise WaveformError(
-            f"all {wanted.size} signals at {time.size} times take {size / 1e9:.1f} GB",
-            where=str(path),
-            expected=f"at most {MAX_BYTES / 1e9:.1f} GB",
-            hint="name the signals you need",
-        )
+    check_size(int(keep.sum()), wanted.size, path)
     values = np.empty((int(keep.sum()), wanted.size))
     for number in np.unique(result.table[wanted]):
         places = np.flatnonzero(result.table[wanted] == number)
@@ -140,17 +132,17 @@ def _open(path: Path) -> _Result:
     transposed = _is_transposed(matrices, path)
     for needed in ("name", "dataInfo", "data_2"):
         if needed not in matrices:
-            raise _damaged(path, f"no matrix '{needed}'", expected=f"one beside {', '.join(matrices)}")
+            raise damaged(path, f"no matrix '{needed}'", expected=f"one beside {', '.join(matrices)}")
     # one line per name, per row of a table: stored transposed, that is how the bytes already lie
     lines = {k: m.values if transposed else m.values.T for k, m in matrices.items()}
     names = _texts(lines["name"])
     info = lines["dataInfo"]
     if info.shape[0] != len(names) or info.shape[1] < 2:
-        raise _damaged(path, "matrix 'dataInfo' does not fit", expected=f"{len(names)} x 4", got=_shape(info))
+        raise damaged(path, "matrix 'dataInfo' does not fit", expected=f"{len(names)} x 4", got=_shape(info))
     described = "description" in lines and lines["description"].size > 0
     descriptions = _texts(lines["description"]) if described else ("",) * len(names)
     if len(descriptions) != len(names):
-        raise _damaged(path, "matrix 'description' does not fit", expected=f"{len(names)}", got=f"{len(descriptions)}")
+        raise damaged(path, "matrix 'description' does not fit", expected=f"{len(names)}", got=f"{len(descriptions)}")
     tables = {int(k[5:]): v for k, v in lines.items() if re.fullmatch(r"data_[1-9]\d?", k)}
     table, column = _places(info, path)
     result = _Result(names, tuple(_unit(text) for text in descriptions), table, column, tables)
@@ -160,12 +152,12 @@ def _open(path: Path) -> _Result:
 
 def _is_transposed(matrices: dict[str, _Matrix], path: Path) -> bool:
     if "Aclass" not in matrices:
-        raise _damaged(path, "not a result file", expected="a matrix 'Aclass'", got=", ".join(matrices) or "none")
+        raise damaged(path, "not a result file", expected="a matrix 'Aclass'", got=", ".join(matrices) or "none")
     lines = _texts(matrices["Aclass"].values.T)  # never transposed itself
     if len(lines) < 4 or lines[0] != "Atrajectory":
-        raise _damaged(path, "not a trajectory", expected="class 'Atrajectory'", got=f"'{lines[0][:30]}'")
+        raise damaged(path, "not a trajectory", expected="class 'Atrajectory'", got=f"'{lines[0][:30]}'")
     if lines[3] not in ("binTrans", "binNormal"):
-        raise _damaged(path, "unknown layout", expected="binTrans or binNormal", got=f"'{lines[3][:30]}'")
+        raise damaged(path, "unknown layout", expected="binTrans or binNormal", got=f"'{lines[3][:30]}'")
     return lines[3] == "binTrans"
 
 
@@ -173,7 +165,7 @@ def _places(info: NDArray[Any], path: Path) -> tuple[NDArray[np.int64], NDArray[
     """Table and signed column of each name."""
     numbers = np.asarray(info[:, :2], dtype=float)
     if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any() or (np.abs(numbers) > 2**31).any():
-        raise _damaged(path, "matrix 'dataInfo' holds other than whole numbers")
+        raise damaged(path, "matrix 'dataInfo' holds other than whole numbers")
     places = numbers.astype(np.int64)
     return places[:, 0], places[:, 1]
 
@@ -190,25 +182,25 @@ def _check_places(result: _Result, path: Path) -> None:
     if bad.any():
         i = int(np.argmax(bad))
         got = f"table {result.table[i]}, column {result.column[i]}"
-        raise _damaged(path, f"signal '{result.names[i][:80]}' has no column in the tables of the file", got=got)
+        raise damaged(path, f"signal '{result.names[i][:80]}' has no column in the tables of the file", got=got)
     if len(set(result.names)) < len(result.names):
         seen: set[str] = set()
         double = next(n for n in result.names if n in seen or seen.add(n))  # type: ignore[func-returns-value]
-        raise _damaged(path, f"two signals have the name '{double[:80]}'")
+        raise damaged(path, f"two signals have the name '{double[:80]}'")
 
 
 def _time(result: _Result, path: Path) -> Array:
     """(n,) the times of the table of variables in s."""
     table = result.tables[2]
     if table.shape[0] < 2 or table.shape[1] < 1:
-        raise _damaged(path, "matrix 'data_2' holds too few times", expected="at least 2", got=_shape(table))
+        raise damaged(path, "matrix 'data_2' holds too few times", expected="at least 2", got=_shape(table))
     time = np.asarray(table[:, 0], dtype=float)
     if not np.isfinite(time).all():
-        raise _damaged(path, f"the time in row {int(np.argmin(np.isfinite(time))) + 1} of 'data_2' is not finite")
+        raise damaged(path, f"the time in row {int(np.argmin(np.isfinite(time))) + 1} of 'data_2' is not finite")
     back = np.flatnonzero(np.diff(time) < 0)
     if back.size:
         a, b = time[back[0]], time[back[0] + 1]
-        raise _damaged(
+        raise damaged(
             path, f"the time goes back in row {int(back[0]) + 2} of 'data_2'", f"at least {a:g} s", f"{b:g} s"
         )
     return time
@@ -226,7 +218,7 @@ def _resampled(result: _Result, number: int, columns: NDArray[np.int64], time: A
     if len(times) and (found == found[0]).all():
         return found[:1]
     if len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise _damaged(path, f"matrix 'data_{number}' has times of its own that do not increase", got=_shape(table))
+        raise damaged(path, f"matrix 'data_{number}' has times of its own that do not increase", got=_shape(table))
     return np.column_stack([np.interp(time, times, found[:, j]) for j in range(columns.size)])
 
 
@@ -235,15 +227,15 @@ def matrices_of(path: Path) -> dict[str, _Matrix]:
     try:
         data: NDArray[np.uint8] = np.memmap(path, dtype=np.uint8, mode="r")
     except (OSError, ValueError) as error:
-        raise _damaged(path, f"cannot open the file: {error}") from None
+        raise damaged(path, f"cannot open the file: {error}") from None
     found: dict[str, _Matrix] = {}
     place = 0
     while place < data.size:
         if len(found) >= _MAX_MATRICES:
-            raise _damaged(path, "too many matrices", expected=f"at most {_MAX_MATRICES}")
+            raise damaged(path, "too many matrices", expected=f"at most {_MAX_MATRICES}")
         matrix, place = _matrix(data, place, path)
         if matrix.name in found:
-            raise _damaged(path, f"matrix '{matrix.name}' stands twice")
+            raise damaged(path, f"matrix '{matrix.name}' stands twice")
         found[matrix.name] = matrix
     return found
 
@@ -253,19 +245,19 @@ def _matrix(data: NDArray[np.uint8], place: int, path: Path) -> tuple[_Matrix, i
     top = data[place : place + _HEADER].tobytes()
     order = _order(top)
     if len(top) < _HEADER or order is None:
-        raise _damaged(path, f"no matrix header at byte {place}", expected="a MATLAB v4 matrix", got=f"{top[:8]!r}")
+        raise damaged(path, f"no matrix header at byte {place}", expected="a MATLAB v4 matrix", got=f"{top[:8]!r}")
     kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", top)
     code, text = kind % 1000 // 10, kind % 10
     if code not in _TYPES or text > 1 or imaginary or not 1 < length <= _MAX_NAME or rows < 0 or columns < 0:
         got = f"type {kind}, {rows} x {columns}, name of {length} bytes"
-        raise _damaged(path, f"no matrix header at byte {place}", expected="a real MATLAB v4 matrix", got=got)
+        raise damaged(path, f"no matrix header at byte {place}", expected="a real MATLAB v4 matrix", got=got)
     name = data[place + _HEADER : place + _HEADER + length].tobytes().split(b"\0")[0].decode("latin-1")
     dtype = np.dtype(f"{order}{_TYPES[code]}")
     start = place + _HEADER + length
     size = rows * columns * dtype.itemsize  # whole numbers of any length: cannot overflow
     if size > data.size - start:
         got = f"{max(0, data.size - start)} left in the file"
-        raise _damaged(path, f"matrix '{name}' of {rows} x {columns} is cut off", f"{size} bytes", got)
+        raise damaged(path, f"matrix '{name}' of {rows} x {columns} is cut off", f"{size} bytes", got)
     if size == 0:  # no bytes behind a number of rows or columns, which may be any
         rows = columns = 0
     values = data[start : start + size].view(dtype).reshape(columns, rows)
@@ -288,15 +280,7 @@ def _texts(lines: NDArray[Any]) -> tuple[str, ...]:
     if lines.dtype.kind == "f":
         lines = np.nan_to_num(lines, nan=0.0)
     codes = np.ascontiguousarray(np.clip(lines, 0, 255).astype(np.uint8))
-    return tuple(_decoded(row.tobytes()) for row in codes) or ("",)
-
-
-def _decoded(text: bytes) -> str:
-    text = text.split(b"\0")[0].rstrip()
-    try:
-        return text.decode("utf-8")
-    except UnicodeDecodeError:
-        return text.decode("latin-1")
+    return tuple(decoded(row.tobytes().split(b"\0")[0].rstrip()) for row in codes) or ("",)
 
 
 def _unit(description: str) -> str:
@@ -307,7 +291,3 @@ def _unit(description: str) -> str:
 
 def _shape(values: NDArray[Any]) -> str:
     return " x ".join(str(n) for n in values.shape)
-
-
-def _damaged(path: Path, what: str, expected: str = "", got: str = "") -> WaveformError:
-    return WaveformError(what, where=str(path), expected=expected, got=got, hint=_HINT)

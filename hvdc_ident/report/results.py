@@ -50,6 +50,16 @@ class Results:
         return self.stages.get(stage, {})
 
     @property
+    def units(self) -> dict[str, str]:
+        """Unit of every recorded output, by its name."""
+        return {**(self.get("simulation").get("units") or {}), **(self.get("fit").get("units") or {})}
+
+    @property
+    def experiments(self) -> dict[str, dict[str, Any]]:
+        """Role, event, window, recording and status of every experiment, by its name."""
+        return {**(self.get("simulation").get("experiments") or {}), **(self.get("fit").get("experiments") or {})}
+
+    @property
     def heading(self) -> dict[str, Any]:
         """Schema, study, model, software, seed and sources, from the last stage of the chain that has them."""
         return self.get("run") or self.get("fit") or next(iter(self.stages.values()))

@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from hvdc_ident.errors import UnknownNameError, WaveformError
-from hvdc_ident.formats import convert, dymola_mat, list_signals, read_waveforms
+from hvdc_ident.formats import convert, list_signals, read_waveforms
 
 REAL = Path(__file__).parents[2] / "../shared/data/dymola/TwoNodePowerSystem.mat"
 needs_real = pytest.mark.skipif(not REAL.is_file(), reason=f"no recorded result file at {REAL}")
@@ -176,7 +176,7 @@ def test_damage_is_named(tmp_path: Path, changes: dict[str, Any], message: str) 
 
 
 def test_too_much_for_memory_asks_for_a_selection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dymola_mat, "MAX_BYTES", 50)
+    monkeypatch.setattr("hvdc_ident.formats._columns.MAX_BYTES", 50)
     path = result(tmp_path)
     with pytest.raises(WaveformError, match="name the signals you need"):
         read_waveforms(path)

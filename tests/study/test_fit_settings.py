@@ -10,6 +10,7 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit.windowed_errors import WINDOWS
+from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections import gains, output_errors, residuals
 from hvdc_ident.study import fitting
 from hvdc_ident.study.examples import write_starter
@@ -48,14 +49,11 @@ def plain(folder) -> tuple[dict, dict[str, str]]:
     return fitted(study(folder, "plain"))
 
 
-class Pages:
-    """Results as the report's sections read them."""
-
-    def __init__(self, fit: dict) -> None:
-        self.fit = fit
-
-    def get(self, name: str) -> dict:
-        return self.fit if name == "fit" else {}
+def pages(fit: dict) -> Results:
+    """Results of a fit alone, as the report's sections read them."""
+    results = Results(Path())
+    vars(results)["stages"] = {"fit": fit}
+    return results
 
 
 def test_a_plain_fit_has_everything_a_reader_needs(plain):
@@ -77,7 +75,7 @@ def test_a_plain_fit_has_everything_a_reader_needs(plain):
     assert header == ["time", "Irorder1", "Irorder1.measured", "Irorder1.low", "Irorder1.high"]
     rows = np.genfromtxt(files["fit.ramp.csv"].splitlines(), delimiter=",", names=True)
     assert (rows["Irorder1low"] < rows["Irorder1"]).all() and (rows["Irorder1high"] > rows["Irorder1"]).all()
-    page = "".join(s.SECTION.render(Pages(data)) for s in (gains, output_errors, residuals))
+    page = "".join(s.SECTION.render(pages(data)) for s in (gains, output_errors, residuals))
     for words in ("The fit converged", "Correlation", "during", "Held-out experiments", "F test", "61400-27-2"):
         assert words in page
     assert "complian" not in page.lower()
@@ -99,7 +97,7 @@ def test_ties_priors_loss_and_whitening(folder):
     assert "# KIQ2 = 2*KIQ = 60.0" in files["fitted-values.toml"]
     assert data["estimates"]["KIVDC"]["method"] == "covariance"
     assert data["estimates"]["KIVDC"]["value"] == pytest.approx(734.7, abs=0.5)
-    assert "What follows from the estimates" in gains.SECTION.render(Pages(data))
+    assert "What follows from the estimates" in gains.SECTION.render(pages(data))
 
 
 def test_nuisances_of_every_kind(folder):
@@ -117,8 +115,8 @@ def test_nuisances_of_every_kind(folder):
     assert own["KIVDC"]["value"] == pytest.approx(734.7, abs=1.0)
     assert own["Pref2"]["value"] == pytest.approx(0.0, abs=1e-4)
     assert data["validation"]["ramp"]["nuisance"]["KIVDC"] == pytest.approx(734.7, abs=5.0)
-    assert "from this record itself" in output_errors.SECTION.render(Pages(data))
-    assert "Pref2" in gains.SECTION.render(Pages(data))
+    assert "from this record itself" in output_errors.SECTION.render(pages(data))
+    assert "Pref2" in gains.SECTION.render(pages(data))
 
 
 def test_capacitance_and_settling_time_with_the_gains_they_mean(folder, plain):
@@ -178,4 +176,4 @@ def test_a_candidate_held_on_a_bound_is_in_the_status(folder):
     assert data["message"].endswith("held on a bound: KIVDC")
     assert data["estimates"]["KIVDC"]["std"] is None
     assert stage("fit").tell(data)[0].startswith("at-bound: ")
-    assert "The fit ended on a bound" in gains.SECTION.render(Pages(data))
+    assert "The fit ended on a bound" in gains.SECTION.render(pages(data))

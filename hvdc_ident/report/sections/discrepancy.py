@@ -27,7 +27,7 @@ def _render(results: Results) -> str:
     found = results.get("discrepancy")
     if not found.get("verdict"):
         return ""
-    units = {**(results.get("simulation").get("units") or {}), **(results.get("fit").get("units") or {})}
+    units = results.units
     parts = [
         _lead(found),
         _effects(found),

@@ -87,10 +87,9 @@ def _missed(results: Results, found: dict[str, Any]) -> str:
         how = f"by {100 * most:.2g} % of all that it does there "
     elif times:
         how = f"by {most:.3g} times its noise "
-    units = {**(results.get("fit").get("units") or {}), **(results.get("simulation").get("units") or {})}
     return (
         f"With the gains it came with, your model misses {output} in experiment '{experiment}' {how}(RMSE {rmse:.3g} "
-        f"{units.get(output, '')}), more than any other recorded signal."
+        f"{results.units.get(output, '')}), more than any other recorded signal."
     ).replace(" )", ")")
 
 

@@ -17,8 +17,7 @@ def _render(results: Results) -> str:
     before = fit.get("rmse_given") or simulation.get("rmse") or {}
     if not before and not after:
         return ""
-    roles = {**(simulation.get("experiments") or {}), **(fit.get("experiments") or {})}
-    units = {**(simulation.get("units") or {}), **(fit.get("units") or {})}
+    roles, units = results.experiments, results.units
     rows = []
     for output, line in (after or before).items():
         for name in line:

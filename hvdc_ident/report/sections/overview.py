@@ -16,7 +16,7 @@ def _render(results: Results) -> str:
 
 
 def _asked(results: Results, fit: dict[str, Any]) -> str:
-    experiments = {**(results.get("simulation").get("experiments") or {}), **(fit.get("experiments") or {})}
+    experiments = results.experiments
     held_out = sum(1 for e in experiments.values() if e.get("role") == "holdout")
     kept = f", {held_out} of them held out" if held_out else ""
     against = f" against {_count(len(experiments), 'experiment')}{kept}" if experiments else ""

@@ -22,11 +22,9 @@ MARGINS = {"left": 0.11, "right": 0.99, "bottom": 0.12, "top": 0.91, "hspace": 0
 
 
 def _render(results: Results) -> str:
-    fit, simulation = results.get("fit"), results.get("simulation")
-    experiments = {**(simulation.get("experiments") or {}), **(fit.get("experiments") or {})}
+    experiments, units = results.experiments, results.units
     if not experiments:
         return ""
-    units = {**(simulation.get("units") or {}), **(fit.get("units") or {})}
     parts: list[str] = []
     left, sheet = MOST, Sheet.new()
     for name, about in experiments.items():
