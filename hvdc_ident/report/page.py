@@ -12,8 +12,8 @@ from markupsafe import Markup
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_bytes, write_text
+from hvdc_ident.report.drawing import asset, scripts
 from hvdc_ident.report.html import text
-from hvdc_ident.report.interactive import asset, scripts
 from hvdc_ident.report.results import Results, Section
 from hvdc_ident.text import with_study
 

@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.data import Array, Trajectory, recording_lines
-from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg, visible, visible_rows
+from hvdc_ident.report.drawing import (
+    AFTER,
+    BEFORE,
+    MARK,
+    MEASURED,
+    PlottedCurve,
+    figure,
+    svg,
+    visible,
+    visible_rows,
+    zoomable,
+)
 from hvdc_ident.report.html import text
-from hvdc_ident.report.interactive import PlottedCurve, zoomable
 from hvdc_ident.report.results import Results, Section
 
 if TYPE_CHECKING:
