@@ -28,6 +28,7 @@ from hvdc_ident.errors import InputError, WaveformError, unknown_name
 __all__ = [
     "MAX_BYTES",
     "Format",
+    "check_times",
     "convert",
     "event_rows",
     "files_of",
@@ -341,21 +342,32 @@ def _recognised(module: Format, path: Path) -> bool:
         return False
 
 
-def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
-    """Refuse a trajectory without the properties that every format promises, which its module need not check."""
-    where = str(path)
-    if len(found) < rows:
-        raise WaveformError("too few rows", where=where, expected=f"at least {rows}", got=f"{len(found)}")
-    if not np.isfinite(found.time).all():
-        raise WaveformError(f"the time in row {int(np.argmin(np.isfinite(found.time))) + 1} is not finite", where=where)
-    back = np.flatnonzero(np.diff(found.time) < 0)
+def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
+    """Raise WaveformError where there are fewer rows, or the times are not finite or go back."""
+    t, where = found.time, str(path)
+    if t.size < rows:
+        hint = "export it again; it may have been cut off"
+        raise WaveformError("too few rows", where=where, expected=f"at least {rows}", got=f"{t.size}", hint=hint)
+    if not np.isfinite(t).all():
+        row = int(np.argmin(np.isfinite(t)))
+        raise WaveformError(
+            f"the time in row {row + 1} is not finite", where=where, expected="a time in s", got=f"{t[row]}",
+            hint="cut the rows without a time, or export it again; it may have been cut off",
+        )  # fmt: skip
+    back = np.flatnonzero(np.diff(t) < 0)
     if back.size:
-        t = found.time
         raise WaveformError(
             f"the time goes back from {t[back[0]]:g} s to {t[back[0] + 1]:g} s",
             where=where,
             expected="increasing times",
+            hint="sort the rows by time, or cut the record where its time begins again",
         )
+
+
+def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
+    """Refuse a trajectory without the properties that every format promises, which its module need not check."""
+    check_times(found, path, rows)
+    where = str(path)
     if not event_rows(found.time).all():
         raise WaveformError("one time stands more than twice", where=where, expected="two rows at a jump")
     bad = np.argwhere(np.isinf(found.values))

@@ -12,7 +12,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import MAX_BYTES, once
+from hvdc_ident.formats import MAX_BYTES, check_times, once
 
 TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo", "time_s", "t_s")
 """What a time vector is called, lower case, in the order of preference."""
@@ -65,11 +65,8 @@ def joined(parts: Sequence[Trajectory], path: Path) -> Trajectory:
 
 
 def checked(record: Trajectory, path: Path) -> Trajectory:
-    """Return the record with the first and last row of every instant alone. Raises WaveformError where its times are none."""
-    if len(record) < 2 or not np.isfinite(record.time).all():
-        raise damaged(path, "a time vector is too short or not finite", expected="at least 2 times")
-    if (np.diff(record.time) < 0).any():
-        raise damaged(path, "the time goes back", expected="increasing times")
+    """Return the record with the first and last row of every instant alone. Raises WaveformError as `check_times`."""
+    check_times(record, path)
     return once(record)
 
 

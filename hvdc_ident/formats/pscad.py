@@ -70,7 +70,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         raise damaged(path, "no channels", expected="a line PGB(1) Output Desc=...")
     first = next(iter(tables.values()))
     for number, table in tables.items():
-        if table.shape[0] != first.shape[0] or not np.array_equal(table[:, 0], first[:, 0]):
+        if table.shape[0] != first.shape[0] or not np.array_equal(table[:, 0], first[:, 0], equal_nan=True):
             raise damaged(_out_file(path, number + 1), "its times differ from those of the other .out files")
     check_size(len(first), len(wanted), path)
     values = np.column_stack([tables[(c.number - 1) // _PER_FILE][:, (c.number - 1) % _PER_FILE + 1] for c in wanted])

@@ -80,6 +80,37 @@ def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> N
         read_waveforms(tmp_path / "run.inf")
 
 
+ALL = ("a.parquet", "a.inf", "a.h5", "a.mat")
+
+
+@pytest.mark.parametrize(
+    ("times", "what", "name"),
+    [
+        *(([0.0], "too few rows; expected at least 2, got 1", n) for n in ("a.parquet", "a.h5")),
+        *(([0.0, np.nan, 0.2], "the time in row 2 is not finite; expected a time in s, got nan", n) for n in ALL),
+        *(([0.0, 0.2, 0.1], "the time goes back from 0.2 s to 0.1 s; expected increasing times", n) for n in ALL),
+    ],
+)
+def test_times_that_are_none_are_refused_alike(tmp_path: Path, times: list[float], what: str, name: str) -> None:
+    y = np.zeros(len(times))
+    if name == "a.parquet":
+        pytest.importorskip("pyarrow.parquet").write_table(
+            pytest.importorskip("pyarrow").table({"time": times, "y": y}), tmp_path / name
+        )
+    elif name == "a.inf":
+        (tmp_path / name).write_text('PGB(1) Output Desc="y" Group="" Max=2.0 Min=-2.0 Units=""\n', "utf-8")
+        (tmp_path / "a_01.out").write_text("\n" + "".join(f"{t} 0.0\n" for t in times), "utf-8")
+    elif name == "a.h5":
+        with pytest.importorskip("h5py").File(tmp_path / name, "w") as file:
+            file["time"], file["y"] = times, y
+    else:
+        from scipy.io import savemat
+
+        savemat(tmp_path / name, {"time": times, "y": y})
+    with pytest.raises(WaveformError, match=rf"{what}. Try: "):
+        read_waveforms(tmp_path / name)
+
+
 def test_netcdf_of_both_kinds(tmp_path: Path) -> None:
     from scipy.io import netcdf_file
 
