@@ -15,7 +15,7 @@ from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.study.stages.identify import told
+from hvdc_ident.study.stages.identify import lines_of
 from tests.fit.simulators import recorded
 from tests.identifiability.cases import closed
 
@@ -143,10 +143,10 @@ def test_a_misfit_is_told_first_and_beside_every_interval() -> None:
         "notes": [],
         "recommended_experiment": None,
     }
-    first, a, b = told(data)
+    first, a, b = lines_of(data)
     assert first.startswith("The model does not explain these data: the residuals are 40 times the noise.")
     assert a.endswith("(chi2/dof 1.6e+03)") and "chi2" not in b
-    assert "chi2" not in "".join(told({**data, "misspecified": False}))
+    assert "chi2" not in "".join(lines_of({**data, "misspecified": False}))
 
 
 @pytest.mark.parametrize("high", [3.0, 50.0])
