@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.fmi import DISCARD, ERROR, FmiError, TerminationRequested, Vector
-from hvdc_ident.fmu.instance import SAME, Instance, RunEnded, RunFailed, apart, moving
+from hvdc_ident.fmu.instance import REPEAT_TOLERANCE, Instance, RunEnded, RunFailed, difference, moving
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 
 EARLY = 10_000  # early returns in one communication step
@@ -124,7 +124,7 @@ def find_calls(
     if not (sloping or reading):
         return
     last = int(np.searchsorted(time, stops[np.argmax(changes)], side="right")) + TRIAL
-    span, allowed = time[:last], max(tolerance, SAME)
+    span, allowed = time[:last], max(tolerance, REPEAT_TOLERANCE)
     if reading:
         found = _harmless_reading(span, allowed, run)
         if found is not None:
@@ -178,10 +178,10 @@ def _harmless_reading(time: Array, allowed: float, run: Callable[[CallPattern, A
                 read = run(CallPattern(reading, plain=True), time)
             except (FmiError, RunFailed):
                 continue
-            if (apart(read, undisturbed) <= allowed * size)[steady].all():
+            if (difference(read, undisturbed) <= allowed * size)[steady].all():
                 return reading
         if attempt == 0:  # an output such as the time that the computation took is never repeated, and does not judge
-            steady = apart(run(CallPattern("never", plain=True), time), undisturbed) <= allowed * size
+            steady = difference(run(CallPattern("never", plain=True), time), undisturbed) <= allowed * size
             if not steady.any():
                 return None
             if steady.all():
@@ -197,9 +197,9 @@ def _tried_slopes(time: Array, allowed: float, held: CallPattern, run: Callable[
     itself. A factor of 2 leaves room for the solver's noise.
     """
     finer, coarse = run(replace(held, parts=PARTS), time), run(held, time)
-    off, allowance = apart(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
+    off, allowance = difference(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
     try:
-        sloped = apart(run(replace(held, sloping=True), time), finer)
+        sloped = difference(run(replace(held, sloping=True), time), finer)
     except (FmiError, RunFailed):
         return "ignored"
     if (sloped > 2.0 * off + allowance).any():
@@ -223,7 +223,7 @@ def _go(
     rows = signals.at(stops, "left"), signals.at(stops, "right")
     instance.begin(values, rows[0][0], float(time[0]), float(stops[-1]), tolerance)
     before, after = (list(map(tuple, side.tolist())) for side in rows)  # compared in every step: tuples are quickest
-    seen = instance.block(names)
+    seen = instance.variables(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
     stepper = _Stepper(instance, calls, before[0], seen.get)
     shows = calls.reading != "never"
@@ -351,7 +351,7 @@ class _Stepper:
         self._apply(first)
         if moves or self._sloping:
             self._slopes.values[:] = (np.array(last) - np.array(first)) / (b - a)
-            self.instance.library.set_slopes_of_inputs(self._references, self._orders, self._slopes)
+            self.instance.library.set_input_derivatives(self._references, self._orders, self._slopes)
             self._sloping = moves
         self._advance(a, b)
         self._stepped = last
@@ -367,7 +367,7 @@ class _Stepper:
         t, rounding = a, 1e-12 * max(abs(b), 1.0)
         for _ in range(EARLY):
             try:
-                reached, computed = self.instance.library.step(t, b - t)
+                reached, computed = self.instance.library.do_step(t, b - t)
             except TerminationRequested as e:
                 raise RunEnded(max(e.reached, t)) from None
             if reached >= b - rounding:

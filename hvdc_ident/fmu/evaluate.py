@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known, unknown_name
+from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance, chains_of
@@ -18,21 +18,18 @@ from hvdc_ident.simulate import Simulation, Statistics, Tolerance, chains_of
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
-
-LARGE = 1e300
-"""A bound where there is none: JSON has no infinity."""
+UNBOUNDED = 1e300  # a bound where there is none: JSON has no infinity
 
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """A way in which the inputs of a run move, of such a size that one of them moves by its range.
+    """A direction in which the inputs of a run move, scaled such that one of them moves by its range.
 
-    points: of all inputs, one after the other, as `PackedInputs.values`. like: a name shared by directions for which the same
-    step of differences does.
+    points: of all inputs, joined as `PackedInputs.values`. key: shared by directions that need the same difference step.
     """
 
     points: Array
-    like: str
+    key: str
 
 
 def simulate(
@@ -44,45 +41,38 @@ def simulate(
     tolerance: Tolerance,
     partial: bool = False,
 ) -> Simulation:
-    """The run, with its recording chains and effects. See `FmuModel.simulate`."""
-    from hvdc_ident.fmu.terminal_effects import TerminalRun
+    """Return the run with its recording chains and effects. See `FmuModel.simulate`."""
+    from hvdc_ident.fmu.terminal_effects import RunWithEffects
 
-    place = f"experiment '{experiment.name}'"
+    where = f"experiment '{experiment.name}'"
     given = {**experiment.values, **values}
     names = tuple(model.outputs if outputs is None else outputs)
     try:
-        checked = (
-            model.recording((*names, *experiment.instrument))
-            .driven(experiment.drive)
-            .with_effects(chains_of(experiment.instrument))
-        )
+        recording = model.recording((*names, *experiment.instrument))
+        checked = recording.driven(experiment.drive).with_effects(chains_of(experiment.instrument))
     except InputError as e:
-        raise e.at(place) from None
-    for name in (*given, *experiment.inputs):
-        if name not in checked.parameters and name not in checked.inputs:
-            known = [*checked.parameters, *checked.inputs]
-            raise unknown_name("parameter or input", name, known, where=place)
-    for name in sensitivities:
-        if name not in checked.parameters and name not in checked.inputs:
-            raise unknown_name("parameter or input", name, [*checked.parameters, *checked.inputs], where=place)
+        raise e.at(where) from None
+    known = {**checked.parameters, **checked.inputs}
+    require_known("parameter or input", (*given, *experiment.inputs, *sensitivities), known, where)
     if experiment.starts:
         raise ModelError(
             "an FMU begins where its own initialisation puts it",
-            where=place,
+            where=where,
             expected="no starts of states",
             got=", ".join(experiment.starts),
             hint="a parameter of the FMU that is a start value, where it has one",
         )
-    require_known("input", experiment.offsets, checked.inputs, f"{place}, offsets")
+    require_known("input", experiment.offsets, checked.inputs, f"{where}, offsets")
     try:
         if checked.effects:
-            return TerminalRun(checked, experiment, given, names, tolerance).simulation(sensitivities)
-        return bare(checked, experiment, given, sensitivities, names, tolerance, partial=partial and not sensitivities)
+            return RunWithEffects(checked, experiment, given, names, tolerance).simulation(sensitivities)
+        accept_end = partial and not sensitivities
+        return simulate_without_effects(checked, experiment, given, sensitivities, names, tolerance, partial=accept_end)
     except HvdcIdentError as e:
-        raise e.at(place) from None
+        raise e.at(where) from None
 
 
-def bare(
+def simulate_without_effects(
     model: FmuModel,
     experiment: Experiment,
     given: Mapping[str, float],
@@ -91,32 +81,33 @@ def bare(
     tolerance: Tolerance,
     *,
     partial: bool = False,
-    kin: str = "",
+    noise_key: str = "",
     directions: Mapping[str, Direction] | None = None,
 ) -> Simulation:
-    """The run of the FMU itself, without effects.
+    """Return the run of the FMU itself.
 
-    partial: whether the rows up to an end that the FMU asks for do. kin: text that is the same for runs whose noise, and
-    whose steps of differences, are alike though their inputs differ. directions: ways in which all inputs move, by a name
-    that is no parameter's; derivatives along them come after those of the sensitivities.
+    partial: whether the rows up to an end that the FMU asks for are accepted. noise_key: shared by runs whose noise and
+    difference steps are alike though their inputs differ. directions: in which all inputs move, by a name that is no
+    parameter's; derivatives along them come after those of the sensitivities.
     """
     along = directions or {}
     signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
-    known = about(model, sensitivities)
+    scales = [*_scales(model, sensitivities), *([1.0, (-UNBOUNDED, UNBOUNDED), 0.0] for _ in along)]
+    sizes, bounds, starts = zip(*scales, strict=True) if scales else ((), (), ())
+    sensitivities = (*sensitivities, *along)
     heading = {
         "do": "simulate",
         "values": changed(model, given),
         "outputs": names,
-        "parameters": (*sensitivities, *along),
-        "sizes": [*known["sizes"], *(1.0 for _ in along)],
-        "bounds": [*known["bounds"], *([-LARGE, LARGE] for _ in along)],
-        "starts": [*known["starts"], *(0.0 for _ in along)],
+        "parameters": sensitivities,
+        "sizes": sizes,
+        "bounds": bounds,
+        "starts": starts,
         "tolerance": tolerance.rtol,
         "partial": partial,
-        "kin": kin,
-        "directions": {n: d.like for n, d in along.items()},
+        "noise key": noise_key,
+        "directions": {n: d.key for n, d in along.items()},
     }
-    sensitivities = (*sensitivities, *along)
     arrays = {
         "time": experiment.time,
         "sizes": signals.sizes,
@@ -127,9 +118,6 @@ def bare(
     if along:
         arrays["directions"] = np.array([d.points for d in along.values()])
     answer, out = model.pool.ask(heading, arrays)
-    units = tuple(model.outputs[n].unit for n in names)
-    accepted, events, evaluations, segments = answer["counts"]
-    method = "lsoda" if model.has_equations else "co-simulation"
     notes = dict(answer["notes"])
     if not model.fmu.outputs and set(names) == set(model.fmu.shown):
         notes["outputs"] = "the FMU declares none: its states are recorded"
@@ -140,8 +128,10 @@ def bare(
         notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {worst}, the least certain"
     rows = out["outputs"]
     status = "converged" if rows.shape[0] == experiment.time.size else "ended"
+    method = "lsoda" if model.has_equations else "co-simulation"
+    accepted, events, evaluations, segments = answer["counts"]
     return Simulation(
-        Trajectory(experiment.time[: rows.shape[0]], rows, names, units),
+        Trajectory(experiment.time[: rows.shape[0]], rows, names, tuple(model.outputs[n].unit for n in names)),
         sensitivities,
         out["gradients"],
         Statistics(status, method, accepted, 0, events, evaluations, segments, 0),
@@ -150,18 +140,18 @@ def bare(
 
 
 def inputs_of(model: FmuModel, experiment: Experiment, given: Mapping[str, float]) -> dict[str, InputSignal]:
-    """Every input's signal, its offset added."""
-    found = {}
-    for name, own in model.inputs.items():
-        signal = experiment.inputs.get(name) or InputSignal.constant(given.get(name, own.value))
+    """Return every input's signal, with its offset added."""
+    signals = {}
+    for name, default in model.inputs.items():
+        signal = experiment.inputs.get(name) or InputSignal.constant(given.get(name, default.value))
         offset = experiment.offsets.get(name, 0.0)
-        found[name] = InputSignal(signal.times, signal.values + offset, signal.breaks) if offset else signal
-    return found
+        signals[name] = InputSignal(signal.times, signal.values + offset, signal.breaks) if offset else signal
+    return signals
 
 
 def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
-    """The values of the FMU's parameters that are not what it starts with. Raises ModelError where one cannot be set."""
-    found = {}
+    """Return the values of the FMU's parameters that differ from its starts. Raises ModelError where one cannot be set."""
+    values = {}
     for name, variable in model.fmu.parameters.items():
         value = float(given.get(name, model.parameters[name].value))
         if not np.isfinite(value):
@@ -171,24 +161,27 @@ def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
                 f"parameter '{name}' takes whole numbers only", where=f"model '{model.name}'", got=f"{value:g}"
             )
         if value != variable.start:
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
-def about(model: FmuModel, sensitivities: Sequence[str]) -> dict[str, list[object]]:
-    """Return what differences need of parameters and inputs: typical sizes, bounds, where they stand if nobody sets them."""
-    sizes, bounds, starts = [], [], []
+def _scales(model: FmuModel, sensitivities: Sequence[str]) -> list[tuple[float, tuple[float, float], float]]:
+    """Return typical size, bounds and start of each parameter or input by which derivatives are asked for."""
+    scales = []
     for name in sensitivities:
         variable = model.fmu.parameters.get(name) or model.fmu.inputs[name]
         if variable.whole:
             raise ModelError(
                 f"there is no derivative by '{name}', which takes whole numbers only", where=f"model '{model.name}'"
             )
-        own = model.parameters.get(name)
-        sizes.append(own.size if own else max(abs(model.inputs[name].value), variable.nominal))
-        bounds.append([max(own.min, -LARGE), min(own.max, LARGE)] if own else [-LARGE, LARGE])
-        starts.append(variable.start or 0.0)
-    return {"sizes": list(sizes), "bounds": list(bounds), "starts": list(starts)}
+        start = variable.start or 0.0
+        if parameter := model.parameters.get(name):
+            bounds = max(parameter.min, -UNBOUNDED), min(parameter.max, UNBOUNDED)
+            scales.append((parameter.size, bounds, start))
+        else:
+            size = max(abs(model.inputs[name].value), variable.nominal)
+            scales.append((size, (-UNBOUNDED, UNBOUNDED), start))
+    return scales
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +193,7 @@ class FmuPoint:
     """
 
     x: Array
-    slopes: Array
+    derivatives: Array
     outputs: Array
     jacobian: Array
     nominals: Array
@@ -210,7 +203,7 @@ class FmuPoint:
 
 
 def smooth_inputs(model: FmuModel) -> tuple[str, ...]:
-    """The inputs that may change continuously: those a Jacobian has columns for."""
+    """Return the inputs that may change continuously: those a Jacobian has columns for."""
     return tuple(n for n, v in model.fmu.inputs.items() if v.continuous)
 
 
@@ -224,7 +217,7 @@ def at_point(
     *,
     check: bool = True,
 ) -> FmuPoint:
-    """The FMU at values of parameters and inputs; states None: where its own initialisation puts them.
+    """Return the FMU at values of parameters and inputs; states None: where its own initialisation puts them.
 
     parameters: those the Jacobian has columns for. check: whether directional derivatives that once agreed with
     differences are compared again. Raises ModelError where it has no equations, SimulationError where
@@ -242,16 +235,15 @@ def at_point(
         "values": changed(model, values),
         "time": time,
         "outputs": list(outputs),
-        "jacobian": True,
         "check": check,
         "parameters": list(parameters),
-        "sizes": about(model, parameters)["sizes"],
+        "sizes": [size for size, _, _ in _scales(model, parameters)],
     }
     u = np.array([float(values.get(n, i.value)) for n, i in model.inputs.items()])
     answer, out = model.pool.ask(heading, {"u": u, **({} if states is None else {"x": states})})
     return FmuPoint(
         out["x"],
-        out["slopes"],
+        out["derivatives"],
         out["outputs"],
         out["jacobian"],
         out["nominals"],

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from ctypes import CFUNCTYPE, addressof, byref, c_bool, c_double, c_int, c_size_t, c_void_p
-from dataclasses import dataclass
+from functools import partial
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ FmiError = FMICallException
 """Raised by a call that returned discard, error or fatal; `.function`, `.status`."""
 WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
 Function = Callable[..., None]
-KEPT = 30  # messages of the FMU that are kept
+MESSAGES_KEPT = 30
 
 
 def why_not_loaded(error: Exception, folder: str, d: Description) -> tuple[str, str]:
@@ -61,9 +61,9 @@ def _missing_libraries(library: Path) -> list[str]:
     return [line.split()[0] for line in said.splitlines() if line.strip().endswith("not found")]
 
 
-def refusal(d: Description, said: str) -> str:
-    """Return what to try where an FMU gives no instance. said: its own words."""
-    words = said.casefold()
+def refusal(d: Description, message: str) -> str:
+    """Return a hint for an FMU that gives no instance, by what its message names."""
+    words = message.casefold()
     if "guid" in words or "token" in words:
         return "take binary and modelDescription.xml from one export: they do not belong together"
     if "licen" in words:
@@ -73,18 +73,8 @@ def refusal(d: Description, said: str) -> str:
     return "look for a wrong GUID, a missing licence or a missing resource, which make an FMU refuse"
 
 
-@dataclass(frozen=True)
-class DiscreteUpdate:
-    """Result of one event iteration: another iteration wanted, the end, states or nominals changed, the next time event, s."""
-
-    again: bool
-    end: bool
-    states_changed: bool
-    next_time: float | None
-
-
 class TerminationRequested(Exception):
-    """The FMU asked for the end of the run in a step. reached: the instant that it stands at, s."""
+    """The FMU requested the end of the run during a step. reached: the instant that it has reached, s."""
 
     def __init__(self, reached: float) -> None:
         super().__init__("the FMU asked for the end of the run")
@@ -104,7 +94,7 @@ class Vector:
 
 
 class VariableGroup:
-    """Some variables of an FMU, to be read or set together: values in their order, whatever their types."""
+    """Variables of an FMU, of any numeric types, that are read or set together, in their order."""
 
     def __init__(self, library: FmiLibrary, variables: Sequence[Variable]) -> None:
         self._library = library
@@ -119,16 +109,14 @@ class VariableGroup:
         self._groups = groups
 
     def get(self) -> Array:
-        """The values now, (n,); the array is used again by the next call."""
+        """Return the present values, (n,); the next call overwrites the array."""
         if self._fast:
             if self._vector.size:
                 self._library.get_reals(self._references, self._vector)
             return self._vector.values
-        for kind, places in self._groups.items():
-            found = getattr(self._library.fmu, f"get{_call_of(kind, self._library.version)}")(
-                [self.variables[i].reference for i in places]
-            )
-            self.values[places] = [float(x) for x in found]
+        for kind, indices in self._groups.items():
+            values = self._accessor("get", kind)([self.variables[i].reference for i in indices])
+            self.values[indices] = [float(x) for x in values]
         return self.values
 
     def set(self, values: Array | Sequence[float]) -> None:
@@ -138,64 +126,16 @@ class VariableGroup:
                 self._vector.values[:] = values
                 self._library.set_reals(self._references, self._vector)
             return
-        for kind, places in self._groups.items():
-            given = [float(values[i]) if kind in REAL else round(float(values[i])) for i in places]
+
+        for kind, indices in self._groups.items():
+            given = [float(values[i]) if kind in REAL else round(float(values[i])) for i in indices]
             exact = [bool(x) for x in given] if kind == "Boolean" else given
-            getattr(self._library.fmu, f"set{_call_of(kind, self._library.version)}")(
-                [self.variables[i].reference for i in places], exact
-            )
+            self._accessor("set", kind)([self.variables[i].reference for i in indices], exact)
 
-
-def _call_of(kind: str, version: int) -> str:
-    """Name of the type in FMPy's getters and setters; an enumeration has those of whole numbers."""
-    return ("Integer" if version == 2 else "Int64") if kind == "Enumeration" else kind
-
-
-@dataclass(frozen=True)
-class FmiFunctions:
-    """The functions of an FMU that are called in every step, each of which raises FmiError.
-
-    Vectors go in as addresses. They are bound here because FMPy's own way to them, which can log each call, takes as
-    long as a small FMU does.
-    """
-
-    get_reals: Function
-    set_reals: Function
-    directional: Function
-    set_time: Function
-    set_states: Function
-    get_states: Function
-    get_slopes: Function
-    get_indicators: Function
-    completed_step: Function
-    step: Function
-
-    @classmethod
-    def of(cls, library: Any, version: int, exchange: bool) -> FmiFunctions:
-        """Return those of a library; of what its interface has not, calls that raise."""
-        sized = [c_size_t] if version == 3 else []
-        real, slopes = ("Real", "Derivatives") if version == 2 else ("Float64", "ContinuousStateDerivatives")
-        vector, flag = [c_void_p, c_size_t], _flag(version)
-
-        def bound(name: str, *types: Any) -> Function:
-            return _bound(library, f"fmi{version}{name}", types)
-
-        def none(name: str, *types: Any) -> Function:
-            return _missing(f"fmi{version}{name}")
-
-        me, cs = (bound, none) if exchange else (none, bound)
-        return cls(
-            bound(f"Get{real}", *vector, c_void_p, *sized),
-            bound(f"Set{real}", *vector, c_void_p, *sized),
-            bound("GetDirectionalDerivative", *vector, *vector, c_void_p, *sized, c_void_p, *sized),
-            me("SetTime", c_double),
-            me("SetContinuousStates", *vector),
-            me("GetContinuousStates", *vector),
-            me(f"Get{slopes}", *vector),
-            me("GetEventIndicators", *vector),
-            me("CompletedIntegratorStep", flag, c_void_p, c_void_p),
-            cs("DoStep", c_double, c_double, c_int),
-        )
+    def _accessor(self, access: str, kind: str) -> Any:
+        """Return FMPy's getter or setter of a type; an enumeration has that of integers."""
+        integer = "Integer" if self._library.version == 2 else "Int64"
+        return getattr(self._library.fmu, f"{access}{integer if kind == 'Enumeration' else kind}")
 
 
 def _flag(version: int) -> Any:
@@ -204,7 +144,7 @@ def _flag(version: int) -> Any:
 
 
 def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
-    """Return a function of a library, whose first argument is the instance."""
+    """Return a function of a library, whose first argument is the instance, as one that raises FmiError."""
     function = CFUNCTYPE(c_int, c_void_p, *types)((name, library))
 
     def call(*arguments: Any) -> None:
@@ -212,11 +152,13 @@ def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
         if status > WARNING:
             raise FmiError(function=name, status=status)
 
-    call.__code__ = call.__code__.replace(co_name=name)  # by which a crash or a hang tells where it was
+    call.__code__ = call.__code__.replace(co_name=name)  # shows in the stack trace of a crash or a hang
     return call
 
 
-def _missing(name: str) -> Function:
+def _missing(library: Any, name: str, types: Sequence[Any]) -> Function:
+    """Return a stand-in for a function that the FMU's interface does not have."""
+
     def call(*arguments: Any) -> None:
         raise FmiError(function=name, status=ERROR)
 
@@ -243,14 +185,37 @@ class FmiLibrary:
             modelIdentifier=description.identifier,
             instanceName="hvdc_ident",
         )
-        self._call = FmiFunctions.of(self.fmu.dll, self.version, self.exchange)
         self._flags = (_flag(self.version)(), _flag(self.version)())
-        self._sized = int(self.version == 3)  # FMI 3.0 gives the number of values, too
+        self._sized = int(self.version == 3)  # FMI 3.0 passes the number of values, too
+        self._bind()
         self._callbacks = self._made_callbacks()
         self.component: Any = None
         self.nx = len(description.states)
-        self.states, self.slopes = Vector(self.nx), Vector(self.nx)
+        self.states, self.derivatives = Vector(self.nx), Vector(self.nx)
         self.indicators = Vector(description.indicators)
+
+    def _bind(self) -> None:
+        """Bind the functions that are called in every step; vectors are passed as addresses.
+
+        FMPy's own way to them, which can log each call, takes as long as a small FMU does.
+        """
+        real, derivatives = ("Real", "Derivatives") if self.version == 2 else ("Float64", "ContinuousStateDerivatives")
+        vector, sized = [c_void_p, c_size_t], [c_size_t] * self._sized
+
+        def bound(name: str, *types: Any, offered: bool = True) -> Function:
+            return (_bound if offered else _missing)(self.fmu.dll, f"fmi{self.version}{name}", types)
+
+        exchange = partial(bound, offered=self.exchange)
+        self._get_reals = bound(f"Get{real}", *vector, c_void_p, *sized)
+        self._set_reals = bound(f"Set{real}", *vector, c_void_p, *sized)
+        self._directional = bound("GetDirectionalDerivative", *vector, *vector, c_void_p, *sized, c_void_p, *sized)
+        self._set_time = exchange("SetTime", c_double)
+        self._set_states = exchange("SetContinuousStates", *vector)
+        self._get_states = exchange("GetContinuousStates", *vector)
+        self._get_derivatives = exchange(f"Get{derivatives}", *vector)
+        self._get_indicators = exchange("GetEventIndicators", *vector)
+        self._completed_step = exchange("CompletedIntegratorStep", _flag(self.version), c_void_p, c_void_p)
+        self._do_step = bound("DoStep", c_double, c_double, c_int, offered=not self.exchange)
 
     def _made_callbacks(self) -> Any:
         if self.version == 3:
@@ -276,7 +241,7 @@ class FmiLibrary:
     def _heard(self, status: int, text: bytes | None) -> None:
         if status > 0 and text:
             self.messages.append(" ".join(text.decode("utf-8", "replace").split())[:300])
-            del self.messages[:-KEPT]
+            del self.messages[:-MESSAGES_KEPT]
 
     # --- instances ---
 
@@ -308,7 +273,7 @@ class FmiLibrary:
 
     # --- initialisation ---
 
-    def set_up(self, start: float, stop: float | None, tolerance: float | None) -> None:
+    def setup_experiment(self, start: float, stop: float | None, tolerance: float | None) -> None:
         """Tell the experiment, FMI 2.0; before values are set, for some FMUs put their own values back here."""
         self.progress[START] = self.progress[NOW] = start
         self.progress[STOP] = nan if stop is None else stop
@@ -334,42 +299,42 @@ class FmiLibrary:
 
     def get_reals(self, references: Any, into: Vector) -> None:
         n = into.size
-        self._call.get_reals(self.component, addressof(references), n, into.address, *(n,) * self._sized)
+        self._get_reals(self.component, addressof(references), n, into.address, *(n,) * self._sized)
 
     def set_reals(self, references: Any, values: Vector) -> None:
         n = values.size
-        self._call.set_reals(self.component, addressof(references), n, values.address, *(n,) * self._sized)
+        self._set_reals(self.component, addressof(references), n, values.address, *(n,) * self._sized)
 
     def directional(self, unknowns: Any, n: int, knowns: Any, m: int, seed: Vector, into: Vector) -> None:
-        """Put the derivatives of the unknowns along the seed into `into`."""
+        """Write the derivatives of the unknowns along the seed into `into`."""
         u, k = addressof(unknowns), addressof(knowns)
         if self._sized:
-            self._call.directional(self.component, u, n, k, m, seed.address, m, into.address, n)
+            self._directional(self.component, u, n, k, m, seed.address, m, into.address, n)
         else:
-            self._call.directional(self.component, u, n, k, m, seed.address, into.address)
+            self._directional(self.component, u, n, k, m, seed.address, into.address)
 
     # --- model exchange ---
 
     def set_time(self, t: float) -> None:
         self.progress[NOW] = t
-        self._call.set_time(self.component, t)
+        self._set_time(self.component, t)
 
     def set_states(self, x: Array) -> None:
         if self.nx:
             self.states.values[:] = x
-            self._call.set_states(self.component, self.states.address, self.nx)
+            self._set_states(self.component, self.states.address, self.nx)
 
     def get_states(self) -> Array:
         """(nx,), a copy."""
         if self.nx:
-            self._call.get_states(self.component, self.states.address, self.nx)
+            self._get_states(self.component, self.states.address, self.nx)
         return self.states.values.copy()
 
-    def get_slopes(self) -> Array:
+    def get_derivatives(self) -> Array:
         """(nx,) the derivatives; the array is used again by the next call."""
         if self.nx:
-            self._call.get_slopes(self.component, self.slopes.address, self.nx)
-        return self.slopes.values
+            self._get_derivatives(self.component, self.derivatives.address, self.nx)
+        return self.derivatives.values
 
     def get_nominals(self) -> Array:
         """(nx,) typical sizes of the states, as the FMU says them."""
@@ -384,30 +349,30 @@ class FmiLibrary:
     def get_indicators(self) -> Array:
         """(nz,), a copy."""
         if self.indicators.size:
-            self._call.get_indicators(self.component, self.indicators.address, self.indicators.size)
+            self._get_indicators(self.component, self.indicators.address, self.indicators.size)
         return self.indicators.values.copy()
 
-    def enter_events(self) -> None:
+    def enter_event_mode(self) -> None:
         self.fmu.enterEventMode()
 
-    def enter_continuous(self) -> None:
+    def enter_continuous_time_mode(self) -> None:
         self.fmu.enterContinuousTimeMode()
 
-    def update(self) -> DiscreteUpdate:
-        """One iteration of the discrete part."""
-        found = self.fmu.newDiscreteStates() if self.version == 2 else self.fmu.updateDiscreteStates()
-        again, end, _, states, defined, when = found
-        return DiscreteUpdate(bool(again), bool(end), bool(states), float(when) if defined else None)
+    def new_discrete_states(self) -> tuple[bool, bool, bool, float | None]:
+        """Return the result of one event iteration: another one needed, the end wanted, states changed, next time event, s."""
+        update = self.fmu.newDiscreteStates() if self.version == 2 else self.fmu.updateDiscreteStates()
+        again, end, _, states_changed, defined, next_time = update
+        return bool(again), bool(end), bool(states_changed), float(next_time) if defined else None
 
-    def completed_step(self) -> tuple[bool, bool]:
+    def completed_integrator_step(self) -> tuple[bool, bool]:
         """Return whether the FMU wants an event, and whether it wants to end."""
         event, end = self._flags
-        self._call.completed_step(self.component, 1, addressof(event), addressof(end))
+        self._completed_step(self.component, 1, addressof(event), addressof(end))
         return bool(event.value), bool(end.value)
 
     # --- co-simulation ---
 
-    def step(self, t: float, h: float) -> tuple[float, float]:
+    def do_step(self, t: float, h: float) -> tuple[float, float]:
         """Return the instant from which to go on, and the one that outputs belong to.
 
         They differ for an FMU of FMI 3.0 whose own steps do not end at t + h: it goes on from there all the same, and
@@ -416,7 +381,7 @@ class FmiLibrary:
         self.progress[NOW] = t
         if self.version == 2:
             try:
-                self._call.step(self.component, t, h, 1)
+                self._do_step(self.component, t, h, 1)
             except FMICallException as e:
                 if e.status != DISCARD:
                     raise
@@ -448,6 +413,6 @@ class FmiLibrary:
             raise discard
         return reached
 
-    def set_slopes_of_inputs(self, references: Any, orders: Any, slopes: Vector) -> None:
+    def set_input_derivatives(self, references: Any, orders: Any, derivatives: Vector) -> None:
         """FMI 2.0 only: the time derivatives of inputs over the next step."""
-        self.fmu.fmi2SetRealInputDerivatives(self.component, references, slopes.size, orders, slopes.pointer)
+        self.fmu.fmi2SetRealInputDerivatives(self.component, references, derivatives.size, orders, derivatives.pointer)

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu.derivatives import VariationalEquations
+from hvdc_ident.fmu.derivatives import SensitivityEquations
 from hvdc_ident.fmu.fmi import DISCARD, FmiError, VariableGroup
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
 from hvdc_ident.fmu.piecewise_linear import Interpolant, PackedInputs
 
-MOST_STEPS = 200_000
-MOST_EVENTS = 100_000
-CHATTER = 50  # state events within CLOSE of each other
-CLOSE = 1e-9  # share of the span
-RETRIES = 8  # shorter steps tried where the FMU discards a point
-JUMP = 1e-6  # change of a derivative at an event, against its size, that sensitivities cannot pass
+MAX_STEPS = 200_000
+MAX_EVENTS = 100_000
+MAX_CHATTER = 50  # state events within CHATTER_SPAN of each other
+CHATTER_SPAN = 1e-9  # share of the span
+MAX_RETRIES = 8  # shorter steps tried where the FMU discards a point
+JUMP_TOLERANCE = 1e-6  # change of a derivative at an event, against its size, that sensitivities cannot pass
 
 
 class SensitivitiesLost(Exception):
@@ -42,11 +42,9 @@ class Counts:
 
 @dataclass
 class ModelExchangeRun:
-    """One run. names: what is read. tangent: the derivatives for sensitivities, or None. start: (nx, np) dx0/dp.
+    """One run. names: of the recorded variables. equations: of the sensitivities, or None. start: (nx, np) dx0/dp.
 
-    most: steps after which the run is given up.
-
-    outputs (n, names) and gradients (n, names, np) are filled row by row.
+    max_steps: after which the run is given up. outputs (n, names) and gradients (n, names, np) are filled row by row.
     """
 
     instance: Instance
@@ -54,28 +52,27 @@ class ModelExchangeRun:
     time: Array
     names: tuple[str, ...]
     tolerance: float
-    tangent: VariationalEquations | None = None
+    equations: SensitivityEquations | None = None
     start: Array | None = None
     counts: Counts = field(default_factory=Counts)
-    most: int = MOST_STEPS
+    max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
         self.library = self.instance.library
         self.nx = self.library.nx
         self.inputs = [Interpolant(t, v) for t, v in self.signals.each()]
-        self.moving = [k for k, m in enumerate(self.inputs) if not m.constant]
-        self.u = np.array([m.at(float(self.time[0]), True) for m in self.inputs])
-        chosen = [list(self.instance.description.inputs.values())[k] for k in self.moving]
-        self.follow = [k for k, v in zip(self.moving, chosen, strict=True) if v.continuous]
-        self.followed = VariableGroup(
-            self.library, [list(self.instance.description.inputs.values())[k] for k in self.follow]
-        )
-        self.seen = self.instance.block(self.names)
-        self.columns = self.tangent.count if self.tangent else 0
+        variables = list(self.instance.description.inputs.values())
+        # Inputs that are set at every instant; the others change at events alone.
+        self.continuous = [
+            k for k, (m, v) in enumerate(zip(self.inputs, variables, strict=True)) if v.continuous and not m.constant
+        ]
+        self.continuous_inputs = VariableGroup(self.library, [variables[k] for k in self.continuous])
+        self.recorded = self.instance.variables(self.names)
+        self.columns = self.equations.count if self.equations else 0
         self.outputs = np.empty((self.time.size, len(self.names)))
         self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
-        self.set: list[float] | None = None  # what the inputs that are followed stand at
-        self.flat = False  # whether they stand, as they are set, until the segment's end
+        self.applied: list[float] | None = None  # present values of the continuous inputs
+        self.flat = False  # whether they keep them until the segment's end
         self.row = 0
         self.end = float(self.time[-1])
         self.segment_end = self.end
@@ -88,20 +85,19 @@ class ModelExchangeRun:
             self._go(values)
         except RunEnded as e:
             while self.row < self.time.size and self.row > 0 and self.time[self.row] <= float(e.t or 0.0):
-                self.outputs[self.row] = self.seen.get()  # the FMU stands there
+                self.outputs[self.row] = self.recorded.get()  # the FMU is at this instant
                 self.row += 1
             e.rows = self.outputs[: self.row].copy()
             raise
 
     def _go(self, values: Mapping[str, float]) -> None:
         t = float(self.time[0])
-        self.instance.begin(values, self.u, t, self.end, self.tolerance)
+        self.instance.begin(values, self._inputs_at(t, before_jump=True), t, self.end, self.tolerance)
         x = self.library.get_states()
         self.atol = 1e-2 * self.tolerance * self.instance.nominals()
         y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
-        stops = [s for s in self.signals.breaks.tolist() if t <= s <= self.end]
-        stops = sorted({*stops, self.end})
-        y = self._arrive(t, y, stops)
+        stops = sorted({*(s for s in self.signals.breaks.tolist() if t <= s <= self.end), self.end})
+        y = self._stop_at(t, y, stops)
         while t < self.end:
             stop = next(s for s in stops if s > t)
             due = self.instance.next_time
@@ -109,38 +105,42 @@ class ModelExchangeRun:
                 y = self._state_event(t, y)
                 continue
             # Two instants that differ by rounding alone are one: no integrator can step from one to the other.
-            apart = 1e-12 * max(1.0, abs(stop))
-            self.segment_end = stop if due is None or abs(due - stop) <= apart else min(due, stop)
+            rounding = 1e-12 * max(1.0, abs(stop))
+            self.segment_end = stop if due is None or abs(due - stop) <= rounding else min(due, stop)
             t, y = self._segment(t, y, self.segment_end)
             if t >= self.segment_end:
-                y = self._arrive(t, y, stops, timed=due is not None and due <= t + apart)
+                y = self._stop_at(t, y, stops, timed=due is not None and due <= t + rounding)
+
+    def _inputs_at(self, t: float, *, before_jump: bool) -> Array:
+        """Return all inputs at an instant, before the jumps there or after them."""
+        return np.array([m.at(t, before_jump) for m in self.inputs])
 
     # --- between stops ---
 
     def _segment(self, t: float, y: Array, end: float) -> tuple[float, Array]:
-        """Return where the integration stopped, at `end` or at an event before it, with the event done."""
+        """Integrate to `end` or to an event before it, which is processed; return the instant and the states."""
         self.counts.segments += 1
         self.positive = self.library.get_indicators() > 0.0
         self.flat = False
-        self._place(t, y[: self.nx])
-        self.flat = all(self.inputs[k].is_flat(t, end) for k in self.follow)
-        with warnings.catch_warnings(record=True) as said:  # of the integrator, told where it gives up
+        self._set_point(t, y[: self.nx])
+        self.flat = all(self.inputs[k].is_flat(t, end) for k in self.continuous)
+        with warnings.catch_warnings(record=True) as caught:  # of the integrator, quoted where it gives up
             warnings.simplefilter("always")
             try:
-                return self._steps(t, y, end, said)
+                return self._steps(t, y, end, caught)
             finally:
                 self.flat = False
 
-    def _steps(self, t: float, y: Array, end: float, said: list[warnings.WarningMessage]) -> tuple[float, Array]:
+    def _steps(self, t: float, y: Array, end: float, caught: list[warnings.WarningMessage]) -> tuple[float, Array]:
         solver = self._solver(t, y, end)
         rows, completed = self.time.tolist(), self.instance.description.completed_step
         retries = 0
         while solver.status == "running":
             before = float(solver.t)
             try:
-                self._advance(solver, said)
+                self._advance(solver, caught)
             except FmiError as e:
-                if e.status != DISCARD or retries == RETRIES:
+                if e.status != DISCARD or retries == MAX_RETRIES:
                     raise
                 retries += 1
                 solver = self._solver(before, y, end, (end - before) * 10.0**-retries)
@@ -156,9 +156,9 @@ class ModelExchangeRun:
                 y = np.asarray(solver.dense_output()(event), dtype=float) if self.nx else y
                 return event, self._state_event(event, y)
             if completed or t >= end:
-                self._place(t, y[: self.nx], before_jump=t >= end)
+                self._set_point(t, y[: self.nx], before_jump=t >= end)
             if completed:
-                wanted, over = self.library.completed_step()
+                wanted, over = self.library.completed_integrator_step()
                 if over:
                     raise RunEnded(t)
                 if wanted and t < end:
@@ -168,13 +168,13 @@ class ModelExchangeRun:
     def _solver(self, t: float, y: Array, end: float, most: float = np.inf) -> Any:
         from scipy.integrate import LSODA
 
-        atol = np.concatenate([self.atol, *(self.atol / s for s in (self.tangent.sizes if self.tangent else []))])
+        atol = np.concatenate([self.atol, *(self.atol / s for s in (self.equations.sizes if self.equations else []))])
         dummy = self.nx == 0
         if dummy:
             most = min(most, (end - t) / 50)
-        jac = self._jacobian if self.tangent is not None and not dummy else None
+        jac = self._jacobian if self.equations is not None and not dummy else None
         return LSODA(
-            (lambda _t, _y: np.zeros(1)) if dummy else self._slopes,
+            (lambda _t, _y: np.zeros(1)) if dummy else self._derivatives,
             t,
             np.zeros(1) if dummy else y,
             end,
@@ -184,52 +184,54 @@ class ModelExchangeRun:
             max_step=most,
         )
 
-    def _advance(self, solver: Any, said: list[warnings.WarningMessage]) -> None:
+    def _advance(self, solver: Any, caught: list[warnings.WarningMessage]) -> None:
         message = solver.step()
         self.counts.accepted += 1
         if solver.status == "failed":
-            text = "; ".join([str(message or ""), *(str(w.message) for w in said)])
+            text = "; ".join([str(message or ""), *(str(w.message) for w in caught)])
             raise RunFailed(
                 f"the integrator gave up: {' '.join(text.split())[:200]}", float(solver.t), "check parameter values"
             )
-        if self.counts.accepted - self.before > self.most:
-            raise RunFailed(f"more than {self.most} steps", float(solver.t), "look for a very fast part of the model")
+        if self.counts.accepted - self.before > self.max_steps:
+            raise RunFailed(
+                f"more than {self.max_steps} steps", float(solver.t), "look for a very fast part of the model"
+            )
 
-    def _place(self, t: float, x: Array, *, before_jump: bool = False) -> None:
+    def _set_point(self, t: float, x: Array, *, before_jump: bool = False) -> None:
         """Set the instant, the state and the continuous inputs."""
         self.library.set_time(t)
         self.library.set_states(x)
-        if self.follow and not (self.flat and t < self.segment_end):
-            u = [self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.follow]
-            if u != self.set:  # held inputs, as stairs, stand for thousands of calls
-                self.followed.set(u)
-                self.set = u
+        if self.continuous and not (self.flat and t < self.segment_end):
+            u = [self.inputs[k].at(t, before_jump or t >= self.segment_end) for k in self.continuous]
+            if u != self.applied:  # held inputs keep their values for thousands of calls
+                self.continuous_inputs.set(u)
+                self.applied = u
 
-    def _slopes(self, t: float, y: Array) -> Array:
+    def _derivatives(self, t: float, y: Array) -> Array:
         self.counts.evaluations += 1
-        self._place(t, y[: self.nx])
-        slopes = self.library.get_slopes()
+        self._set_point(t, y[: self.nx])
+        derivatives = self.library.get_derivatives()
         if not self.columns:
-            return slopes.copy()
+            return derivatives.copy()
         found = np.empty(y.size)
-        found[: self.nx] = slopes
-        assert self.tangent is not None
+        found[: self.nx] = derivatives
+        assert self.equations is not None
         for j in range(self.columns):
             part = slice((j + 1) * self.nx, (j + 2) * self.nx)
-            found[part] = self.tangent.slopes(j, y[part])
+            found[part] = self.equations.derivatives(j, y[part])
         return found
 
     def _jacobian(self, t: float, y: Array) -> Array:
-        """For the stiff method's iteration: A on the diagonal; what couples S to x is left out."""
-        assert self.tangent is not None
-        self._place(t, y[: self.nx])
-        a = self.tangent.state_matrix()
+        """Return the matrix of the stiff method's iteration: A on the diagonal, without the coupling of S to x."""
+        assert self.equations is not None
+        self._set_point(t, y[: self.nx])
+        a = self.equations.state_matrix()
         return np.asarray(np.kron(np.eye(1 + self.columns), a), dtype=float) if self.columns else a
 
     # --- events ---
 
     def _crossing(self, solver: Any, before: float) -> float | None:
-        """The instant just after the first indicator of a step changed its sign, or None."""
+        """Return the instant just after the first indicator of a step changed its sign, or None."""
         if not self.library.indicators.size:
             return None
         t = float(solver.t)
@@ -246,11 +248,11 @@ class ModelExchangeRun:
         return None
 
     def _indicators(self, t: float, x: Array) -> Array:
-        self._place(t, x)
+        self._set_point(t, x)
         return self.library.get_indicators()
 
     def _located(self, dense: Any, low: float, high: float) -> float:
-        """The right end of a bracket of the first change of sign, as narrow as times can be told apart."""
+        """Return the right end of a bracket of the first change of sign, as narrow as the resolution of time allows."""
         z_low = self._indicators(low, dense(low)[: self.nx])
         z_high = self._indicators(high, dense(high)[: self.nx])
         width = 1e-13 * max(abs(low), abs(high), self.end - float(self.time[0]))
@@ -274,50 +276,52 @@ class ModelExchangeRun:
         return high
 
     def _state_event(self, t: float, y: Array) -> Array:
-        """The states after the event."""
+        """Process a state event; return the states after it."""
         self.counts.events += 1
         span = self.end - float(self.time[0])
-        self.close = [s for s in self.close if t - s <= CLOSE * span] + [t]
-        if self.counts.events > MOST_EVENTS or len(self.close) > CHATTER:
+        self.close = [s for s in self.close if t - s <= CHATTER_SPAN * span] + [t]
+        if self.counts.events > MAX_EVENTS or len(self.close) > MAX_CHATTER:
             raise RunFailed(
                 "a limit switches on and off without end", t, "add a hysteresis or a small lag where it acts"
             )
-        self._place(t, y[: self.nx])
-        return self._through(t, y, None)
+        self._set_point(t, y[: self.nx])
+        return self._event_at(t, y, None)
 
-    def _through(self, t: float, y: Array, u: Array | None) -> Array:
-        """The states after event mode at t, with inputs u set in it where they jump."""
-        old = self.library.get_slopes().copy() if self.columns else None
-        self.library.enter_events()
+    def _event_at(self, t: float, y: Array, u: Array | None) -> Array:
+        """Return the states after event mode at t; inputs u are set in it where they jump."""
+        old = self.library.get_derivatives().copy() if self.columns else None
+        self.library.enter_event_mode()
         if u is not None:
             self.instance.inputs.set(u)
-            self.set = None
-        changed = self.instance.iterate(t)
-        self.library.enter_continuous()
+            self.applied = None
+        changed = self.instance.update_discrete_states(t)
+        self.library.enter_continuous_time_mode()
         x = self.library.get_states() if changed else y[: self.nx]
         if self.columns:
             jumped = bool(np.abs(x - y[: self.nx]).max(initial=0.0) > 0.0)
             if u is None and old is not None:
-                size = np.abs(old).max(initial=0.0) + np.abs(self.library.slopes.values).max(initial=0.0)
-                jumped |= bool(np.abs(self.library.get_slopes() - old).max(initial=0.0) > JUMP * max(size, 1e-300))
+                size = np.abs(old).max(initial=0.0) + np.abs(self.library.derivatives.values).max(initial=0.0)
+                jumped |= bool(
+                    np.abs(self.library.get_derivatives() - old).max(initial=0.0) > JUMP_TOLERANCE * max(size, 1e-300)
+                )
             if jumped:
                 raise SensitivitiesLost(f"a state or a derivative jumps at {t:.6g} s")
         return np.concatenate([x, y[self.nx :]]) if changed else y
 
-    def _arrive(self, t: float, y: Array, stops: Sequence[float], *, timed: bool = False) -> Array:
-        """The states after a stop: rows before its jump are read, then inputs and time events act, then those after."""
-        self._place(t, y[: self.nx], before_jump=True)
+    def _stop_at(self, t: float, y: Array, stops: Sequence[float], *, timed: bool = False) -> Array:
+        """Process a stop; return the states: rows before its jump are recorded, then inputs and time events act, then rows after it."""
+        self._set_point(t, y[: self.nx], before_jump=True)
         while self.row + 1 < self.time.size and self.time[self.row] == t == self.time[self.row + 1]:
             self._record(y)
-        u = np.array([m.at(t, False) for m in self.inputs])
-        jumps = t in stops and bool((u != np.array([m.at(t, True) for m in self.inputs])).any())
+        u = self._inputs_at(t, before_jump=False)
+        jumps = t in stops and bool((u != self._inputs_at(t, before_jump=True)).any())
         if timed:
             self.counts.events += 1
-            y = self._through(t, y, None)
+            y = self._event_at(t, y, None)
         if jumps:
-            y = self._through(t, y, u)
+            y = self._event_at(t, y, u)
         self.segment_end = self.end + 1.0 if t < self.end else t
-        self._place(t, y[: self.nx])
+        self._set_point(t, y[: self.nx])
         while self.row < self.time.size and self.time[self.row] <= t:
             self._record(y)
         return y
@@ -325,17 +329,17 @@ class ModelExchangeRun:
     # --- rows ---
 
     def _record_until(self, dense: Any, t: float) -> None:
-        """Read the rows of a step that lie before t; those at a stop are left to it."""
+        """Record the rows of a step that lie before t; those at a stop are recorded there."""
         while self.row < self.time.size and self.time[self.row] < t:
             s = float(self.time[self.row])
             y = np.asarray(dense(s), dtype=float) if self.nx else np.zeros(0)
-            self._place(s, y[: self.nx])
+            self._set_point(s, y[: self.nx])
             self._record(y)
 
     def _record(self, y: Array) -> None:
-        """Fill the next row, the FMU standing at its instant."""
-        self.outputs[self.row] = self.seen.get()
-        if self.tangent is not None:
+        """Record the next row, at whose instant the FMU is."""
+        self.outputs[self.row] = self.recorded.get()
+        if self.equations is not None:
             for j in range(self.columns):
-                self.gradients[self.row, :, j] = self.tangent.outputs(j, y[(j + 1) * self.nx : (j + 2) * self.nx])
+                self.gradients[self.row, :, j] = self.equations.outputs(j, y[(j + 1) * self.nx : (j + 2) * self.nx])
         self.row += 1

@@ -2,8 +2,8 @@
 
 The effects are those of the catalogue, in a model that passes signals u0, u1 ... through to y0, y1 ..., which the engine
 simulates. Signals between it and the FMU are piecewise linear: inputs on a grid refined until lines hold to 1e-5 of their
-range, outputs on the experiment's rows, or on at least FINE rows where an effect has memory. An effect at an input that
-reads an output would close a loop around the FMU: it is refused.
+range, outputs on the experiment's rows, or on at least MIN_ROWS rows where an effect has memory. An effect at an input
+that reads an output would close a loop around the FMU: it is refused.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.effects import EffectUse, apply_effects, effects, joined_sources
 from hvdc_ident.errors import InputError, ModelError, unknown_name
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.fmu.evaluate import Direction, bare, changed, inputs_of
-from hvdc_ident.fmu.piecewise_linear import kept_rows, refined, sampling_grid, signal_of
+from hvdc_ident.fmu.evaluate import Direction, changed, inputs_of, simulate_without_effects
+from hvdc_ident.fmu.piecewise_linear import kept_rows, refined_grid, sampling_grid, signal_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.parameters import Input, Parameter
@@ -34,19 +34,18 @@ if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
 
-FINE = 4000
-"""Rows, at least, on which outputs are taken where an effect filters them."""
-KEPT = 12
-"""Runs of an FMU that are kept: refits of what sits at its outputs ask for the same ones many times over."""
-
-JUMP = 2.0
-"""How many times as large as on the other side a change is where a jump is in it, at a row that one passes over."""
-BRIEF = 0.02
-"""Share of the run that the largest value of a slope would have to last for as much as the slope comes to in all."""
+MIN_ROWS = 4000  # on which outputs are recorded where an effect at them has memory
+RUNS_KEPT = 12  # of an FMU: refits of effects at its outputs request the same ones many times
+JUMP_RATIO = 2.0  # of the changes on the two sides of a parameter's value, above which one of them has a jump in it
+SPIKE_SHARE = 0.02  # share of the run for which a derivative would have its largest value to have its mean
+PARAMETER_SHIFT = 0.01  # of a parameter whose derivative comes from runs, in its sizes
+DIRECTION_SHARE = "share_of_the_direction"
+"""Parameter by which the FMU's outputs move along signals s0, s1 ...: its sensitivity passes theirs through the effects."""
+Side = Literal["input", "output"]
 
 
 def with_effects(model: FmuModel, uses: Iterable[Any]) -> FmuModel:
-    """The model with the effects at its ends; their parameters join the model's."""
+    """Return the model with the effects at its terminals; their parameters join the model's."""
     for given in uses:
         use = EffectUse.of(given)
         catalogue = effects()
@@ -68,8 +67,8 @@ def _free_prefix(model: FmuModel, use: EffectUse) -> str:
     return next(p for p in tried if not any(f"{p}_{n}" in model.parameters for n in names))
 
 
-class TerminalRun:
-    """One run with the effects at the inputs, the FMU, and the effects at its outputs."""
+class RunWithEffects:
+    """One run through the effects at the inputs, the FMU, and the effects at the outputs."""
 
     def __init__(
         self,
@@ -81,190 +80,186 @@ class TerminalRun:
     ) -> None:
         self.model, self.experiment, self.tolerance, self.names = model, experiment, tolerance, names
         self.given = dict(given)
-        self.plain = inputs_of(model, experiment, self.given)
+        self.signals = inputs_of(model, experiment, self.given)
         self.values = {n: float(given.get(n, p.value)) for n, p in model.parameters.items()}
-        self.entrance, self.exit = entrance(model), exit_(model)
-        self.enters, self.leaves = bool(self.entrance.parameters), bool(self.exit.parameters)
+        self.input_chain, self.output_chain = input_chain(model), output_chain(model)
         breaks = [b for s in experiment.inputs.values() for b in s.breaks.tolist()]
         self.breaks = np.unique(np.array(breaks))
-        remembers = bool(self.exit.states or self.exit.delays or self.exit.sampled)
-        self.time = sampling_grid(experiment.time, self.breaks, FINE) if remembers else experiment.time
-        self.raw = tuple(model.outputs) if self.leaves else names
+        memory = bool(self.output_chain.states or self.output_chain.delays or self.output_chain.sampled)
+        self.time = sampling_grid(experiment.time, self.breaks, MIN_ROWS) if memory else experiment.time
+        self.fmu_outputs = tuple(model.outputs) if self.output_chain.parameters else names
 
     def simulation(self, sensitivities: tuple[str, ...]) -> Simulation:
-        fixed = () if self.enters else tuple(self.model.inputs)
-        own = tuple(n for n in sensitivities if n in self.model.fmu.parameters or n in fixed)
-        at_entrance = tuple(
-            n for n in sensitivities if n in self.entrance.parameters or (n in self.model.inputs and n not in own)
-        )
-        inputs, slopes = self._inputs(at_entrance)
-        # A parameter may move a jump, as a delay does, or an edge: no slope says that. A constant of an input moves none.
+        """Return the run with its derivatives by the parameters and inputs."""
+        direct = {*self.model.fmu.parameters, *(() if self.input_chain.parameters else self.model.inputs)}
+        by_fmu = tuple(n for n in sensitivities if n in direct)
+        before = {*self.input_chain.parameters, *self.model.inputs} - direct
+        by_inputs = tuple(n for n in sensitivities if n in before)
+        inputs, derivatives = self._inputs(by_inputs)
+        # A parameter may move a jump, as a delay does, or an edge, which no derivative at an instant shows. A constant
+        # added to an input moves none.
         jumps = any(np.setdiff1d(s.breaks, self.breaks).size for s in inputs.values())
-        edges = [n for n in at_entrance if n in self.entrance.parameters and (jumps or _brief(slopes[n].values()))]
-        ways = {n: _direction(inputs, slopes[n]) for n in at_entrance if n not in edges}
-        inside = self._inside(inputs, own, {n: d for n, (d, size) in ways.items() if size > 0.0})
-        raw = inside.trajectory.values
-        gradients = {n: inside.gradients[:, :, k] for k, n in enumerate(inside.parameters)}
-        for n, (_, size) in ways.items():
-            gradients[n] = gradients[n] * size if size > 0.0 else np.zeros(raw.shape)
-        for n in edges:
-            gradients[n] = self._moving(n, inputs, raw)
-        values, found = self._leave(raw, gradients, sensitivities)
-        shape = (self.experiment.time.size, len(self.names), len(sensitivities))
-        table = np.empty(shape)
+        by_runs = [
+            n
+            for n in by_inputs
+            if n in self.input_chain.parameters and (jumps or any(map(_has_spikes, derivatives[n].values())))
+        ]
+        directions = {n: _direction(inputs, derivatives[n]) for n in by_inputs if n not in by_runs}
+        run = self._fmu_run(inputs, by_fmu, {n: d for n, (d, size) in directions.items() if size > 0.0})
+        outputs = run.trajectory.values
+        gradients = {n: run.gradients[:, :, k] for k, n in enumerate(run.parameters)}
+        for n, (_, size) in directions.items():
+            gradients[n] = gradients[n] * size if size > 0.0 else np.zeros(outputs.shape)
+        for n in by_runs:
+            gradients[n] = self._difference(n, inputs, outputs)
+        values, columns = self._recorded(outputs, gradients, sensitivities)
+        table = np.empty((self.experiment.time.size, len(self.names), len(sensitivities)))
         for k, n in enumerate(sensitivities):
-            table[:, :, k] = found[n]
+            table[:, :, k] = columns[n]
         units = tuple(self.model.outputs[n].unit for n in self.names)
-        return Simulation(
-            Trajectory(self.experiment.time, values, self.names, units),
-            sensitivities,
-            table,
-            inside.statistics,
-            inside.notes,
-        )
-
-    # --- in ---
+        trajectory = Trajectory(self.experiment.time, values, self.names, units)
+        return Simulation(trajectory, sensitivities, table, run.statistics, run.notes)
 
     def _inputs(
         self, sensitivities: tuple[str, ...] = (), values: Mapping[str, float] | None = None
     ) -> tuple[dict[str, InputSignal], dict[str, dict[str, InputSignal]]]:
-        """Return the signals that enter the FMU, by input, and their derivatives by each parameter of the entrance, jumps staying in place.
+        """Return the signals that enter the FMU, by input, and their derivatives by each parameter, with jumps in place.
 
         values: of all parameters, where they are not this run's.
         """
-        model, e, plain = self.model, self.experiment, self.plain
-        if not self.enters:
-            return plain, {}
-        asked = tuple(f"u{list(plain).index(n)}" if n in plain else n for n in sensitivities)
-        given = {f"u{k}": s for k, s in enumerate(plain.values())}
-        chosen = {n: (values or self.values)[n] for n in self.entrance.parameters}
+        if not self.input_chain.parameters:
+            return self.signals, {}
+        names = list(self.signals)
+        parameters = tuple(f"u{names.index(n)}" if n in names else n for n in sensitivities)
+        signals = FrozenMap({f"u{k}": s for k, s in enumerate(self.signals.values())})
+        chosen = {n: (values or self.values)[n] for n in self.input_chain.parameters}
 
         def run(time: Array) -> Simulation:
-            passing = Experiment(time, "entrance", inputs=FrozenMap(given))
-            return engine_run(self.entrance, passing, chosen, asked, tolerance=self.tolerance)
+            experiment = Experiment(time, "effects at the inputs", inputs=signals)
+            return engine_run(self.input_chain, experiment, chosen, parameters, tolerance=self.tolerance)
 
-        grid = refined(lambda time: run(time).trajectory.values, e.time, self.breaks)
-        found = run(grid)
+        grid = refined_grid(lambda time: run(time).trajectory.values, self.experiment.time, self.breaks)
+        result = run(grid)
         inputs: dict[str, InputSignal] = {}
-        slopes: dict[str, dict[str, InputSignal]] = {n: {} for n in sensitivities}
-        for k, name in enumerate(model.inputs):
-            inputs[name] = signal_of(grid, found[f"y{k}"], self.breaks)
-            for n, column in zip(sensitivities, found.gradient(f"y{k}").T, strict=True):
-                slopes[n][name] = InputSignal(inputs[name].times, column[kept_rows(grid, found[f"y{k}"])], np.empty(0))
-        return inputs, slopes
+        derivatives: dict[str, dict[str, InputSignal]] = {n: {} for n in sensitivities}
+        for k, name in enumerate(names):
+            column = result[f"y{k}"]
+            inputs[name] = signal_of(grid, column, self.breaks)
+            for n, gradient in zip(sensitivities, result.gradient(f"y{k}").T, strict=True):
+                derivatives[n][name] = InputSignal(inputs[name].times, gradient[kept_rows(grid, column)], np.empty(0))
+        return inputs, derivatives
 
-    def _inside(
+    def _fmu_run(
         self,
         inputs: Mapping[str, InputSignal],
         sensitivities: tuple[str, ...] = (),
         directions: Mapping[str, Direction] | None = None,
     ) -> Simulation:
-        """The run of the FMU on what enters it, with derivatives by its parameters and along directions of its inputs.
+        """Return the FMU's run on inputs, with derivatives by its parameters and along directions of its inputs.
 
-        The last KEPT are had without running it again.
+        The last RUNS_KEPT are not run again.
         """
         along = directions or {}
-        inner = Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs))
-        kept: dict[bytes, Simulation] = self.model.pool.kept
-        key = self._key(inputs, along)
-        found = kept.pop(key, None)
-        names = (*sensitivities, *along)
-        if found is None or not set(names) <= set(found.parameters):
-            found = bare(
-                self.model, inner, self.given, sensitivities, self.raw, self.tolerance,
-                kin=_digest(self.plain), directions=along,
-            )  # fmt: skip
-        kept[key] = found
-        while len(kept) > KEPT:
-            del kept[next(iter(kept))]
-        columns = [found.parameters.index(n) for n in names]
-        return replace(found, parameters=names, gradients=found.gradients[:, :, columns])
-
-    def _key(self, inputs: Mapping[str, InputSignal], along: Mapping[str, Direction]) -> bytes:
-        """Return a key of what decides a run, and of the ways in which its inputs move."""
+        cache: dict[bytes, Simulation] = self.model.pool.cache
         values = sorted(changed(self.model, self.given).items())
-        text = repr((values, self.raw, self.tolerance.rtol, _digest(inputs), sorted(along))).encode()
-        return b"".join([self.time.tobytes(), text, *(along[n].points.tobytes() for n in sorted(along))])
+        names = (*sensitivities, *along)
+        text = repr((values, self.fmu_outputs, self.tolerance.rtol, _digest_of(inputs), sorted(along))).encode()
+        key = b"".join([self.time.tobytes(), text, *(along[n].points.tobytes() for n in sorted(along))])
+        run = cache.pop(key, None)
+        if run is None or not set(names) <= set(run.parameters):
+            run = simulate_without_effects(
+                self.model,
+                Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs)),
+                self.given,
+                sensitivities,
+                self.fmu_outputs,
+                self.tolerance,
+                noise_key=_digest_of(self.signals),
+                directions=along,
+            )
+        cache[key] = run
+        while len(cache) > RUNS_KEPT:
+            del cache[next(iter(cache))]
+        columns = [run.parameters.index(n) for n in names]
+        return replace(run, parameters=names, gradients=run.gradients[:, :, columns])
 
-    def _moving(self, name: str, inputs: Mapping[str, InputSignal], raw: Array) -> Array:
-        """(n, raw) the derivative by a parameter of the entrance, from runs with it a hundredth of its size apart.
+    def _difference(self, name: str, inputs: Mapping[str, InputSignal], outputs: Array) -> Array:
+        """(n, outputs) derivative by a parameter of the effects at the inputs, from runs on both sides of its value.
 
         An output that jumps with an input shows the jump, not a derivative, at a row over which it passes between two of
         the runs: there, the difference is that of the side on which none passes.
         """
-        parameter = self.model.parameters[name]
-        h = 0.01 * parameter.size
-        at = self.values[name]
-        low, high = max(at - h, parameter.min), min(at + h, parameter.max)
+        parameter, value = self.model.parameters[name], self.values[name]
+        h = PARAMETER_SHIFT * parameter.size
+        low, high = max(value - h, parameter.min), min(value + h, parameter.max)
         runs, passed = {}, {}
-        for value in (low, high):
-            moved, _ = self._inputs((), {**self.values, name: value})
-            runs[value] = self._inside(moved).trajectory.values
-            passed[value] = _passed_over(self.time, inputs, moved)
-        found = np.asarray((runs[high] - runs[low]) / (high - low))
+        for shifted in (low, high):
+            moved, _ = self._inputs((), {**self.values, name: shifted})
+            runs[shifted] = self._fmu_run(moved).trajectory.values
+            passed[shifted] = _passed_over(self.time, inputs, moved)
+        result = np.asarray((runs[high] - runs[low]) / (high - low))
         for side, other in ((low, high), (high, low)):
-            if side == at:
+            if side == value:
                 continue
-            own, over = runs[side] - raw, runs[other] - raw
-            # Without a jump the changes on the two sides differ by the bend alone; one no larger than elsewhere does no harm.
-            elsewhere = np.abs(over)[~passed[other]].max(axis=0, initial=0.0)
-            jumped = np.abs(over) > np.maximum(JUMP * np.abs(own), elsewhere)
+            change, change_there = runs[side] - outputs, runs[other] - outputs
+            # Without a jump the changes on the two sides differ by the curvature alone; one no larger than at other rows
+            # does no harm.
+            elsewhere = np.abs(change_there)[~passed[other]].max(axis=0, initial=0.0)
+            jumped = np.abs(change_there) > np.maximum(JUMP_RATIO * np.abs(change), elsewhere)
             rows = (passed[other] & ~passed[side])[:, None] & jumped
-            found[rows] = own[rows] / (side - at)
-        return found
+            result[rows] = change[rows] / (side - value)
+        return result
 
-    # --- out ---
-
-    def _leave(
-        self, raw: Array, gradients: Mapping[str, Array], sensitivities: tuple[str, ...]
+    def _recorded(
+        self, outputs: Array, gradients: Mapping[str, Array], sensitivities: tuple[str, ...]
     ) -> tuple[Array, dict[str, Array]]:
         """Return the recorded values, (n, names), and their derivative by each parameter."""
-        if not self.leaves:
-            return raw, {n: gradients[n] for n in sensitivities}
-        at_exit = tuple(n for n in sensitivities if n in self.exit.parameters)
-        passed = self._passed(raw, at_exit)
-        found = {}
+        if not self.output_chain.parameters:
+            return outputs, {n: gradients[n] for n in sensitivities}
+        by_outputs = tuple(n for n in sensitivities if n in self.output_chain.parameters)
+        values, columns = self._through_outputs(outputs, by_outputs)
+        totals = {}
         for n in sensitivities:
-            total = np.zeros((self.experiment.time.size, len(self.names)))
+            total = np.zeros(values.shape)
             if n in gradients:
-                total += self._along(raw, gradients[n])
-            if n in at_exit:
-                total += passed.gradients[:, :, at_exit.index(n)]
-            found[n] = total
-        return passed.trajectory.values, found
+                total += self._through_outputs(outputs, (DIRECTION_SHARE,), gradients[n])[1][:, :, 0]
+            if n in by_outputs:
+                total += columns[:, :, by_outputs.index(n)]
+            totals[n] = total
+        return values, totals
 
-    def _passed(self, raw: Array, sensitivities: tuple[str, ...] = (), slope: Array | None = None) -> Simulation:
-        """The exit's run on given outputs of the FMU, and how these move with ALONG."""
-        outputs = list(self.model.outputs)
-        signals = {f"u{k}": signal_of(self.time, raw[:, self.raw.index(n)], self.breaks) for k, n in enumerate(outputs)}
-        if slope is not None:
-            signals |= {
-                f"s{k}": signal_of(self.time, slope[:, self.raw.index(n)], self.breaks) for k, n in enumerate(outputs)
-            }
-        values = {n: self.values[n] for n in self.exit.parameters}
-        inner = Experiment(self.experiment.time, "exit", inputs=FrozenMap(signals))
-        leaving = self.exit if slope is None else exit_(self.model, along=True)
-        run = engine_run(leaving, inner, values, sensitivities, tolerance=self.tolerance)
-        leaving_as = [f"y{outputs.index(n)}" for n in self.names]
-        trajectory = Trajectory(self.experiment.time, np.column_stack([run[y] for y in leaving_as]), self.names)
-        gradients = np.stack([run.gradient(y) for y in leaving_as], axis=1)
-        return Simulation(trajectory, sensitivities, gradients, run.statistics)
+    def _through_outputs(
+        self, outputs: Array, sensitivities: tuple[str, ...], direction: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Return what is recorded of given outputs of the FMU, (n, names), and its derivatives, (n, names, parameters).
 
-    def _along(self, raw: Array, slope: Array) -> Array:
-        """(n, names) change of what is recorded as the FMU's outputs move along the slope, (rows, raw)."""
-        return self._passed(raw, (ALONG,), slope).gradients[:, :, 0]
+        direction: (rows, outputs) in which the FMU's outputs move with DIRECTION_SHARE.
+        """
+        names = list(self.model.outputs)
+
+        def signals(letter: str, rows: Array) -> dict[str, InputSignal]:
+            columns = [rows[:, self.fmu_outputs.index(n)] for n in names]
+            return {f"{letter}{k}": signal_of(self.time, c, self.breaks) for k, c in enumerate(columns)}
+
+        inputs = signals("u", outputs) | (signals("s", direction) if direction is not None else {})
+        chain = self.output_chain if direction is None else output_chain(self.model, directed=True)
+        values = {n: self.values[n] for n in self.output_chain.parameters}
+        experiment = Experiment(self.experiment.time, "effects at the outputs", inputs=FrozenMap(inputs))
+        run = engine_run(chain, experiment, values, sensitivities, tolerance=self.tolerance)
+        recorded = [f"y{names.index(n)}" for n in self.names]
+        return np.column_stack([run[y] for y in recorded]), np.stack([run.gradient(y) for y in recorded], axis=1)
 
 
-def _direction(inputs: Mapping[str, InputSignal], slope: Mapping[str, InputSignal]) -> tuple[Direction, float]:
-    """Return the direction of a slope, and the slope's size in it: 0 where nothing moves."""
+def _direction(inputs: Mapping[str, InputSignal], derivative: Mapping[str, InputSignal]) -> tuple[Direction, float]:
+    """Return the direction of a derivative, and the derivative's size in it: 0 where nothing moves."""
     ranges = {n: max(np.ptp(s.values), 1e-6 * np.abs(s.values).max(), 1e-12) for n, s in inputs.items()}
-    sizes = {n: float(np.abs(slope[n].values).max()) / r for n, r in ranges.items()}
+    sizes = {n: float(np.abs(derivative[n].values).max()) / r for n, r in ranges.items()}
     size = max(sizes.values(), default=0.0)
-    points = np.concatenate([slope[n].values for n in inputs]) / (size or 1.0)
+    points = np.concatenate([derivative[n].values for n in inputs]) / (size or 1.0)
     return Direction(points, "along " + ", ".join(n for n, s in sizes.items() if s > 0.0)), size
 
 
-def _digest(inputs: Mapping[str, InputSignal]) -> str:
+def _digest_of(inputs: Mapping[str, InputSignal]) -> str:
     parts = [a.tobytes() + b"|" for s in inputs.values() for a in (s.times, s.values, s.breaks)]
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
@@ -278,64 +273,56 @@ def _passed_over(time: Array, inputs: Mapping[str, InputSignal], moved: Mapping[
     return found
 
 
-def _brief(slopes: Iterable[InputSignal]) -> bool:
-    """Return whether one of the slopes is a few spikes: small enough to be a slope, they are lost in a run's tolerance."""
-    return any(_spiked(s) for s in slopes)
+def _has_spikes(derivative: InputSignal) -> bool:
+    """Return whether a derivative is a few spikes: a step small enough for them is lost in a run's tolerance."""
+    size = np.abs(derivative.values)
+    span = float(derivative.times[-1] - derivative.times[0])
+    return bool(span > 0 and np.trapezoid(size, derivative.times) < SPIKE_SHARE * span * size.max())
 
 
-def _spiked(slope: InputSignal) -> bool:
-    """Return whether a slope's largest value lasts for a small share of the time."""
-    size = np.abs(slope.values)
-    span = float(slope.times[-1] - slope.times[0])
-    return bool(span > 0 and np.trapezoid(size, slope.times) < BRIEF * span * size.max())
+# --- the models that signals pass through ---
 
 
-End = Literal["input", "output"]
-ALONG = "share_of_the_direction"
-"""Parameter by which the FMU's outputs move along signals s0, s1 ...: its sensitivity passes theirs through the effects."""
-NAME = re.compile(r"[A-Za-z_]\w*")
-
-
-def end_of(model: FmuModel, place: str) -> tuple[End, int] | None:
-    """Return the side of an insertion point and its number there; None for what is none."""
+def terminal_of(model: FmuModel, place: str) -> tuple[Side, int] | None:
+    """Return on which side an insertion point lies, and its number there; None for what is none."""
     name = place.removeprefix("outputs.")
     if place in model.inputs:
         return "input", list(model.inputs).index(place)
     return ("output", list(model.outputs).index(name)) if name in model.outputs else None
 
 
-def entrance(model: FmuModel) -> Model:
-    """Inputs u0, u1 ... that come out as y0, y1 ... after the effects at the FMU's inputs."""
-    return _passage(len(model.inputs), _at(model, "input"), tuple(i.value for i in model.inputs.values()), False)
+def input_chain(model: FmuModel) -> Model:
+    """Return the model of the effects at the FMU's inputs: u0, u1 ... that come out as y0, y1 ...."""
+    return _chain(len(model.inputs), _effects_at(model, "input"), tuple(i.value for i in model.inputs.values()), False)
 
 
-def exit_(model: FmuModel, *, along: bool = False) -> Model:
-    """The FMU's outputs as u0, u1 ... that come out as y0, y1 ... after the effects at them.
+def output_chain(model: FmuModel, *, directed: bool = False) -> Model:
+    """Return the model of the effects at the FMU's outputs: u0, u1 ... that come out as y0, y1 ....
 
-    along: with inputs s0, s1 ... too, of which ALONG times are added to the outputs.
+    directed: with inputs s0, s1 ... too, DIRECTION_SHARE times which are added to the outputs.
     """
-    return _passage(len(model.outputs), _at(model, "output"), (0.0,) * len(model.outputs), along)
+    return _chain(len(model.outputs), _effects_at(model, "output"), (0.0,) * len(model.outputs), directed)
 
 
 def added(model: FmuModel, use: EffectUse) -> dict[str, Parameter]:
-    """The parameters that an effect brings; none where it is neutral.
+    """Return the parameters that an effect adds; none where it is neutral.
 
-    Raises UnknownNameError or ModelError where it cannot sit there: at what is no end, or reading what it cannot see.
+    Raises UnknownNameError or ModelError for an effect at what is no terminal, or that reads what it cannot see.
     """
     _check(model, use)
     trial = replace(model, effects=(*model.effects, use))
     try:
-        sides = entrance(trial), exit_(trial)
+        sides = input_chain(trial), output_chain(trial)
     except InputError as e:
-        raise _in_own_names(model, use, e) from None
+        raise _in_fmu_names(model, use, e) from None
     return {n: p for side in sides for n, p in side.parameters.items() if n not in model.parameters}
 
 
 def _check(model: FmuModel, use: EffectUse) -> None:
-    """Check an effect; raises what `added` says of places, of the signal brought in, and of parameters that are given by name."""
+    """Check an effect's insertion points, the signals that it reads, and its parameters; raises what `added` raises."""
     where = f"effect '{use.effect}' at {', '.join(use.at)}"
     for place in use.at:
-        if end_of(model, place) is None:
+        if terminal_of(model, place) is None:
             raise unknown_name(
                 "insertion point", place, model.insertion_points, where=f"model '{model.name}', which is closed inside"
             )
@@ -347,26 +334,25 @@ def _check(model: FmuModel, use: EffectUse) -> None:
                 expected="a number",
                 got=repr(value),
             )
-    brought = use.sources
     read = []
     if use.expression:
         names = {s.name for s in parse(use.expression, where=f"{where}, expression").free_symbols}
         read = sorted(names - use.parameters.keys() - {"time"})
     for k, place in enumerate(use.at):
-        for name, key in [*((n, "from") for n in brought[k : k + 1]), *((n, "expression") for n in read)]:
+        for name, key in [*((n, "from") for n in use.sources[k : k + 1]), *((n, "expression") for n in read)]:
             _check_reading(model, place, name, f"{where}, {key}")
 
 
 def _check_reading(model: FmuModel, place: str, name: str, where: str) -> None:
-    """Raise where an effect at a place cannot see a signal."""
-    here, there = end_of(model, place), end_of(model, name)
-    assert here is not None
-    if there is None:
-        known = model.inputs if here[0] == "input" else [s for s in model.insertion_points if s not in model.inputs]
+    """Raise where an effect at a terminal cannot read a signal."""
+    terminal, source = terminal_of(model, place), terminal_of(model, name)
+    assert terminal is not None
+    if source is None:
+        known = model.inputs if terminal[0] == "input" else [s for s in model.insertion_points if s not in model.inputs]
         raise unknown_name("signal", name, known, where=f"{where} (the model is closed inside)")
-    if here[0] == there[0]:
+    if terminal[0] == source[0]:
         return
-    if here[0] == "input":
+    if terminal[0] == "input":
         raise ModelError(
             f"an effect at an input that reads the output '{name}' would close a loop around the FMU",
             where=where,
@@ -379,61 +365,54 @@ def _check_reading(model: FmuModel, place: str, name: str, where: str) -> None:
     )
 
 
-def _at(model: FmuModel, end: End) -> tuple[EffectUse, ...]:
-    """The effects with those of their places that lie at one end, in the passage's names."""
-    found = []
+def _effects_at(model: FmuModel, side: Side) -> tuple[EffectUse, ...]:
+    """Return the effects with those of their insertion points that lie on one side, in the chain's names."""
+    letter = "u" if side == "input" else "y"
+    uses = []
     for use in model.effects:
-        ends = [end_of(model, p) for p in use.at]
-        here = [k for k, e in enumerate(ends) if e is not None and e[0] == end]
-        places = [e for k in here if (e := ends[k]) is not None]
-        letter = "u" if end == "input" else "y"
-        if places:
-            read = [e for k in here if use.source and (e := end_of(model, use.sources[k])) is not None]
-            found.append(
-                replace(
-                    use,
-                    at=tuple(f"{letter}{k}" for _, k in places),
-                    source=joined_sources(f"{letter}{k}" for _, k in read),
-                    expression=_renamed(model, use),
-                )
-            )
-    return tuple(found)
+        terminals = {k: t for k, p in enumerate(use.at) if (t := terminal_of(model, p)) is not None and t[0] == side}
+        sources = [t for k in terminals if use.source and (t := terminal_of(model, use.sources[k])) is not None]
+        if terminals:
+            at = tuple(f"{letter}{number}" for _, number in terminals.values())
+            source = joined_sources(f"{letter}{number}" for _, number in sources)
+            uses.append(replace(use, at=at, source=source, expression=_renamed(model, use)))
+    return tuple(uses)
 
 
 def _renamed(model: FmuModel, use: EffectUse) -> str:
-    """A term's expression with the FMU's inputs, or its outputs as they come out of it, under the passage's names."""
+    """Return an effect's expression with the FMU's inputs, or its outputs before the effects, in the chain's names."""
 
     def name(match: re.Match[str]) -> str:
         word = match.group()
-        place = None if word in use.parameters else end_of(model, word)
-        return f"u{place[1]}" if place else word
+        terminal = None if word in use.parameters else terminal_of(model, word)
+        return f"u{terminal[1]}" if terminal else word
 
-    return NAME.sub(name, use.expression)
+    return re.sub(r"[A-Za-z_]\w*", name, use.expression)
 
 
 @lru_cache(maxsize=64)
-def _passage(count: int, uses: tuple[EffectUse, ...], values: Sequence[float], along: bool) -> Model:
+def _chain(count: int, uses: tuple[EffectUse, ...], values: Sequence[float], directed: bool) -> Model:
     inputs = {f"u{k}": Input(v) for k, v in enumerate(values)}
-    passing = {f"y{k}": symbol(f"u{k}") for k in range(count)}
-    if along:
+    outputs = {f"y{k}": symbol(f"u{k}") for k in range(count)}
+    if directed:
         inputs |= {f"s{k}": Input(0.0) for k in range(count)}
-        passing = {n: e + symbol(ALONG) * symbol(f"s{n[1:]}") for n, e in passing.items()}
+        outputs = {n: e + symbol(DIRECTION_SHARE) * symbol(f"s{n[1:]}") for n, e in outputs.items()}
     model = Model(
         name="ends",
-        parameters=FrozenMap({ALONG: Parameter(0.0, scale=1.0)} if along else {}),
+        parameters=FrozenMap({DIRECTION_SHARE: Parameter(0.0, scale=1.0)} if directed else {}),
         inputs=FrozenMap(inputs),
-        outputs=FrozenMap({n: Output(e) for n, e in passing.items()}),
+        outputs=FrozenMap({n: Output(e) for n, e in outputs.items()}),
     )
     return apply_effects(model, uses)
 
 
-def _in_own_names(model: FmuModel, use: EffectUse, error: InputError) -> InputError:
-    """The error with the FMU's names in the place of the passage's."""
-    outputs = any((e := end_of(model, p)) is not None and e[0] == "output" for p in use.at)
+def _in_fmu_names(model: FmuModel, use: EffectUse, error: InputError) -> InputError:
+    """Return the error with the FMU's names in the place of the chain's."""
+    outputs = any((e := terminal_of(model, p)) is not None and e[0] == "output" for p in use.at)
     names = list(model.outputs if outputs else model.inputs)
 
-    def own(text: str) -> str:
+    def renamed(text: str) -> str:
         return re.sub(r"\b[uy](\d+)\b", lambda m: names[int(m[1])] if int(m[1]) < len(names) else str(m[0]), text)
 
-    parts = {k: own(getattr(error, k)) for k in ("where", "expected", "got", "hint")}
-    return type(error)(own(error.what), **parts)
+    parts = {k: renamed(getattr(error, k)) for k in ("where", "expected", "got", "hint")}
+    return type(error)(renamed(error.what), **parts)

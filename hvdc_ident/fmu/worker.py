@@ -1,6 +1,6 @@
 """The process with an FMU's machine code in it: it answers the pool's requests. See `hvdc_ident.processes`.
 
-Whatever the FMU prints goes to a file, whose end the pool quotes where it dies.
+Whatever the FMU prints goes to a file, whose last line the pool quotes where the process ends.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ def finish(setup: Setup) -> None:
     setup.folder.release()
 
 
-def serve(connection: Connection, progress: memoryview[float], setup: Setup, begun: Mapping[str, Any]) -> None:
-    """Answer requests until the connection closes or the FMU ends the process. begun: what the pool has learned."""
+def serve(connection: Connection, progress: memoryview[float], setup: Setup, learned: Mapping[str, Any]) -> None:
+    """Answer requests until the connection closes or the FMU ends the process. learned: by earlier workers."""
     from hvdc_ident.fmu.fmi import why_not_loaded
     from hvdc_ident.fmu.instance import Instance, RunFailed
     from hvdc_ident.fmu.sensitivity_run import RequestHandler
 
     folder = str(setup.folder.binaries)
 
-    def make(learned: dict[str, Any]) -> Instance:
+    def load(learned: dict[str, Any]) -> Instance:
         try:
             instance = Instance(setup.description, folder, learned)
         except MemoryError:
@@ -59,33 +59,33 @@ def serve(connection: Connection, progress: memoryview[float], setup: Setup, beg
         progress[PROCESS] = os.getpid()
         return instance
 
-    def tell() -> None:
+    def restart_deadline() -> None:
         progress[BEGAN] = time.monotonic()  # the deadline is that of one run
         progress[START] = progress[STOP] = progress[NOW] = math.nan
 
-    def guarded(work: Callable[[], Any]) -> bool:
-        """Answer with what the work returns or with its failure; return whether it did not fail.
+    def answer(work: Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]]) -> bool:
+        """Send the work's result or its failure; return whether it succeeded.
 
         A fatal failure ends the process. One with "again" may have come from what the process did before: the pool asks
         once more in a new one.
         """
         try:
-            found, out = work()
-            told, fatal = {**found, "done": 1}, False
+            result, arrays = work()
+            heading, fatal = {**result, "done": 1}, False
         except Exception as e:
-            failed = jobs.failed(e)
-            told, out, fatal = failed.told(), {}, failed.fatal
-        progress[PROCESS] = os.getpid()  # of those that the work was done in
-        taken = max(resident(), told.get("resident", 0)), max(space(), told.get("space", 0))
-        connection.send_bytes(packed({**told, "memory": taken[0], "space": taken[1]}, out))
+            failed = handler.failed(e)
+            heading, arrays, fatal = failed.heading(), {}, failed.fatal
+        progress[PROCESS] = os.getpid()  # the work may have used others
+        memory = {"memory": max(resident(), heading.get("resident", 0)), "space": max(space(), heading.get("space", 0))}
+        connection.send_bytes(packed({**heading, **memory}, arrays))
         if fatal:
             os._exit(0)
-        return "done" in told
+        return "done" in heading
 
-    jobs = RequestHandler(setup.description, make, tell, dict(begun))
-    if not guarded(jobs.load):
+    handler = RequestHandler(setup.description, load, restart_deadline, dict(learned))
+    if not answer(handler.load):
         return
     while True:
         heading, arrays = unpacked(connection.recv_bytes())
-        tell()
-        guarded(partial(jobs.do, heading, arrays))
+        restart_deadline()
+        answer(partial(handler.do, heading, arrays))

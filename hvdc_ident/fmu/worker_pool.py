@@ -14,7 +14,7 @@ import re
 import signal
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from hashlib import sha256
 from itertools import islice
 from multiprocessing.util import Finalize
@@ -34,9 +34,12 @@ from hvdc_ident.processes.supervisor import last_line
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of an FMU. deadline: s for one run; load: s to begin; memory: bytes more than a worker has without it;
-    runs: after which a worker is replaced by a new one, as it is where it keeps half of its memory; workers: processes
-    at once for differences of whole runs, None: as many as there are idle cores, or one in a process of a pool."""
+    """Limits of an FMU's processes.
+
+    deadline: s for one run. load: s to begin. memory: bytes more than a worker has without the FMU. runs: after which a
+    worker is replaced by a new one, as it is where it keeps half of its memory. workers: processes at once for
+    differences of whole runs, None: as many as there are idle cores, or one in a process of a pool.
+    """
 
     deadline: float = 60.0
     load: float = 60.0
@@ -52,30 +55,32 @@ class Limits:
 
     @classmethod
     def of(cls, stated: Limits | Mapping[str, float] | None) -> Limits:
-        """The limits that are stated by the keys of a study: deadline and load in s, memory in MiB."""
+        """Return the limits that a study's keys state: deadline and load in s, memory in MiB."""
         if isinstance(stated, Limits):
             return stated
-        found: dict[str, Any] = dict(stated or {})
-        known = [f.name for f in fields(cls)]
-        require_known("limit", found, known, "limits of an FMU")
-        if "memory" in found:
-            found["memory"] = round(found["memory"] * MIB)
-        return replace(cls(), **found)
+        values: dict[str, Any] = dict(stated or {})
+        require_known("limit", values, [f.name for f in fields(cls)], "limits of an FMU")
+        if "memory" in values:
+            values["memory"] = round(values["memory"] * MIB)
+        return cls(**values)
 
 
 @dataclass(eq=False)
 class _FmuWorker:
-    """A process with the FMU in it. resident, space: its bytes of memory and of address space after its last answer."""
+    """A process with the FMU in it. runs: requests so far. findings: number of those in the pool that were sent to it.
+
+    resident, space: bytes of memory and of address space after its last answer.
+    """
 
     process: ChildProcess
     runs: int = 0
-    known: int = 0  # how much of what workers found out it was told
+    findings: int = 0
     resident: int = 0
     space: int = 0
 
     @property
     def pid(self) -> int:
-        """Its process, 0 before it began."""
+        """Number of its process, 0 before it began."""
         return self.process.pid
 
 
@@ -104,11 +109,13 @@ class _Processes:
 
 @dataclass(eq=False)
 class WorkerPool:
-    """The workers of one FMU. It travels to other processes without them and starts its own there.
+    """The workers of one FMU. A pickled pool has none; it starts its own where it is unpickled.
 
-    learned: what was found out about the FMU in its first runs, kept for later workers: "restart", how it is brought
-    back to its start (see `hvdc_ident.fmu.instance`); "derivatives", by parameter whether a run confirmed its own.
-    started: processes so far. runs: whole runs of the FMU so far, those that derivatives took among them.
+    learned: what was found out about the FMU in its first runs, for later workers: "restart", how it is brought back to
+    its start (see `hvdc_ident.fmu.instance`); "derivatives", by parameter whether a run confirmed the FMU's own.
+    cache: runs that callers keep, see `hvdc_ident.fmu.terminal_effects`. memory: bytes of the first worker after its last
+    answer. sensitivity_error: largest relative error of a derivative by differences. started: processes so far. runs:
+    whole runs of the FMU so far, those for derivatives among them.
     """
 
     description: Description
@@ -119,13 +126,15 @@ class WorkerPool:
     def __post_init__(self) -> None:
         self._lock = Lock()
         self._processes: _Processes | None = None
-        self._useless: SimulationError | None = None
+        self._broken: SimulationError | None = None  # why no worker can begin
         self._single = False  # no second worker begins
-        self._loading = self._shared = 0.0  # s that a worker takes to begin, and that shareable requests have taken
+        self._loading_time = self._shareable_time = (
+            0.0  # s that a worker takes to begin; of requests that workers can share
+        )
         self._busy = 1  # workers of the last request
-        self._found: dict[str, Any] = {}  # noise of runs and steps of differences, see `hvdc_ident.fmu.sensitivity_run`
+        self._findings: dict[str, Any] = {}  # noise of runs and difference steps, see `hvdc_ident.fmu.sensitivity_run`
         self._base: tuple[bytes, Array] | None = None  # the last run, and its outputs
-        self.kept: dict[bytes, Any] = {}  # runs that whoever asks keeps, see `hvdc_ident.fmu.terminal_effects`
+        self.cache: dict[bytes, Any] = {}
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
@@ -140,7 +149,7 @@ class WorkerPool:
         self.__post_init__()
 
     def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-        """A worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or ate its worker.
+        """Return a worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or used up memory.
 
         An answer {"again": 1} says that a new process may do what this one, which was used before, cannot: the process
         is replaced and asked once more, and only its answer counts.
@@ -152,28 +161,28 @@ class WorkerPool:
             if len(shares) > 1 and self._prepared(len(shares)):
                 known = {"base": self._base[1]} if self._base is not None and self._base[0] == run else {}
                 parts = self._together([{**heading, "wanted": names} for names in shares], {**arrays, **known})
-                answer, out = _joined(heading["parameters"], shares, parts)
+                answer, out = _combined(heading["parameters"], shares, parts)
             else:
                 answer, out = self._together([heading], arrays)[0]
             if heading["do"] == "simulate":
                 self._base = (run, out["outputs"])
             if len(shares) > 1:
-                self._shared += time.monotonic() - begun
+                self._shareable_time += time.monotonic() - begun
             self.runs += int(answer.get("whole runs", 0))
             return answer, out
 
     def close(self) -> None:
         """End the processes; the next run starts others."""
         with self._lock:
-            self._closed()
+            self._close()
 
     # --- shares of a request ---
 
     def _shares(self, heading: Mapping[str, Any]) -> list[list[str]]:
-        """The parameters of each worker where derivatives come from differences of whole runs; empty for one worker.
+        """Return the parameters of each worker where derivatives come from differences of whole runs; empty for one worker.
 
-        Columns of one worker and of several are the same to the last digit: what a worker finds out about the noise of
-        runs and the steps of differences goes to all of them.
+        Columns of one worker and of several are the same to the last digit: the noise of runs and the difference steps
+        that a worker finds are sent to all of them.
         """
         names: list[str] = heading.get("parameters", [])
         if heading["do"] != "simulate" or len(names) < 2 or "restart" not in self.learned:
@@ -186,24 +195,24 @@ class WorkerPool:
         return [names[i::count] for i in range(count)]
 
     def _prepared(self, count: int) -> bool:
-        """Return whether so many workers are there: they are started once as much time was spent as their start takes.
+        """Return whether so many workers run: they are started once requests took as much time as their start takes.
 
-        What is spent is then at most twice the least that it could have been. A number that was asked for is started
-        at once. An FMU that begins in one process only, as for its licence, stays in one.
+        The total is then at most twice the least possible. A number that the limits state is started at once. An FMU
+        that begins in one process only, as for its licence, stays in one.
         """
-        if self._single or not (self.limits.workers or self._shared >= self._loading):
+        if self._single or not (self.limits.workers or self._shareable_time >= self._loading_time):
             return False
         try:
             for number in range(count):
                 self._ready(number)
         except SimulationError:
-            if 0 not in self._mine().workers:
+            if 0 not in self._own_processes().workers:
                 raise
-            self._single, self._useless = True, None
+            self._single, self._broken = True, None
         return not self._single
 
     def _together(self, headings: Sequence[Mapping[str, Any]], arrays: Mapping[str, Array]) -> list[Message]:
-        """The answers of as many workers as headings, all asked at once. Raises the first failure among them."""
+        """Return the answers of as many workers as headings, all asked at once. Raises the first failure among them."""
         sent = [self._sent(self._ready(number), h, arrays) for number, h in enumerate(headings)]
         self._busy = len(sent)
         answers: list[Message] = []
@@ -220,7 +229,7 @@ class WorkerPool:
     def _answer(
         self, number: int, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]
     ) -> Message:
-        """The answer of a worker that was asked, or of the one that replaces it."""
+        """Return the answer of a worker that was asked, or of the one that replaces it."""
         fresh = worker.runs == 1
         answer, out = self._heard(worker, "run")
         if answer.get("again") and not fresh:
@@ -235,23 +244,23 @@ class WorkerPool:
             self.memory = worker.resident
         self.learned |= answer.get("learned", {})
         for key, value in answer.get("found", {}).items():
-            self._found.setdefault(key, value)
+            self._findings.setdefault(key, value)
         return answer, out
 
     # --- one answer ---
 
     def _sent(self, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _FmuWorker:
-        """The worker, once it is asked, with what others have found out meanwhile."""
+        """Send a request to a worker, with what others have found out meanwhile; return the worker."""
         worker.runs += 1
         worker.process.begin()
-        news = dict(islice(self._found.items(), worker.known, None))
-        worker.known = len(self._found)
+        new = dict(islice(self._findings.items(), worker.findings, None))
+        worker.findings = len(self._findings)
         with contextlib.suppress(OSError):  # it is gone: noticed when it is heard
-            worker.process.connection.send_bytes(packed({**heading, "found": news}, arrays))
+            worker.process.connection.send_bytes(packed({**heading, "found": new}, arrays))
         return worker
 
     def _heard(self, worker: _FmuWorker, what: str) -> Message:
-        """The answer of a worker. Raises SimulationError where it ends or hangs."""
+        """Return the answer of a worker. Raises SimulationError where it ends or hangs."""
         deadline = self.limits.load if what == "loading" else self.limits.deadline
         watch = Watch(worker.process.progress, deadline)
         while True:
@@ -270,55 +279,50 @@ class WorkerPool:
             return heading, arrays
 
     def _failure(self, worker: _FmuWorker, heading: Mapping[str, Any]) -> SimulationError:
-        """The failure that a worker told, with its memory where that was used up."""
-        t = heading.get("time")
-        said = heading.get("said", "")
-        what, hint = heading["failed"], heading.get("hint", "")
+        """Return the failure that a worker reports, with its memory where that was used up."""
+        what, t, hint = heading["failed"], heading["t"], heading["hint"]
         budget = worker.process.budget
         taken = budget.taken(worker.resident, worker.space)
         if budget.exhausted(taken):
             what, hint = f"{what}; {budget.told(taken)}", more_memory(budget)
-        return self._error(
-            what, where="" if t is None else f"t = {t:.6g} s", got=f"the FMU said: {said}" if said else "", hint=hint
-        )
+        return self._error(what, where="" if t is None else f"t = {t:.6g} s", message=heading["message"], hint=hint)
 
-    def _error(self, what: str, where: str = "", got: str = "", hint: str = "") -> SimulationError:
+    def _error(self, what: str, *, where: str = "", message: str = "", hint: str = "") -> SimulationError:
         name = self.description.path.name
+        got = f"the FMU said: {message}" if message else ""
         return SimulationError(what, where=f"{name}, {where}" if where else name, got=got, hint=hint)
 
     def _hung(self, worker: _FmuWorker, what: str, watch: Watch) -> SimulationError:
-        """A worker that is past its deadline, which is ended."""
+        """End a worker that is past its deadline; return the error."""
         instants, still = watch.instants(), watch.still()
-        said = worker.process.last_line
+        message = worker.process.last_line
         end = self._end(worker) or Ending(-9)
         limit = "load" if what == "loading" else "deadline"
         text, hint = overdue(end, worker.process.budget, what, (limit, watch.deadline), instants, still)
-        return self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
+        return self._error(text, message=message, hint=hint)
 
     def _lost(self, worker: _FmuWorker, when: str) -> Message:
-        """The answer of a worker that is gone. Raises SimulationError where a new one cannot be expected to do better."""
+        """Return the answer of a worker that has ended. Raises SimulationError where a new one cannot be expected to succeed."""
         supervisor = self._supervisor()
-        said = worker.process.last_line
+        message = worker.process.last_line
         end = self._end(worker)
-        if end is not None and worker.runs > 1 and "Instantiate" in call_of(end):
-            return {"again": 1}, {}  # some FMUs give one instance a process, and crash at the second
         if end is None:
-            said = supervisor.last
             code = supervisor.process.poll()
-            raise self._error(
-                f"the process that watches the FMU's workers ended {when}, exit code {code}",
-                got=f"it said: {said}" if said else "",
-            )
+            got = f"it said: {supervisor.last}" if supervisor.last else ""
+            what = f"the process that watches the FMU's workers ended {when}, exit code {code}"
+            raise SimulationError(what, where=self.description.path.name, got=got)
+        if worker.runs > 1 and "Instantiate" in call_of(end):
+            return {"again": 1}, {}  # some FMUs allow one instance a process, and crash at the second
         text, hint = crash(end, worker.process.budget, when)
-        raise self._error(text, got=f"the FMU said: {said}" if said else "", hint=hint)
+        raise self._error(text, message=message, hint=hint)
 
     # --- processes ---
 
     def _ready(self, number: int) -> _FmuWorker:
-        """A worker that waits for a request."""
-        if self._useless is not None:
-            raise self._useless
-        processes = self._mine()
+        """Return a worker that waits for a request."""
+        if self._broken is not None:
+            raise self._broken
+        processes = self._own_processes()
         worker = processes.workers.get(number)
         if worker is not None and (worker.runs >= self.limits.runs or self._leaks(worker)):
             self._end(worker)
@@ -330,11 +334,11 @@ class WorkerPool:
         budget = worker.process.budget
         return budget.exhausted(budget.taken(worker.resident, worker.space))
 
-    def _mine(self) -> _Processes:
-        """The processes of this one; those of a process that this was forked from are left to it."""
+    def _own_processes(self) -> _Processes:
+        """Return this process's own workers; those of a process that it was forked from are left to that."""
         if self._processes is not None and self._processes.owner != os.getpid():
             self.unpacked = self._processes.folder.path
-            self._closed()
+            self._close()
         if self._processes is None:
             folder = shared_folder(self.unpacked) if self.unpacked is not None else None
             self._processes = _Processes(os.getpid(), folder or unpacked_folder(self.description.path))
@@ -342,7 +346,7 @@ class WorkerPool:
         return self._processes
 
     def _supervisor(self) -> Supervisor:
-        processes = self._mine()
+        processes = self._own_processes()
         if processes.supervisor is None:
             processes.supervisor = Supervisor(
                 "hvdc_ident.fmu.worker",
@@ -353,7 +357,7 @@ class WorkerPool:
         return processes.supervisor
 
     def _start(self, number: int) -> _FmuWorker:
-        """A worker that has loaded the FMU."""
+        """Start a worker; return it once it has loaded the FMU."""
         supervisor = self._supervisor()
         begun = time.monotonic()
         self.memory = 0
@@ -361,28 +365,26 @@ class WorkerPool:
         worker: _FmuWorker | None = None
         try:
             worker = _FmuWorker(supervisor.start(self.learned))
-            self._mine().workers[number] = worker
+            self._own_processes().workers[number] = worker
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
                 raise self._failure(worker, answer)
         except OSError:
-            self._useless = self._error(
-                "the process that watches the FMU's workers ended before one began",
-                got=last_line(supervisor.printed),
-            )
-            self._closed()
-            raise self._useless from None
+            what = "the process that watches the FMU's workers ended before one began"
+            self._broken = SimulationError(what, where=self.description.path.name, got=last_line(supervisor.printed))
+            self._close()
+            raise self._broken from None
         except SimulationError as e:
             if worker is not None:
                 self._end(worker)
-            self._useless = e
+            self._broken = e
             raise
-        self._loading = time.monotonic() - begun
+        self._loading_time = time.monotonic() - begun
         return worker
 
     def _end(self, worker: _FmuWorker) -> Ending | None:
-        """End a worker; how it ended, or None where that is not known."""
-        processes = self._mine()
+        """End a worker; return how it ended, or None where that is not known."""
+        processes = self._own_processes()
         at = next((n for n, known in processes.workers.items() if known is worker), None)
         if at is None or processes.supervisor is None:  # ended before
             return None
@@ -392,7 +394,7 @@ class WorkerPool:
             processes.supervisor = None
         return end
 
-    def _closed(self) -> None:
+    def _close(self) -> None:
         if self._processes is not None:
             self._finalizer.cancel()
             self._processes.close()
@@ -401,12 +403,12 @@ class WorkerPool:
 
 def _run_of(heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
     """Return a digest of everything that decides the outputs of a run."""
-    own = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
-    return sha256(packed(own, arrays)).digest()
+    decisive = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
+    return sha256(packed(decisive, arrays)).digest()
 
 
-def _joined(parameters: list[str], shares: list[list[str]], parts: list[Message]) -> Message:
-    """One answer with the columns that several workers have made."""
+def _combined(parameters: list[str], shares: list[list[str]], parts: list[Message]) -> Message:
+    """Return one answer with the columns that several workers have computed."""
     (first, out), notes = parts[0], dict(parts[0][0]["notes"])
     gradients, errors = out["gradients"].copy(), out["errors"].copy()
     for names, (answer, columns) in zip(shares[1:], parts[1:], strict=True):
@@ -421,7 +423,7 @@ def _joined(parameters: list[str], shares: list[list[str]], parts: list[Message]
 
 
 def idle_cores(own: int) -> int:
-    """Processes that may work at once, 1 at least: one for each core that is not busy with anything else.
+    """Return the number of processes that may work at once, one for each idle core and at least 1.
 
     own: how many worked for the caller lately; they count as load. A process that a pool has started is one of several
     that share the cores already.
@@ -437,7 +439,7 @@ def idle_cores(own: int) -> int:
 
 
 CALL = re.compile(r"\b(fmi[23][A-Z]\w*)\s*\(|\b_(dlopen)\(")
-BOUND = re.compile(r"fmi[23][A-Z]\w*")  # the name of a function bound by `hvdc_ident.fmu.fmi`
+BOUND_NAME = re.compile(r"fmi[23][A-Z]\w*")  # name of a function that `hvdc_ident.fmu.fmi` has bound
 
 
 def key(name: str, value: float) -> str:
@@ -449,7 +451,7 @@ def key(name: str, value: float) -> str:
 def call_of(end: Ending) -> str:
     """Return where in the FMU a process was when it ended: "in fmi2DoStep"; empty where that is not known."""
     for file, line, name in end.frames():
-        if BOUND.fullmatch(name):
+        if BOUND_NAME.fullmatch(name):
             return f"in {name}"
         if call := CALL.search(linecache.getline(file, line)):
             return f"in {call[1]}" if call[1] else "in loading its library"

@@ -148,7 +148,7 @@ class _FmuSearch:
             *(nx + nu + k for k in range(len(self.free_parameters))),
         ]
         shown = [p.outputs[self.outputs.index(n)] - value for n, value in self.wanted.items()]
-        return np.concatenate([p.slopes[rows], shown]), p.jacobian[np.ix_([*rows, *lower], columns)]
+        return np.concatenate([p.derivatives[rows], shown]), p.jacobian[np.ix_([*rows, *lower], columns)]
 
     def _evaluate(self, values: Mapping[str, float], x: Array | None) -> FmuPoint:
         return at_point(self.model, values, x, self.outputs, self.free_parameters, self.time, check=False)

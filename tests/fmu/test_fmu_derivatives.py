@@ -11,7 +11,7 @@ from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
-from hvdc_ident.fmu.derivatives import ENOUGH, derivative, first, noise_of
+from hvdc_ident.fmu.derivatives import SUFFICIENT, difference, first_difference, noise_of
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
 
 TIME = np.linspace(0.0, 5.0, 251)
@@ -143,10 +143,10 @@ def test_a_step_is_chosen_against_the_noise(noise, low, high):
     level = noise_of(lambda k: runs(2.0 + away * k * 2e-3), middle)
     assert level[0] == pytest.approx(noise, rel=0.3) if noise else level[0] < 1e-12
     wanted = t * np.exp(2.0 * t)
-    begun, step = first(runs, 2.0, 2.0, low, high, middle, level)
-    assert len(counted) <= 1 + 6 + 2 and step.sides == 1 and step.error <= ENOUGH
+    begun, step = first_difference(runs, 2.0, 2.0, low, high, middle, level)
+    assert len(counted) <= 1 + 6 + 2 and step.sides == 1 and step.error <= SUFFICIENT
     counted.clear()
-    later = derivative(runs, 2.0, step, low, high, middle)
+    later = difference(runs, 2.0, step, low, high, middle)
     assert len(counted) == 1
     for found in (begun, later):
         error = np.sqrt(np.mean((found[:, 0] - wanted) ** 2)) / np.sqrt(np.mean(wanted**2))
@@ -163,7 +163,9 @@ def test_noise_asks_for_both_sides():
 
     middle = runs(2.0)
     wanted = t * np.exp(2.0 * t)
-    begun, step = first(runs, 2.0, 2.0, -np.inf, np.inf, middle, noise_of(lambda k: runs(2.0 + k * 2e-3), middle))
+    begun, step = first_difference(
+        runs, 2.0, 2.0, -np.inf, np.inf, middle, noise_of(lambda k: runs(2.0 + k * 2e-3), middle)
+    )
     assert step.sides == 2 and step.error < 1e-2
-    for found in (begun, derivative(runs, 2.0, step, -np.inf, np.inf, middle)):
+    for found in (begun, difference(runs, 2.0, step, -np.inf, np.inf, middle)):
         assert np.sqrt(np.mean((found[:, 0] - wanted) ** 2) / np.mean(wanted**2)) < 2.0 * step.error
