@@ -36,7 +36,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # the same model gives the same file
 
 @dataclass(frozen=True)
 class FmuFile:
-    """An FMU that was written. binary: the folder of its binary, None where it holds sources only; note: what to say of it."""
+    """An FMU that was written. binary: the folder of its binary, None where it holds sources only. note: for the user."""
 
     path: Path
     version: str
@@ -54,10 +54,11 @@ def export_fmu(
     binary: bool | None = None,
     stop: float = 1.0,
 ) -> FmuFile:
-    """The FMU, written to path. model: itself, or its equations as C, where several FMUs are made of it.
+    """Write a model as an FMU to path; return what was written.
 
-    kinds: "model-exchange", "co-simulation" or both. binary: True needs a C compiler, False leaves the sources alone,
-    None compiles where there is a compiler. stop: end of the default experiment, s.
+    model: the model, or its equations as C, where several FMUs are made of them. kinds: "model-exchange", "co-simulation"
+    or both. binary: True needs a C compiler, False leaves the sources alone, None compiles where there is a compiler.
+    stop: end of the default experiment, s.
 
     The FMU starts from the steady state of the inputs and parameters given to it before its initialisation ends (states
     with a start of their own from that), with exact derivatives of that start. Raises ModelError for options that are
@@ -76,42 +77,41 @@ def export_fmu(
             expected="cc, gcc, clang or what CC names",
             hint="leave the binary out",
         )
-    program = model if isinstance(model, CModel) else CModel(model)
-    identifier = identifier_of(program.model.name)
-    content = _content(program, version, chosen, identifier, stop)
+    code = model if isinstance(model, CModel) else CModel(model)
+    identifier = identifier_of(code.model.name)
+    content = _content(code, version, chosen, identifier, stop)
     folder = None
+    note = "sources only, as asked" if binary is False else "sources only: no C compiler was there"
     if command:
         folder = binary_folder(version)
-        sources = {n.removeprefix("sources/"): t for n, t in content.items() if n.startswith("sources/")}
-        library = compiled(command, {n: t.decode() for n, t in sources.items()}, identifier)
-        content[f"binaries/{folder}/{identifier}{library_suffix()}"] = library
-    note = f"binary for {folder}, and sources" if folder else "sources only: no C compiler was there"
-    if binary is False:
-        note = "sources only, as asked"
+        sources = {n.removeprefix("sources/"): t.decode() for n, t in content.items() if n.startswith("sources/")}
+        content[f"binaries/{folder}/{identifier}{library_suffix()}"] = compiled(command, sources)
+        note = f"binary for {folder}, and sources"
     return FmuFile(write_bytes(Path(path), _zipped(content)), version, chosen, folder, note)
 
 
 def identifier_of(name: str) -> str:
-    """A model's name as an identifier of C."""
+    """Return a model's name as an identifier of C."""
     text = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return text if re.match(r"[A-Za-z_]", text) else f"m_{text}"
 
 
-def _content(program: CModel, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
+def _content(code: CModel, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
+    """Return the FMU's files but for the binary, by name."""
     runtime = resources.files("hvdc_ident.fmu.export") / "runtime"
     shared = (*_RUNTIME, f"fmi{version[0]}.c")
     names = ("model.c", *shared)
-    variables = ExportedVariables(program)
-    files = {"model.c": program.source, "tableau.h": tableau()}
+    variables = ExportedVariables(code)
+    files = {"model.c": code.source, "tableau.h": tableau()}
     files |= {n: (runtime / n).read_text("utf-8") for n in (*shared, "fmi.h", "internal.h")}
 
     def described(token: str) -> str:
         return description(variables, token, version, identifier, kinds, names, stop)
 
     # The token is a digest of the content: an importer's stored state of another model is refused.
-    everything = [described(""), program.header("", version), *(files[n] for n in sorted(files))]
+    everything = [described(""), code.header("", version), *(files[n] for n in sorted(files))]
     token = f"{{{uuid.uuid5(_NAMESPACE, ''.join(everything))}}}"
-    files["model.h"] = program.header(token, version)
+    files["model.h"] = code.header(token, version)
     content = {"modelDescription.xml": described(token)}
     content |= {f"sources/{n}": t for n, t in files.items()}
     if version == "3.0":

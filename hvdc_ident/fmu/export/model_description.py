@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from xml.etree import ElementTree as ET
 
 from hvdc_ident.expression import symbol
@@ -37,21 +38,21 @@ class ExportedVariables:
     any other output whose name is taken becomes outputs.NAME, as insertion points are named.
     """
 
-    program: CModel
+    code: CModel
 
     @cached_property
     def all(self) -> tuple[ExportedVariable, ...]:
         """Every variable as listed: time, inputs, outputs in the model's order, other states, derivatives, parameters."""
         states, outputs = list(self._states()), list(self._outputs())
         shown = {v.name: v for v in states if v.causality == "output"} | {v.name: v for v in outputs}
-        ordered = [shown[self._output_name(n)] for n in self.program.model.outputs]
+        ordered = [shown[self._output_name(n)] for n in self.code.model.outputs]
         inner = [v for v in states if v.causality != "output"]
         return (*self._time(), *self._inputs(), *ordered, *inner, *self._rates(), *self._parameters())
 
     @cached_property
     def first(self) -> dict[str, int]:
         """The first value reference of each range."""
-        m, s = self.program.model, self.program.structure.sizes
+        m, s = self.code.model, self.code.structure.sizes
         counts = {
             "time": 1,
             "inputs": len(m.inputs),
@@ -61,11 +62,7 @@ class ExportedVariables:
             "parameters": len(m.parameters),
             "indicators": s.ns,
         }
-        starts, total = {}, 0
-        for name, count in counts.items():
-            starts[name] = total
-            total += count
-        return starts
+        return dict(zip(counts, accumulate(counts.values(), initial=0), strict=False))
 
     @property
     def derivatives(self) -> tuple[ExportedVariable, ...]:
@@ -84,14 +81,14 @@ class ExportedVariables:
         return tuple(v for v in self.all if v.causality == "output" or v.reference in states)
 
     @cached_property
-    def output_states(self) -> dict[str, str]:
-        """{output: state} of outputs that are the state of their own name."""
-        m = self.program.model
-        return {n: n for n, o in m.outputs.items() if n in m.states and o.value == symbol(n)}
+    def output_states(self) -> frozenset[str]:
+        """Outputs that are the state of their own name."""
+        m = self.code.model
+        return frozenset(n for n, o in m.outputs.items() if n in m.states and o.value == symbol(n))
 
     def dependencies(self, variable: ExportedVariable) -> tuple[int, ...]:
         """References of the time, inputs and states that an output or a derivative may depend on, ascending."""
-        s, first = self.program.structure, self.first
+        s, first = self.code.structure, self.first
         if first["states"] <= variable.reference < first["rates"]:
             return (variable.reference,)
         node = (
@@ -99,25 +96,21 @@ class ExportedVariables:
             if variable.derivative is not None
             else s.observed[variable.reference - first["outputs"]]
         )
-        return self._known(node)
+        return self._references(node)
 
     def indicator_dependencies(self, index: int) -> tuple[int, ...]:
         """References of the time, inputs and states that an event indicator may depend on, ascending."""
-        return self._known(self.program.structure.graph.switches[index])
+        return self._references(self.code.structure.graph.switches[index])
 
-    def _known(self, node: int) -> tuple[int, ...]:
-        found, unknowns = self._leaves(node)
+    def _references(self, node: int) -> tuple[int, ...]:
+        leaves, unknowns = self._leaves(node)
         if unknowns:
-            found = found | self._behind_unknowns
-        return tuple(sorted(found))
-
-    @cached_property
-    def _behind_unknowns(self) -> frozenset[int]:
-        return frozenset().union(*(self._leaves(r)[0] for r in self.program.structure.residuals))
+            leaves = leaves.union(*(self._leaves(r)[0] for r in self.code.structure.residuals))
+        return tuple(sorted(leaves))
 
     def _leaves(self, node: int) -> tuple[frozenset[int], bool]:
-        """References reached from a node, conditions included; and whether an algebraic unknown is among what is reached."""
-        s, first = self.program.structure, self.first
+        """Return the references that a node depends on, through conditions too, and whether it depends on an algebraic unknown."""
+        s, first = self.code.structure, self.first
         graph, nx, nu = s.graph, s.sizes.nx, s.sizes.nu
         seen: set[int] = set()
         stack, found, unknowns = [node], set(), False
@@ -132,7 +125,7 @@ class ExportedVariables:
                 unknowns = unknowns or key[2] >= nx
                 found |= {first["states"] + key[2]} if key[2] < nx else set()
             elif key[0] == "leaf" and key[1] == "w":
-                found.add(key[2] if key[2] <= nu else 0)  # what is remembered changes with time
+                found.add(key[2] if key[2] <= nu else 0)  # delayed and sampled signals change with time
         return frozenset(found), unknowns
 
     # --- the ranges ---
@@ -141,21 +134,21 @@ class ExportedVariables:
         yield ExportedVariable("time", 0, "independent", "continuous", unit="s", description="simulation time")
 
     def _inputs(self) -> Iterator[ExportedVariable]:
-        for k, (name, i) in enumerate(self.program.model.inputs.items()):
+        for k, (name, i) in enumerate(self.code.model.inputs.items()):
             yield ExportedVariable(
                 name, self.first["inputs"] + k, "input", "continuous", "", i.value, i.unit, i.description
             )  # fmt: skip
 
     def _state_name(self, name: str) -> str:
-        m = self.program.model
+        m = self.code.model
         return f"states.{name}" if name in m.outputs and name not in self.output_states else name
 
     def _output_name(self, name: str) -> str:
-        m = self.program.model
+        m = self.code.model
         return f"outputs.{name}" if name in m.inputs or name in m.parameters else name
 
     def _states(self) -> Iterator[ExportedVariable]:
-        for k, (name, state) in enumerate(self.program.model.states.items()):
+        for k, (name, state) in enumerate(self.code.model.states.items()):
             searched = state.start is None
             yield ExportedVariable(
                 self._state_name(name),
@@ -163,14 +156,14 @@ class ExportedVariables:
                 "output" if name in self.output_states else "local",
                 "continuous",
                 "approx" if searched else "calculated",
-                float(self.program.rest[k]) if searched else None,
+                float(self.code.rest[k]) if searched else None,
                 state.unit,
                 state.description,
-                nominal=float(self.program.nominals[k]),
+                nominal=float(self.code.nominals[k]),
             )
 
     def _rates(self) -> Iterator[ExportedVariable]:
-        for k, (name, state) in enumerate(self.program.model.states.items()):
+        for k, (name, state) in enumerate(self.code.model.states.items()):
             unit = f"{state.unit}/s" if state.unit and "/" not in state.unit else ""
             yield ExportedVariable(
                 f"der({self._state_name(name)})",
@@ -183,7 +176,7 @@ class ExportedVariables:
             )
 
     def _outputs(self) -> Iterator[ExportedVariable]:
-        m = self.program.model
+        m = self.code.model
         for k, (name, output) in enumerate(m.outputs.items()):
             if name in self.output_states:
                 continue
@@ -199,8 +192,8 @@ class ExportedVariables:
             )
 
     def _parameters(self) -> Iterator[ExportedVariable]:
-        fixed = self.program.fixed
-        for k, (name, q) in enumerate(self.program.model.parameters.items()):
+        fixed = self.code.fixed
+        for k, (name, q) in enumerate(self.code.model.parameters.items()):
             yield ExportedVariable(
                 name,
                 self.first["parameters"] + k,
@@ -244,7 +237,7 @@ def description(
     stop: float,
 ) -> str:
     """The text of modelDescription.xml. version: "2.0" or "3.0"; kinds: keys of KINDS; stop: of the default experiment, s."""
-    model = variables.program.model
+    model = variables.code.model
     root = ET.Element(
         "fmiModelDescription",
         {
@@ -256,7 +249,7 @@ def description(
             "variableNamingConvention": "structured",
         },
     )
-    count = variables.program.structure.sizes.ns
+    count = variables.code.structure.sizes.ns
     if version == "2.0":
         root.set("numberOfEventIndicators", str(count))
     for kind in kinds:
@@ -274,11 +267,7 @@ def description(
         stepSize=repr(stop / 500),
     )
     _variables(ET.SubElement(root, "ModelVariables"), variables, version)
-    structure = ET.SubElement(root, "ModelStructure")
-    if version == "2.0":
-        _structure_2(structure, variables)
-    else:
-        _structure_3(structure, variables)
+    _structure(ET.SubElement(root, "ModelStructure"), variables, version)
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
@@ -342,20 +331,20 @@ def _labels(v: ExportedVariable) -> dict[str, str]:
 
 
 def _variables(parent: ET.Element, variables: ExportedVariables, version: str) -> None:
-    place = {v.reference: k + 1 for k, v in enumerate(variables.all)}
+    number = {v.reference: k + 1 for k, v in enumerate(variables.all)}
     for v in variables.all:
         unit = {"unit": v.unit} if v.unit else {}
         common = {"name": v.name, "valueReference": str(v.reference), **_labels(v)}
         if version == "2.0":
             real = unit | _numbers(v)
             if v.derivative is not None:
-                real["derivative"] = str(place[v.derivative])
+                real["derivative"] = str(number[v.derivative])
             ET.SubElement(ET.SubElement(parent, "ScalarVariable", common), "Real", real)
         else:
             derivative = {} if v.derivative is None else {"derivative": str(v.derivative)}
             ET.SubElement(parent, "Float64", common | unit | _numbers(v) | derivative)
     if version == "3.0":
-        for k in range(variables.program.structure.sizes.ns):
+        for k in range(variables.code.structure.sizes.ns):
             ET.SubElement(
                 parent,
                 "Float64",
@@ -367,32 +356,29 @@ def _variables(parent: ET.Element, variables: ExportedVariables, version: str) -
             )
 
 
-def _dependent(places: Sequence[int]) -> dict[str, str]:
-    return {"dependencies": " ".join(map(str, places)), "dependenciesKind": " ".join("dependent" for _ in places)}
+def _structure(parent: ET.Element, variables: ExportedVariables, version: str) -> None:
+    """Add the unknowns with their dependencies: by the variables' numbers in FMI 2.0, by their references in FMI 3.0."""
+    second = version == "2.0"
+    number = {v.reference: k + 1 for k, v in enumerate(variables.all)}
 
+    def unknown(parent: ET.Element, element: str, reference: int, dependencies: Sequence[int] | None) -> None:
+        shown = number if second else {r: r for r in (reference, *(dependencies or ()))}
+        attributes = {"index" if second else "valueReference": str(shown[reference])}
+        if dependencies is not None:
+            attributes["dependencies"] = " ".join(str(shown[r]) for r in dependencies)
+            attributes["dependenciesKind"] = " ".join("dependent" for _ in dependencies)
+        ET.SubElement(parent, "Unknown" if second else element, attributes)
 
-def _structure_2(structure: ET.Element, variables: ExportedVariables) -> None:
-    place = {v.reference: k + 1 for k, v in enumerate(variables.all)}
-    for group, members in (("Outputs", variables.outputs), ("Derivatives", variables.derivatives)):
-        if not members:
-            continue
-        parent = ET.SubElement(structure, group)
+    for group, element, members in (
+        ("Outputs", "Output", variables.outputs),
+        ("Derivatives", "ContinuousStateDerivative", variables.derivatives),
+        ("InitialUnknowns", "InitialUnknown", variables.unknown_at_start),
+    ):
+        holder = ET.SubElement(parent, group) if second and members else parent
         for v in members:
-            known = _dependent([place[r] for r in variables.dependencies(v)])
-            ET.SubElement(parent, "Unknown", {"index": str(place[v.reference]), **known})
-    if variables.unknown_at_start:
-        parent = ET.SubElement(structure, "InitialUnknowns")
-        for v in variables.unknown_at_start:
-            ET.SubElement(parent, "Unknown", index=str(place[v.reference]))
-
-
-def _structure_3(structure: ET.Element, variables: ExportedVariables) -> None:
-    for kind, members in (("Output", variables.outputs), ("ContinuousStateDerivative", variables.derivatives)):
-        for v in members:
-            known = _dependent(variables.dependencies(v))
-            ET.SubElement(structure, kind, {"valueReference": str(v.reference), **known})
-    for v in variables.unknown_at_start:
-        ET.SubElement(structure, "InitialUnknown", valueReference=str(v.reference))
-    for k in range(variables.program.structure.sizes.ns):
-        known = _dependent(variables.indicator_dependencies(k))
-        ET.SubElement(structure, "EventIndicator", {"valueReference": str(variables.first["indicators"] + k), **known})
+            dependencies = None if element == "InitialUnknown" else variables.dependencies(v)
+            unknown(holder, element, v.reference, dependencies)
+    if not second:
+        for k in range(variables.code.structure.sizes.ns):
+            dependencies = variables.indicator_dependencies(k)
+            unknown(parent, "EventIndicator", variables.first["indicators"] + k, dependencies)
