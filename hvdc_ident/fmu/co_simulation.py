@@ -1,11 +1,11 @@
 """A run of a co-simulation FMU: communication steps from row to row. Runs in the worker alone.
 
-Reading outputs can harm a run. An FMU may restart its solver at a step only where an input was set to another value
+Reading outputs can disturb a run. An FMU may restart its solver at a step only where an input was set to another value
 since it last computed its equations, and reading an output computes them: read between the setting and the step, a jump
-goes by unseen until the solver's own next step, which may be many rows later (FMUs of Dymola do so). Outputs right
-after a jump can be had all the same: once they are read, inputs go back to what the last step had and then to their new
-values, with no reading before the step, which is what the FMU would have seen without the reading. Whether that is
-harmless is tried once for each FMU, against a run that reads right after steps alone, as any importer may.
+has no effect until the solver's own next step, which may be many rows later (FMUs of Dymola do so). Outputs right after
+a jump can be read all the same: once they are read, inputs are set to what the last step had and then to their new
+values, with no reading before the step, which is the sequence that the FMU would have had without the reading. Each FMU
+is tested once for whether that is harmless, against a run that reads right after steps alone, as any importer may.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from hvdc_ident.fmu.fmi import DISCARD, ERROR, FmiError, TerminationRequested, V
 from hvdc_ident.fmu.instance import REPEAT_TOLERANCE, Instance, RunEnded, RunFailed, difference, moving
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 
-EARLY = 10_000  # early returns in one communication step
-TRIAL = 300  # rows of a trial from the first change of an input on: solvers' own steps may be tens of rows long
-PARTS = 4  # of a communication step, in the trial of held inputs on finer steps
+MAX_EARLY_RETURNS = 10_000  # in one communication step
+TRIAL_ROWS = 300  # of a trial from the first change of an input on: solvers' own steps may be tens of rows long
+TRIAL_PARTS = 4  # of a communication step, in the trial of held inputs on finer steps
 
 Reading = Literal["restored", "recomputed", "never"]
 READINGS: tuple[Reading, ...] = ("restored", "recomputed", "never")
-"""Ways to prepare a step after outputs were read with inputs that the last step had not: the inputs of that step are set
-again; they are set again and outputs computed with them; or no such reading is made."""
+"""Preparation of a step after outputs were read with other inputs than those of the last step: the inputs of that step
+are set again; they are set again and outputs computed with them; or no such reading is made."""
 Inputs = tuple[float, ...]
 Slopes = Literal["followed", "ignored", "needless"]
-"""Treatment of the slopes of inputs; needless: held inputs were as good where it was tried."""
+"""Treatment of the slopes of inputs by an FMU; needless: held inputs were as good where it was tried."""
 
 
 @dataclass(frozen=True)
 class CallPattern:
-    """The way in which an FMU is called.
+    """The sequence of calls in a step.
 
     reading: see `READINGS`. sloping: moving inputs are set with their slopes; else they are held at their mean over a
-    step. parts: of each step with a moving input. plain: rows are as read right after each step, with its inputs.
+    step. parts: of each step with a moving input. plain: rows are read right after each step, with its inputs.
     """
 
     reading: Reading = "restored"
@@ -54,7 +54,7 @@ class CallPattern:
 
     @classmethod
     def learned(cls, learned: Mapping[str, Any]) -> CallPattern:
-        """Return the calls that trials have shown to be right, where there were any."""
+        """Return the pattern that trials have shown to be right, where there were any."""
         return cls(learned.get("reading", "restored"), learned.get("sloping") == "followed")
 
 
@@ -70,33 +70,36 @@ def run(
     """Return the outputs at the instants, shape (n, outputs). Two equal instants are before and after a jump.
 
     Inputs follow their slope where the FMU was found to follow it, else they are held at their mean over a step; they
-    stand at their own value where outputs are read. FMI 3.0 gives an input during a step only to FMUs that ask for it by
-    intermediate updates, which are not used here, so a ramp is stairs of the rows' width there. Steps end at every row
+    have their own value where outputs are read. FMI 3.0 gives an input during a step only to FMUs that ask for it by
+    intermediate updates, which are not used here, so a ramp is a staircase of the rows' width there. Steps end at every row
     and every break of an input. An FMU of fixed steps, and one that refuses others, takes its own step (where it states
     none, the shortest interval): a jump within one enters as the mean over it, and rows between are joined by lines.
 
     calls: default, those that are learned of the FMU. Raises RunFailed, or what a failing call of FMI raises.
     """
-    chosen = calls or CallPattern.learned(instance.learned)
-    even = not instance.description.variable_step or instance.learned.get("steps") == "even"
+    chosen, learned = calls or CallPattern.learned(instance.learned), instance.learned
+
+    def attempt(stops: Array) -> Array:
+        return _run(instance, values, signals, time, stops, names, tolerance, chosen)
+
+    even = not instance.description.variable_step or learned.get("steps") == "even"
     stops = _stops(instance.description, signals, time, even)
-    uneven = not _is_even(stops)
+    uneven = not even and not _is_even(stops)
     try:
-        rows = _go(instance, values, signals, time, stops, names, tolerance, chosen)
+        rows = attempt(stops)
     except FmiError as e:
-        retry = uneven and not even and "steps" not in instance.learned
-        if not retry or not e.function.endswith("DoStep") or e.status not in (DISCARD, ERROR):
+        refused = e.function.endswith("DoStep") and e.status in (DISCARD, ERROR)
+        if not (uneven and refused and "steps" not in learned):
             raise
         instance.abandon()
         try:
-            stops = _stops(instance.description, signals, time, even=True)
-            rows = _go(instance, values, signals, time, stops, names, tolerance, chosen)
+            rows = attempt(_stops(instance.description, signals, time, even=True))
         except (FmiError, RunFailed):
             raise e from None
-        instance.learned["steps"] = "even"
+        learned["steps"] = "even"
         return rows
-    if uneven and not even:
-        instance.learned["steps"] = "any"
+    if uneven:
+        learned["steps"] = "any"
     return rows
 
 
@@ -110,8 +113,8 @@ def find_calls(
 ) -> None:
     """Learn how the FMU has to be called for this experiment, where that is not known yet, from short runs of it.
 
-    run: called with the calls and the instants, returns outputs, (n, outputs). learned: gets "reading" where inputs
-    change during the run and outputs move, and "sloping" where inputs move and the FMU offers to follow their slopes.
+    run: of a pattern and the instants, returns outputs, (n, outputs). learned: gets "reading" where inputs change during
+    the run and outputs move, and "sloping" where inputs move and the FMU offers to follow their slopes.
     """
     if time[0] == time[-1]:
         return
@@ -119,54 +122,50 @@ def find_calls(
     before, after = signals.at(stops, "left"), signals.at(stops, "right")
     moves = (after[:-1] != before[1:]).any(axis=1)
     changes = moves | (before[:-1] != after[:-1]).any(axis=1)  # a jump at the end is followed by no step
-    sloping = "sloping" not in learned and _offers_slopes(description) and bool(moves.any())
+    d = description
+    real = bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
+    sloping = "sloping" not in learned and d.interpolates and d.variable_step and real and bool(moves.any())
     reading = "reading" not in learned and bool(changes.any())
     if not (sloping or reading):
         return
-    last = int(np.searchsorted(time, stops[np.argmax(changes)], side="right")) + TRIAL
+    last = int(np.searchsorted(time, stops[np.argmax(changes)], side="right")) + TRIAL_ROWS
     span, allowed = time[:last], max(tolerance, REPEAT_TOLERANCE)
-    if reading:
-        found = _harmless_reading(span, allowed, run)
-        if found is not None:
-            learned["reading"] = found
+    if reading and (harmless := _harmless_reading(span, allowed, run)) is not None:
+        learned["reading"] = harmless
     if sloping:
         held = CallPattern(learned.get("reading", "restored"))
         learned["sloping"] = _tried_slopes(span, allowed, held, run)
 
 
 def notes(learned: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a user has to know of how the FMU was called, by subject."""
-    found = {}
+    """Return notes for the user on how the FMU was called, by subject."""
+    texts = {}
     if learned.get("reading") == "never":
-        found["outputs at jumps"] = (
+        texts["outputs at jumps"] = (
             "the FMU loses jumps of its inputs where outputs are read right after them: rows at jumps are before them"
         )
     if learned.get("sloping") == "ignored":
-        found["ramps of inputs"] = (
+        texts["ramps of inputs"] = (
             "the FMU offers to take slopes of its inputs, but was further off with them than with inputs held at their "
             "mean over each step: they are held"
         )
     if learned.get("steps") == "even":
-        found["steps"] = (
+        texts["steps"] = (
             "the FMU refuses steps of different lengths: it took even ones, rows between are joined by lines"
         )
     if learned.get("behind", 0.0) > 0.0:
-        found["internal steps"] = (
+        texts["internal steps"] = (
             f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "
             f"{learned['behind']:.3g} s earlier"
         )
-    return found
+    return texts
 
 
 # --- trials ---
 
 
-def _offers_slopes(d: Description) -> bool:
-    return d.interpolates and d.variable_step and bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
-
-
 def _harmless_reading(time: Array, allowed: float, run: Callable[[CallPattern, Array], Array]) -> Reading | None:
-    """Return the first way to read outputs after a change that leaves the run as it is; None where nothing moves."""
+    """Return the first way to read outputs after a change that does not disturb the run; None where nothing moves."""
     undisturbed = run(CallPattern("never", plain=True), time)
     size = np.nan_to_num(np.ptp(undisturbed, axis=0))
     if not moving(undisturbed).any():
@@ -192,25 +191,25 @@ def _harmless_reading(time: Array, allowed: float, run: Callable[[CallPattern, A
 def _tried_slopes(time: Array, allowed: float, held: CallPattern, run: Callable[[CallPattern, Array], Array]) -> Slopes:
     """Return whether slopes of inputs give outputs as near to those of held inputs on finer steps as held inputs do.
 
-    Held at their mean over a step, inputs are off by the square of its length: with PARTS as many steps the error left
-    is a small part of that, and slopes that are followed are nearer still. Slopes that are not are off by the length
-    itself. A factor of 2 leaves room for the solver's noise.
+    Held at their mean over a step, inputs cause an error that goes with the square of its length: with TRIAL_PARTS times
+    as many steps the remaining error is a small part of that, and slopes that are followed leave less still. Slopes that
+    are ignored leave one that goes with the length itself. A factor of 2 leaves room for the solver's noise.
     """
-    finer, coarse = run(replace(held, parts=PARTS), time), run(held, time)
-    off, allowance = difference(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
+    finer, coarse = run(replace(held, parts=TRIAL_PARTS), time), run(held, time)
+    deviation, allowance = difference(coarse, finer), allowed * np.nan_to_num(np.ptp(finer, axis=0))
     try:
         sloped = difference(run(replace(held, sloping=True), time), finer)
     except (FmiError, RunFailed):
         return "ignored"
-    if (sloped > 2.0 * off + allowance).any():
+    if (sloped > 2.0 * deviation + allowance).any():
         return "ignored"
-    return "followed" if (off > allowance).any() else "needless"
+    return "followed" if (deviation > allowance).any() else "needless"
 
 
 # --- one run ---
 
 
-def _go(
+def _run(
     instance: Instance,
     values: Mapping[str, float],
     signals: PackedInputs,
@@ -220,13 +219,14 @@ def _go(
     tolerance: float,
     calls: CallPattern,
 ) -> Array:
-    rows = signals.at(stops, "left"), signals.at(stops, "right")
-    instance.begin(values, rows[0][0], float(time[0]), float(stops[-1]), tolerance)
-    before, after = (list(map(tuple, side.tolist())) for side in rows)  # compared in every step: tuples are quickest
-    seen = instance.variables(names)
+    """Return the outputs of a run with communication steps between the stops, (n, outputs)."""
+    sides = signals.at(stops, "left"), signals.at(stops, "right")
+    instance.begin(values, sides[0][0], float(time[0]), float(stops[-1]), tolerance)
+    before, after = (list(map(tuple, side.tolist())) for side in sides)  # compared in every step: tuples are quickest
+    outputs = instance.variables(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
-    stepper = _Stepper(instance, calls, before[0], seen.get)
-    shows = calls.reading != "never"
+    stepper = _Stepper(instance, calls, before[0], outputs.get)
+    reads_changes = calls.reading != "never"
     instants = stops.tolist()
     for k, t in enumerate(instants):
         if k:
@@ -235,22 +235,21 @@ def _go(
             except RunEnded as e:
                 count = k
                 if float(e.t or 0.0) >= t - _rounding(time):
-                    with contextlib.suppress(FmiError):  # an FMU may show nothing any more: its row is not there then
-                        left[k] = right[k] = seen.get()
+                    with contextlib.suppress(FmiError):  # the FMU may not answer any more: then there is no row
+                        left[k] = right[k] = outputs.get()
                         count += 1
-                e.rows = _rows(
-                    time[time <= stops[count - 1] + _rounding(time)], stops[:count], left[:count], right[:count]
-                )
+                recorded = time[time <= stops[count - 1] + _rounding(time)]
+                e.rows = _rows(recorded, stops[:count], left[:count], right[:count])
                 raise
-        plain = calls.plain or not shows or stepper.stands_at(before[k])
-        left[k] = seen.get() if plain else stepper.show(before[k])
-        if calls.plain and shows and not stepper.stands_at(before[k]):
-            stepper.show(before[k])
+        current = stepper.has_inputs(before[k])
+        left[k] = outputs.get() if calls.plain or not reads_changes or current else stepper.read(before[k])
+        if calls.plain and reads_changes and not current:
+            stepper.read(before[k])
         right[k] = left[k]
-        if shows and before[k] != after[k]:
-            shown = stepper.show(after[k])
+        if reads_changes and before[k] != after[k]:
+            changed = stepper.read(after[k])
             if not calls.plain:
-                right[k] = shown
+                right[k] = changed
     if stepper.behind > instance.learned.get("behind", 0.0):
         instance.learned["behind"] = stepper.behind
     return _rows(time, stops, left, right)
@@ -276,72 +275,71 @@ def _stops(description: Description, signals: PackedInputs, time: Array, even: b
         return wanted
     count = int(np.ceil((end - begin) / step - 1e-9))
     grid: Array = begin + step * np.arange(count + 1, dtype=float)
-    # A row or jump that rounding alone keeps off a step's end is at it: a jump just before it would be averaged away.
+    # A row or jump that differs from a step's end by rounding is at it: a jump just before it would be averaged away.
     return _moved_to(grid, wanted, 1e-6 * step)
 
 
-def _moved_to(instants: Array, places: Array, near: float) -> Array:
-    """Return the instants, those that have one of the places, in order, so near by at it."""
-    if not places.size:
+def _moved_to(instants: Array, targets: Array, near: float) -> Array:
+    """Return the instants, each moved to the target that is so near, where there is one. targets: ascending."""
+    if not targets.size:
         return instants
-    found = places[np.clip(np.searchsorted(places, instants - near), 0, places.size - 1)]
-    return np.asarray(np.where(np.abs(found - instants) <= near, found, instants), dtype=float)
+    nearest = targets[np.clip(np.searchsorted(targets, instants - near), 0, targets.size - 1)]
+    return np.asarray(np.where(np.abs(nearest - instants) <= near, nearest, instants), dtype=float)
 
 
 def _rounding(time: Array) -> float:
-    """Return by how much instants may differ that are meant to be the same: a few last digits of the largest."""
+    """Return the difference of instants up to which they are the same: a few last digits of the largest."""
     return 8.0 * float(np.spacing(np.abs(time[[0, -1]]).max()))
 
 
 def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
     """Return the values at the rows; of two equal instants the first has what was before the jump."""
     at = _moved_to(time, stops, _rounding(time))
-    place = np.minimum(np.searchsorted(stops, at), stops.size - 1)
-    if (stops[place] == at).all():
-        twice = np.zeros(time.size, dtype=bool)
-        twice[:-1] = time[:-1] == time[1:]
-        return np.where(twice[:, None], left[place], right[place])
+    index = np.minimum(np.searchsorted(stops, at), stops.size - 1)
+    if (stops[index] == at).all():
+        before_jump = np.append(time[:-1] == time[1:], False)
+        return np.where(before_jump[:, None], left[index], right[index])
     return np.column_stack([np.interp(time, stops, right[:, k]) for k in range(right.shape[1])])
 
 
 class _Stepper:
-    """The steps of one run. behind: by how much the outputs of a step were older than its end at most, s."""
+    """The steps of one run. behind: largest time by which the outputs of a step were older than its end, s."""
 
     def __init__(self, instance: Instance, calls: CallPattern, inputs: Inputs, compute: Callable[[], Array]) -> None:
         self.instance, self.calls, self.compute = instance, calls, compute
         self.behind = 0.0
         self._stepped = inputs  # at the end of the last step
-        self._now: Inputs | None = inputs
-        self._shown = False  # whether others were set since
+        self._current: Inputs | None = inputs
+        self._read = False  # whether outputs were read with other inputs since
         self._sloping = False
         if calls.sloping:
-            inputs_ = instance.description.inputs.values()
-            self._references = instance.library.references([v.reference for v in inputs_])
-            self._orders = (c_int * len(inputs_))(*([1] * len(inputs_)))
-            self._slopes = Vector(len(inputs_))
+            variables = instance.description.inputs.values()
+            self._references = instance.library.references([v.reference for v in variables])
+            self._orders = (c_int * len(variables))(*([1] * len(variables)))
+            self._slopes = Vector(len(variables))
 
-    def stands_at(self, u: Inputs) -> bool:
-        """Return whether the FMU has these inputs."""
-        return self._now == u
+    def has_inputs(self, u: Inputs) -> bool:
+        """Return whether these inputs are set."""
+        return self._current == u
 
-    def show(self, u: Inputs) -> Array:
+    def read(self, u: Inputs) -> Array:
         """Return the outputs with these inputs."""
         self._set(u)
-        self._shown = True
+        self._read = True
         return self.compute()
 
     def _set(self, u: Inputs) -> None:
         self.instance.inputs.set(u)
-        self._now = u
+        self._current = u
 
     def step(self, a: float, b: float, first: Inputs, last: Inputs) -> None:
         """Bring the FMU from a to b while its inputs go from `first` to `last`."""
         moves = first != last
-        if self._shown:
+        if self._read:
             self._set(self._stepped)
             if self.calls.reading == "recomputed":
                 self.compute()
-            self._shown = False
+            self._read = False
         if moves and not self.calls.sloping:
             for x, y in pairwise(np.linspace(0.0, 1.0, self.calls.parts + 1).tolist()):
                 share = 0.5 * (x + y)
@@ -355,17 +353,17 @@ class _Stepper:
             self._sloping = moves
         self._advance(a, b)
         self._stepped = last
-        self._now = None  # an FMU may have moved its inputs along the slopes, or not
+        self._current = None  # the FMU may have moved its inputs along the slopes, or not
 
     def _apply(self, u: Inputs) -> None:
-        """Have the inputs stand at u in the next step."""
-        if self._now != u:
+        """Set the inputs of the next step."""
+        if self._current != u:
             self._set(u)
         self._stepped = u
 
     def _advance(self, a: float, b: float) -> None:
         t, rounding = a, 1e-12 * max(abs(b), 1.0)
-        for _ in range(EARLY):
+        for _ in range(MAX_EARLY_RETURNS):
             try:
                 reached, computed = self.instance.library.do_step(t, b - t)
             except TerminationRequested as e:
@@ -375,4 +373,4 @@ class _Stepper:
                     self.behind = max(self.behind, b - computed)
                 return
             t = reached
-        raise RunFailed(f"the FMU returned early {EARLY} times in one step", t)
+        raise RunFailed(f"the FMU returned early {MAX_EARLY_RETURNS} times in one step", t)
