@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 from hvdc_ident.errors import ModelError
+from hvdc_ident.immutable import FrozenMap
 
 
 @dataclass(frozen=True)
@@ -59,3 +61,27 @@ class Input:
         object.__setattr__(self, "value", float(self.value))
         if not math.isfinite(self.value):
             raise ModelError("an input's value is not finite", expected="a finite number", got=f"{self.value}")
+
+
+def with_values(
+    parameters: Mapping[str, Parameter],
+    inputs: Mapping[str, Input],
+    values: Mapping[str, float],
+    unknown: Callable[[str], Exception],
+) -> tuple[FrozenMap[Parameter], FrozenMap[Input]]:
+    """Return parameters and inputs with other values.
+
+    Raises ModelError for a value outside a parameter's bounds, and what `unknown` gives for a name of neither.
+    """
+    changed_parameters, changed_inputs = dict(parameters), dict(inputs)
+    for name, value in values.items():
+        if name in parameters:
+            try:
+                changed_parameters[name] = replace(parameters[name], value=float(value))
+            except ModelError as e:
+                raise e.at(f"parameter '{name}'") from None
+        elif name in inputs:
+            changed_inputs[name] = replace(inputs[name], value=float(value))
+        else:
+            raise unknown(name)
+    return FrozenMap(changed_parameters), FrozenMap(changed_inputs)

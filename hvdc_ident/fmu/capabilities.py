@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,10 +25,8 @@ from hvdc_ident.immutable import FrozenMap
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
-ROWS = 15
-"""Variables of one group that are shown where not all are asked for: the groups together stay about a screen."""
-SHARE = 0.1
-"""Of the default experiment's length that the short run takes."""
+ROWS_SHOWN = 15  # of one group of variables, where not all are asked for: the groups together fill about a screen
+SHORT_RUN = 0.1  # length of the test run, in shares of the default experiment's
 GROUPS = {
     "inputs": "inputs",
     "outputs": "outputs, recorded where nothing else is named",
@@ -47,26 +44,24 @@ OFFERS = {
     "one instance a process": "canBeInstantiatedOnlyOncePerProcess",
     "needs its tool": "needsExecutionTool",
 }
-"""By the words for it, the attribute of FMI that says it."""
-
-
+"""Attributes of FMI, by the words for them."""
 LEARNED = {
     "brought back to its start by": "restart",
     "slopes of inputs": "sloping",
     "communication steps": "steps",
     "reading outputs after a jump": "reading",
 }
-"""By the words for it, the key of what the pool has learned in its runs."""
+"""Keys of what the pool has learned in its runs, by the words for them."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
-    """An FMU as it describes itself, and as it was found.
+    """An FMU as it describes itself, and as test runs show it.
 
-    interfaces: of each kind that it offers, what it says of OFFERS. platforms: libraries by folder. problem: why it
-    cannot be used here, "" where it can. experiment: start, stop, tolerance and step of its default, where it says
-    them. groups: variables by GROUPS; sizes: how many there are of each. arrays: sizes of variables that are arrays.
-    unused: variables that are no numbers. found: what runs of it showed, in words by subject.
+    interfaces: values of OFFERS by the kinds of interface that it has. platforms: libraries by folder. problem: why it
+    cannot be used on this machine, "" where it can. experiment: start, stop, tolerance and step of its default, where
+    given. groups: variables by GROUPS; sizes: their numbers. arrays: sizes of variables that are arrays. unused:
+    variables that are no numbers. found: results of test runs, in words by subject.
     """
 
     path: Path
@@ -89,7 +84,7 @@ class Capabilities:
     found: FrozenMap[str] = field(default_factory=FrozenMap)
 
     def matching(self, text: str) -> Capabilities:
-        """Return the same with only the variables that have the text in name, unit or description, in any case."""
+        """Return a copy with only the variables that have the text in name, unit or description, in any case."""
         part = text.casefold()
 
         def holds(v: Variable) -> bool:
@@ -105,7 +100,7 @@ class Capabilities:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything, all variables included, as JSON has it."""
+        """Return everything, all variables included, in the form of JSON."""
         plain = {k: v for k, v in self.__dict__.items() if k not in ("path", "interfaces", "groups", "platforms")}
         return {
             "schema": 1,
@@ -113,11 +108,11 @@ class Capabilities:
             **{k: dict(v) if isinstance(v, FrozenMap) else v for k, v in plain.items()},
             "interfaces": {k: dict(v) for k, v in self.interfaces.items()},
             "platforms": {k: list(v) for k, v in self.platforms.items()},
-            "variables": {g: {n: _line(v) for n, v in vs.items()} for g, vs in self.groups.items()},
+            "variables": {g: {n: _plain(v) for n, v in vs.items()} for g, vs in self.groups.items()},
         }
 
-    def text(self, rows: int | None = ROWS) -> str:
-        """Return a screen of it; rows: of each group that are shown, None for all."""
+    def text(self, rows: int | None = ROWS_SHOWN) -> str:
+        """Return it as text. rows: of each group that are shown, None for all."""
         return "\n".join([*self._heading(), *self._abilities(), *self._listed(rows)])
 
     def __str__(self) -> str:
@@ -183,13 +178,13 @@ def _cells(v: Variable) -> tuple[str, ...]:
     return v.name, v.causality, v.variability, v.unit, start, bounds, " ".join(f"{v.description}{also}".split())
 
 
-def _line(v: Variable) -> dict[str, Any]:
+def _plain(v: Variable) -> dict[str, Any]:
     finite = {k: x if np.isfinite(x) else None for k, x in (("min", v.min), ("max", v.max))}
     return {k: x for k, x in {**asdict(v), **finite, "also": list(v.also)}.items() if k not in ("name", "reference")}
 
 
 def read_capabilities(path: str | Path) -> Capabilities:
-    """Return what an FMU says of itself; nothing of it is run. Raises ModelError where it is no FMU of FMI 2.0 or 3.0."""
+    """Return an FMU's capabilities as it describes them, without running it. Raises ModelError for no FMU of FMI 2.0 or 3.0."""
     file = Path(path)
     names = check_archive(file)
     described = read_description(file, binary=False)
@@ -225,9 +220,9 @@ def read_capabilities(path: str | Path) -> Capabilities:
 
 
 def _offers(interface: Any) -> FrozenMap[Any]:
-    """Return what one interface says of itself, by the words of OFFERS; what its kind does not have is left out."""
-    said = {words: getattr(interface, attribute, None) for words, attribute in OFFERS.items()}
-    return FrozenMap({words: value for words, value in said.items() if value is not None})
+    """Return the values of OFFERS that one kind of interface has, by their words."""
+    values = {words: getattr(interface, attribute, None) for words, attribute in OFFERS.items()}
+    return FrozenMap({words: value for words, value in values.items() if value is not None})
 
 
 def _groups(d: Description) -> FrozenMap[FrozenMap[Variable]]:
@@ -243,41 +238,38 @@ def _groups(d: Description) -> FrozenMap[FrozenMap[Variable]]:
 
 
 def tested_capabilities(model: FmuModel, known: Capabilities | None = None) -> Capabilities:
-    """Return the capabilities of an FMU with what short runs of it show; what fails is told in the error's words."""
-    found = known or read_capabilities(model.fmu.path)
-    subjects = {"two short runs": _two_runs, "derivatives at the start": _derivatives}
-    words = {subject: _words(look, model, found) for subject, look in subjects.items()}
-    words |= {subject: str(model.pool.learned.get(key, "")) for subject, key in LEARNED.items()}
-    return replace(found, found=FrozenMap({k: v for k, v in words.items() if v}))
+    """Return the capabilities of an FMU with the results of short test runs, or the error of those that fail."""
+    described = known or read_capabilities(model.fmu.path)
+    found = {}
+    for subject, test in {"two short runs": _two_runs, "derivatives at the start": _derivatives}.items():
+        try:
+            found[subject] = test(model, described)
+        except HvdcIdentError as e:
+            found[subject] = f"failed: {e.what}" + (f" ({e.got})" if e.got else "")
+    found |= {subject: str(model.pool.learned.get(key, "")) for subject, key in LEARNED.items()}
+    return replace(described, found=FrozenMap({k: v for k, v in found.items() if v}))
 
 
-def _words(look: Callable[[FmuModel, Capabilities], str], model: FmuModel, found: Capabilities) -> str:
-    try:
-        return look(model, found)
-    except HvdcIdentError as e:
-        return f"failed: {e.what}" + (f" ({e.got})" if e.got else "")
-
-
-def _two_runs(model: FmuModel, found: Capabilities) -> str:
-    """Return whether a second run equals the first."""
+def _two_runs(model: FmuModel, described: Capabilities) -> str:
+    """Return in words whether a second run equals the first."""
     from hvdc_ident.data import experiment
 
     if not model.outputs:
         return ""
-    start = found.experiment.get("start", 0.0)
-    span = SHARE * max(found.experiment.get("stop", start + 1.0) - start, 0.0) or SHARE
+    start = described.experiment.get("start", 0.0)
+    span = SHORT_RUN * max(described.experiment.get("stop", start + 1.0) - start, 0.0) or SHORT_RUN
     short = experiment("short", np.linspace(start, start + span, 11), {})
     first, second = (model.simulate(short).trajectory.values for _ in range(2))
-    off = np.abs(second - first).max(axis=0) / np.maximum(np.abs(first).max(axis=0), 1e-300)
-    names = [n for n, o in zip(model.outputs, off.tolist(), strict=True) if o > 0.0]
+    relative = np.abs(second - first).max(axis=0) / np.maximum(np.abs(first).max(axis=0), 1e-300)
+    names = [n for n, r in zip(model.outputs, relative.tolist(), strict=True) if r > 0.0]
     length = f"{span:g} s from {start:g} s"
     if not names:
         return f"equal, {length}"
-    return f"differ by up to {off.max():.2g} of their size in {', '.join(names[:3])}, {length}"
+    return f"differ by up to {relative.max():.2g} of their size in {', '.join(names[:3])}, {length}"
 
 
 def _derivatives(model: FmuModel, _: Capabilities) -> str:
-    """Return which derivatives the FMU computes itself, and whether these agree with differences."""
+    """Return in words which derivatives the FMU computes itself, and whether these agree with differences."""
     from hvdc_ident.fmu.evaluate import at_point, smooth_inputs
 
     if not model.has_equations or not model.states:
@@ -287,7 +279,7 @@ def _derivatives(model: FmuModel, _: Capabilities) -> str:
     real = [n for n, v in model.fmu.parameters.items() if not v.whole]
     point = at_point(model, {}, None, tuple(model.outputs), real)
     columns = [*model.states, *smooth_inputs(model), *real]
-    wrong = [n for n, own in zip(columns, point.directional.tolist(), strict=True) if not own]
+    wrong = [n for n, directional in zip(columns, point.directional.tolist(), strict=True) if not directional]
     if not wrong:
         return f"directional ones agree with differences, for all {len(columns)} states, inputs and parameters"
     some = ", ".join(wrong[:4]) + (" ..." if len(wrong) > 4 else "")

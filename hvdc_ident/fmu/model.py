@@ -22,7 +22,7 @@ from hvdc_ident.fmu.description import Description, Interface, Variable, read_de
 from hvdc_ident.fmu.worker_pool import Limits, WorkerPool
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Output
-from hvdc_ident.parameters import Input, Parameter
+from hvdc_ident.parameters import Input, Parameter, with_values
 from hvdc_ident.simulate import Simulation, Tolerance
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class FmuModel:
 
     The start of a run is what the FMU's own initialisation gives for the inputs' first values.
     outputs: what the FMU declares as such (its states where it declares none), and what `recording` added.
-    pool: its worker, shared by all models made from this one. effects: in the order they were put on.
+    pool: its workers, shared by all models made from this one. effects: in the order they were put on.
     """
 
     name: str
@@ -106,19 +106,9 @@ class FmuModel:
         return self.pool.sensitivity_error
 
     def with_values(self, values: Mapping[str, float]) -> FmuModel:
-        """The model with other parameter or input values. Raises UnknownNameError, or ModelError outside the bounds."""
-        parameters, inputs = dict(self.parameters), dict(self.inputs)
-        for name, value in values.items():
-            if name in parameters:
-                try:
-                    parameters[name] = replace(parameters[name], value=float(value))
-                except ModelError as e:
-                    raise e.at(f"parameter '{name}'") from None
-            elif name in inputs:
-                inputs[name] = replace(inputs[name], value=float(value))
-            else:
-                raise self._unknown(name)
-        return replace(self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs))
+        """Return the model with other parameter or input values. Raises UnknownNameError, or ModelError outside the bounds."""
+        parameters, inputs = with_values(self.parameters, self.inputs, values, self._unknown)
+        return replace(self, parameters=parameters, inputs=inputs)
 
     def _unknown(self, name: str) -> Exception:
         for kind in (self.fmu.parameters, self.fmu.inputs):
@@ -167,13 +157,13 @@ class FmuModel:
         return f"`hvdc-ident check {self.fmu.path.name} --find TEXT`"
 
     def with_effects(self, effects: Iterable[Any]) -> FmuModel:
-        """The model with effects at its inputs and outputs, one after the other; neutral ones change nothing."""
+        """Return the model with effects at its inputs and outputs, one after the other; neutral ones change nothing."""
         from hvdc_ident.fmu.terminal_effects import with_effects
 
         return with_effects(self, effects)
 
     def driven(self, points: Iterable[str]) -> FmuModel:
-        """The model itself where only inputs are driven. Raises ModelError for any other insertion point."""
+        """Return the model itself where only inputs are driven. Raises ModelError for any other insertion point."""
         for name in points:
             if name not in self.inputs:
                 raise ModelError(
@@ -219,7 +209,7 @@ def read_fmu(
     interface: Interface | None = None,
     limits: Limits | Mapping[str, float] | None = None,
 ) -> FmuModel:
-    """The model of an FMU, 2.0 or 3.0. Load only FMUs you trust.
+    """Return the model of an FMU, 2.0 or 3.0. Load only FMUs you trust.
 
     interface: model exchange where the FMU offers both and none is asked for. limits: `Limits`, or by the keys
     of a study, {"deadline": 300.0, "load": 60.0, "memory": 4096}: s for one run, s to begin, and MiB.
@@ -229,31 +219,31 @@ def read_fmu(
     path = Path(source)
     if not path.is_file():
         raise ModelError("the model file is not there", where=str(path))
-    found = read_description(path.resolve(), interface)
-    pool = WorkerPool(found, Limits.of(limits))
-    starts = {n: v.start for n, v in found.parameters.items()}
-    if None in starts.values():
-        read = pool.ask({"do": "starts"}, {})[1]["parameters"].tolist()
-        starts = {n: s if s is not None else r for (n, s), r in zip(starts.items(), read, strict=True)}
-        pool.close()  # the next worker knows the starts
-        pool.description = replace(
-            found,
-            parameters=FrozenMap({n: replace(v, start=starts[n]) for n, v in found.parameters.items()}),
-        )
+    described = read_description(path.resolve(), interface)
+    pool = WorkerPool(described, Limits.of(limits))
+    if any(v.start is None for v in described.parameters.values()):
+        starts = pool.ask({"do": "starts"}, {})[1]["parameters"].tolist()
+        pool.close()  # the next worker gets the starts
+        parameters = {
+            n: v if v.start is not None else replace(v, start=start)
+            for (n, v), start in zip(described.parameters.items(), starts, strict=True)
+        }
+        pool.description = described = replace(described, parameters=FrozenMap(parameters))
     return FmuModel(
-        name=found.name,
+        name=described.name,
         pool=pool,
-        parameters=FrozenMap({n: _parameter(v, float(starts[n] or 0.0)) for n, v in found.parameters.items()}),
-        inputs=FrozenMap({n: Input(v.start or 0.0, v.unit, v.description) for n, v in found.inputs.items()}),
-        outputs=FrozenMap({n: _output(found.variable(n)) for n in found.shown}),
-        states=FrozenMap({n: FmuState(v.unit, v.description, v.nominal) for n, v in found.states.items()}),
-        description=found.text,
+        parameters=FrozenMap({n: _parameter(v) for n, v in described.parameters.items()}),
+        inputs=FrozenMap({n: Input(v.start or 0.0, v.unit, v.description) for n, v in described.inputs.items()}),
+        outputs=FrozenMap({n: _output(described.variable(n)) for n in described.shown}),
+        states=FrozenMap({n: FmuState(v.unit, v.description, v.nominal) for n, v in described.states.items()}),
+        description=described.text,
         source=digest(path.read_bytes()),
     )
 
 
-def _parameter(v: Variable, start: float) -> Parameter:
-    """The parameter; bounds that its own start leaves are no bounds."""
+def _parameter(v: Variable) -> Parameter:
+    """Return a variable as a parameter, without bounds where its own start lies outside them."""
+    start = float(v.start or 0.0)
     low, high = (v.min, v.max) if v.min <= start <= v.max else (-np.inf, np.inf)
     text = v.description + (f" (also {', '.join(v.also)})" if v.also else "")
     return Parameter(start, v.unit, low, high, scale=v.nominal if start == 0.0 else 0.0, description=text.strip())

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 import sympy as sp
 
 from hvdc_ident.display import Shown, Table
-from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.errors import unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.parameters import Input, Parameter
+from hvdc_ident.parameters import Input, Parameter, with_values
 
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment
@@ -150,20 +150,13 @@ class Model(Shown):
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """The model with other parameter or input values; bounds of a parameter that the value leaves are an error."""
-        parameters, inputs = dict(self.parameters), dict(self.inputs)
-        for name, value in values.items():
-            if name in parameters:
-                try:
-                    parameters[name] = replace(parameters[name], value=float(value))
-                except ModelError as e:
-                    raise e.at(f"parameter '{name}'") from None
-            elif name in inputs:
-                inputs[name] = replace(inputs[name], value=float(value))
-            else:
-                raise unknown_name("parameter or input", name, [*parameters, *inputs], where=f"model '{self.name}'")
-        return replace(
-            self, parameters=FrozenMap(parameters), inputs=FrozenMap(inputs), origin=self.origin or ModelOrigin(self)
-        )
+
+        def unknown(name: str) -> Exception:
+            known = [*self.parameters, *self.inputs]
+            return unknown_name("parameter or input", name, known, where=f"model '{self.name}'")
+
+        parameters, inputs = with_values(self.parameters, self.inputs, values, unknown)
+        return replace(self, parameters=parameters, inputs=inputs, origin=self.origin or ModelOrigin(self))
 
     def driven(self, points: Iterable[str]) -> Model:
         """Return the model in which these insertion points are inputs that follow a recorded column, not their equation."""
