@@ -47,11 +47,10 @@ DAMAGE = (
     ValueError,
 )
 """Errors that reading a damaged archive raises."""
-IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def check_archive(path: Path) -> tuple[str, ...]:
-    """The names in the archive, once it may be unpacked. Raises ModelError where it may not; nothing is written."""
+    """Check that an archive may be unpacked; return the names in it. Raises ModelError where it may not."""
     with _opened(path) as archive:
         entries = archive.infolist()
         if len(entries) > MOST_ENTRIES:
@@ -81,8 +80,8 @@ def check_archive(path: Path) -> tuple[str, ...]:
 
 
 def check_identifier(path: Path, identifier: str | None) -> str:
-    """The model identifier, once it can only be the name of a file in the folder of binaries. Raises ModelError."""
-    if identifier is None or not IDENTIFIER.fullmatch(identifier):
+    """Return a model identifier that is a plain file name. Raises ModelError for any other."""
+    if identifier is None or not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
         raise _refused(
             path, "the model identifier is none", "letters, digits and _, the first no digit", repr(identifier)[:80]
         )
@@ -90,7 +89,7 @@ def check_identifier(path: Path, identifier: str | None) -> str:
 
 
 def machine_of(library: bytes) -> str:
-    """Return for what a shared library's first bytes say it is made, "x86_64 Linux"; "" where they do not tell.
+    """Return the machine that a shared library is for, "x86_64 Linux", by its first bytes; "" where these do not tell.
 
     ELF: bytes 4 (1: 32 bits, 2: 64 bits) and 18 (the machine) of its header; Windows begins with MZ, macOS with Mach-O.
     """
@@ -136,7 +135,7 @@ def _damaged(path: Path, name: str, error: Exception) -> ModelError:
 
 
 def _said(error: Exception) -> str:
-    """The reason, without the folder it was unpacked to."""
+    """Return the reason of an error, without the folder that it was unpacked to."""
     return (error.strerror or type(error).__name__) if isinstance(error, OSError) else str(error)
 
 
@@ -170,7 +169,7 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
 
 
 def _check_doubles(path: Path, entries: Iterable[zipfile.ZipInfo]) -> None:
-    """Raises ModelError where two files of one name differ and one of them is run, read by the FMU, or parsed.
+    """Raise ModelError where two files of one name differ and one of them is run, read by the FMU, or parsed.
 
     Anywhere else, as in `extra`, the last one counts, as it does for every unzip.
     """
@@ -183,12 +182,12 @@ def _check_doubles(path: Path, entries: Iterable[zipfile.ZipInfo]) -> None:
 
 
 def _plain(name: str) -> str:
-    """The name with the slashes of the zip standard; some tools write backslashes."""
+    """Return the name with the slashes of the zip standard; some tools write backslashes."""
     return name.replace("\\", "/")
 
 
 def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
-    """Raises ModelError where the XML is too large or deep, not well-formed, or has a DOCTYPE, where entities would come from."""
+    """Raise ModelError where the XML is too large or deep, not well-formed, or has a DOCTYPE, which could define entities."""
     where = f"{path}, {name}"
     size = archive.getinfo(name).file_size
     if size > MOST_XML:
@@ -243,11 +242,11 @@ class Folder:
 
     @property
     def binaries(self) -> Path:
-        """The folder that the archive's top folder became."""
+        """Folder with the archive's files."""
         return self.path / "fmu"
 
     def release(self) -> None:
-        """Use it no more; remove it where nobody else does."""
+        """Stop using it; remove it where nobody else uses it."""
         if self.lock < 0:
             return
         with contextlib.suppress(OSError):
@@ -257,17 +256,17 @@ class Folder:
         self.lock = -1
 
     def disown(self) -> None:
-        """Forget it in a process that was forked from a user's: it stays that user's."""
+        """Forget it in a process that was forked from one that uses it."""
         if self.lock >= 0:
             os.close(self.lock)
             self.lock = -1
 
 
 def unpacked_folder(archive: Path) -> Folder:
-    """A new folder with the archive's content. Folders that killed processes left behind are removed."""
+    """Return a new folder with the archive's content. Folders that killed processes left behind are removed."""
     remove_abandoned_folders()
     path = Path(tempfile.mkdtemp(prefix=PREFIX))
-    held = path / f"{LOCK}.new"  # under its name only once it is held: before, a sweep would take it for left behind
+    held = path / f"{LOCK}.new"  # renamed once it is held: before, it would count as abandoned
     lock = os.open(held, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     _share(lock)
     held.rename(path / LOCK)
@@ -282,7 +281,7 @@ def unpacked_folder(archive: Path) -> Folder:
 
 
 def shared_folder(path: Path) -> Folder | None:
-    """The folder of another process, used here too; None where it is not there or about to go."""
+    """Return the folder of another process, to be shared with it; None where it is removed or being removed."""
     try:
         lock = os.open(path / LOCK, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:
@@ -305,14 +304,14 @@ def remove_abandoned_folders() -> None:
 
 
 def _share(lock: int) -> None:
-    """Hold the lock beside others. Raises OSError where somebody has it alone."""
+    """Take the lock beside others. Raises OSError where another process holds it alone."""
     import fcntl
 
     fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 def _alone(lock: int) -> bool:
-    """Return whether nobody else holds the lock, which is then held alone."""
+    """Take the lock alone; return whether nobody else holds it."""
     import fcntl
 
     try:

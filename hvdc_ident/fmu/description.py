@@ -1,4 +1,4 @@
-"""An FMU's own account of itself: its variables, its abilities, and which of them are used here."""
+"""An FMU's model description: its variables and capabilities, read from its XML, and the checks that it can be used."""
 
 from __future__ import annotations
 
@@ -23,10 +23,9 @@ SETTABLE = ("parameter", "input")
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable. kind: its type in the FMI version. start: None where the FMU does not say it. nominal: above 0.
+    """One variable. kind: its type in the FMI version. start: None where the FMU does not give it. nominal: above 0.
 
-    causality, variability: in FMI's words. tunable: whether it may be set during a run. whole: whether it takes whole
-    numbers only. also: aliases, which are other names of the same value reference.
+    causality, variability: in FMI's words. also: aliases, which are other names of the same value reference.
     """
 
     name: str
@@ -65,16 +64,15 @@ class Variable:
 
 @dataclass(frozen=True)
 class Description:
-    """An FMU as a worker and a model know it.
+    """The model description of an FMU.
 
     version: 2 or 3. token: the GUID or instantiation token. derivatives: value references in the order of the states.
     variables: every scalar number by name, aliases included. arrays: sizes in words of those that are arrays, which
-    stay at their start and are not recorded. shown: names recorded where none are asked for, the outputs that it
-    declares or, without any, its states. tool: what made it; needs_tool: whether it runs in that tool alone.
-    completed_step: whether it wants to hear of finished integrator steps. directional: whether it offers directional
-    derivatives. variable_step: whether communication steps may differ. interpolates: whether it takes the slope of
-    inputs. step: communication step it suggests, s, or None.
-    once_per_process: whether a process may make one instance only.
+    stay at their start and are not recorded. shown: names recorded where none are asked for, the declared outputs or,
+    without any, the states. tool: that generated it; needs_tool: whether it runs in that tool alone. completed_step:
+    whether it needs the calls after integrator steps. directional: whether it offers directional derivatives.
+    variable_step: whether communication steps may differ. interpolates: whether it takes the derivatives of inputs.
+    step: communication step that it suggests, s, or None. once_per_process: whether a process may make one instance only.
     """
 
     path: Path
@@ -109,10 +107,10 @@ class Description:
 
 
 def read_description(path: Path, interface: Interface | None = None, *, binary: bool = True) -> Description:
-    """Return the description of a checked FMU; model exchange where it offers both and none is asked for.
+    """Check an FMU and return its description; model exchange where it offers both interfaces and none is named.
 
     binary: whether it must have one for this machine. Raises ModelError where the archive is refused, the XML makes no
-    sense, or what is needed is not there.
+    sense, or something that is needed is missing.
     """
     names = check_archive(path)
     given = parsed(path)
@@ -166,7 +164,7 @@ def read_description(path: Path, interface: Interface | None = None, *, binary: 
 
 
 def parsed(path: Path) -> Any:
-    """Return FMPy's reading of the XML. Its own validation is off: it refuses what can be worked with, as a missing start."""
+    """Return the model description as FMPy reads it, without its validation, which refuses what can be used, as a missing start."""
     from fmpy import read_model_description
     from lxml import etree
 
@@ -191,7 +189,7 @@ def _tool_words(given: Any) -> str:
 
 
 def _says_directional(path: Path, kind: Interface) -> bool:
-    """FMI 3's word for directional derivatives, which FMPy does not read."""
+    """Return FMI 3.0's attribute for directional derivatives, which FMPy does not read."""
     from xml.etree import ElementTree
 
     with zipfile.ZipFile(path) as archive, archive.open(DESCRIPTION) as text:
@@ -208,6 +206,7 @@ def _said(error: BaseException) -> str:
 
 
 def _interface(path: Path, given: Any, asked: Interface | None) -> tuple[Interface, Any]:
+    """Return the interface to use, and FMPy's description of it. Raises ModelError where it is not offered."""
     offered = {
         k: v for k, v in zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True) if v is not None
     }
@@ -241,7 +240,7 @@ def platforms(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def check_binary(path: Path, names: Iterable[str], version: int, identifier: str) -> None:
-    """Raise ModelError where there is no binary that this machine can load: what is in its place, and the way out."""
+    """Raise ModelError where there is no binary that this machine can load."""
     from fmpy import platform, platform_tuple, sharedLibraryExtension
 
     folder = platform if version == 2 else platform_tuple
@@ -251,18 +250,18 @@ def check_binary(path: Path, names: Iterable[str], version: int, identifier: str
     if has_sources(names):
         hint = f"`hvdc-ident check {path.name} --compile` compiles the C sources in it, into a new file; or {hint}"
     if file in have.get(folder, ()):
-        with Path(sys.executable).open("rb") as own:
-            made, here = machine_of(first_bytes(path, expected)), machine_of(own.read(64))
-        if not made or made == here:
+        with Path(sys.executable).open("rb") as interpreter:
+            machine, local = machine_of(first_bytes(path, expected)), machine_of(interpreter.read(64))
+        if not machine or machine == local:
             return
-        what, expected, got = f"the FMU's binary {expected} is for another machine", here, made
+        what, expected, got = f"the FMU's binary {expected} is for another machine", local, machine
     else:
         what, got = "the FMU has no binary for this machine", _in_its_place(folder, have, has_sources(names))
     raise ModelError(what, where=str(path), expected=expected, got=got, hint=hint)
 
 
 def _in_its_place(folder: str, have: Mapping[str, list[str]], sources: bool) -> str:
-    """Return what an FMU has instead of a binary for this machine, in words."""
+    """Return in words what an FMU has instead of a binary for this machine."""
     filled = [p for p, libraries in have.items() if libraries and p != folder]
     others = f"; binaries for {', '.join(filled)}" if filled else ""
     if folder not in have:
@@ -287,25 +286,14 @@ def _size(v: Any) -> str:
     return " x ".join(str(n) for n in v.shape or ())
 
 
-def _refuse_array(path: Path, v: Any, given: Any) -> None:
-    if v.dimensions:
-        other = "use its co-simulation (interface), or " if given.coSimulation else ""
-        raise ModelError(
-            "a state of the FMU is an array, which is not supported",
-            where=f"{path}, variable '{v.name}'",
-            expected="scalar states",
-            got=f"an array of {_size(v)}",
-            hint=f"{other}export its elements as scalars",
-        )
-
-
 def _named_states(given: Any, variables: FrozenMap[Variable]) -> tuple[str, ...]:
-    """Return the names of the scalar states that the model structure tells of, for co-simulation too."""
+    """Return the names of the scalar states in the model structure, which co-simulation FMUs may have too."""
     states = (u.variable.derivative for u in given.derivatives)
     return tuple(dict.fromkeys(s.name for s in states if s is not None and getattr(s, "name", None) in variables))
 
 
 def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...]]:
+    """Return the states, and the value references of their derivatives. Raises ModelError where they are not usable."""
     states: dict[str, Variable] = {}
     derivatives = []
     first = {v.valueReference: v for v in reversed(given.modelVariables)} if given.fmiMajorVersion == 3 else {}
@@ -317,7 +305,14 @@ def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...
                 f"the derivative '{derivative.name}' does not say of which state it is", where=f"{path}, ModelStructure"
             )
         state = first.get(state.valueReference, state)  # where an output has the reference too, FMPy takes the last
-        _refuse_array(path, state, given)
+        if state.dimensions:
+            raise ModelError(
+                "a state of the FMU is an array, which is not supported",
+                where=f"{path}, variable '{state.name}'",
+                expected="scalar states",
+                got=f"an array of {_size(state)}",
+                hint=f"{'use its co-simulation (interface), or ' if given.coSimulation else ''}export its elements as scalars",
+            )
         if state.name in states:
             raise ModelError(f"the state '{state.name}' has two derivatives", where=f"{path}, ModelStructure")
         states[state.name] = _variable(state)
@@ -326,32 +321,32 @@ def _states(path: Path, given: Any) -> tuple[FrozenMap[Variable], tuple[int, ...
 
 
 def _variable(v: Any) -> Variable:
-    """The variable with what its declared type says where it does not."""
+    """Return a variable with the attributes of its declared type where it has none of its own."""
     declared = v.declaredType
 
-    def said(name: str) -> Any:
-        own = getattr(v, name, None)
-        return own if own is not None else getattr(declared, name, None)
+    def attribute(name: str) -> Any:
+        value = getattr(v, name, None)
+        return value if value is not None else getattr(declared, name, None)
 
-    nominal = abs(_number(said("nominal")) or 0.0)
-    low, high = _number(said("min")), _number(said("max"))
+    nominal = abs(_number(attribute("nominal")) or 0.0)
+    low, high = _number(attribute("min")), _number(attribute("max"))
     return Variable(
         name=v.name,
         reference=int(v.valueReference),
         kind=v.type,
-        unit=said("unit") or "",
+        unit=attribute("unit") or "",
         start=_number(v.start),
         nominal=nominal or 1.0,
         min=-math.inf if low is None else low,
         max=math.inf if high is None else high,
-        description=said("description") or "",
+        description=attribute("description") or "",
         causality=v.causality or "local",
         variability=v.variability or ("continuous" if v.type in REAL else "discrete"),
     )
 
 
 def _number(text: object) -> float | None:
-    """The finite number that the XML's text is, else None."""
+    """Return the finite number in a text of the XML, else None."""
     if text is None:
         return None
     words = str(text).strip()
@@ -365,7 +360,7 @@ def _number(text: object) -> float | None:
 
 
 def _merged(variables: Iterable[Variable]) -> FrozenMap[Variable]:
-    """By name, one for each value reference: what shares one is one variable under several names."""
+    """Return variables by name, one for each value reference, with the other names of it as aliases."""
     found: dict[tuple[int, bool], Variable] = {}
     for v in variables:
         key = (v.reference, v.kind in REAL)

@@ -17,8 +17,8 @@ from hvdc_ident.simulate import Elimination, Graph, ModelEquations, engine_of, s
 TOLERANCE = 1e-8
 """Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""
 
-# C function: the structure's function of the same content.
-_SAME = {
+# C functions, and the model's functions that they contain.
+_FUNCTIONS = {
     "model_f": "f",
     "model_jac": "jac",
     "model_ft": "ft",
@@ -47,7 +47,7 @@ class CModel:
 
     @cached_property
     def rest(self) -> Array:
-        """[states, unknowns, delays, sampled] at the steady start of the model's own values; the guesses where there is none."""
+        """[states, unknowns, delays, sampled] at the steady state of the model's values; the guesses where there is none."""
         m = self.model
         p = np.array([q.value for q in m.parameters.values()])
         u = np.array([i.value for i in m.inputs.values()])
@@ -61,7 +61,7 @@ class CModel:
 
     @cached_property
     def guesses(self) -> Array:
-        """Where the search for the steady start begins where the start of the model's own values does not help."""
+        """Start of the search for the steady state where that of the model's own values does not help."""
         m, s = self.model, self.structure
         states = [0.0 if q.guess is None else q.guess for q in m.states.values()]
         unknowns = [m.algebraic[n].start for n in s.unknowns]
@@ -75,7 +75,7 @@ class CModel:
 
     @cached_property
     def fixed(self) -> frozenset[str]:
-        """Parameters that decide delay times and sampling: they cannot change after initialisation."""
+        """Parameters of delay times and sampling, which cannot change after initialisation."""
         names = list(self.model.parameters)
         return frozenset(names[i] for v in self.structure.timing for i in self.structure.partial(v, "p"))
 
@@ -96,7 +96,7 @@ class CModel:
             "    const double *y, *yd, *w, *wd, *p, *dp, *m;",
             "} Args;",
             *(f"extern {declaration.split(' = ')[0]};" for declaration in self._tables),
-            *(f"void {n}(const Args *a, double *out);" for n in (*_SAME, *_TANGENTS)),
+            *(f"void {n}(const Args *a, double *out);" for n in (*_FUNCTIONS, *_TANGENTS)),
         ]
         if self._elimination:
             lines += [
@@ -131,7 +131,7 @@ class CModel:
     def _functions(self) -> Iterator[str]:
         s = self.structure
         known = {f.name: f for f in s.functions}
-        for name, same in _SAME.items():
+        for name, same in _FUNCTIONS.items():
             f = known[same]
             yield c_function(s.graph, name, f.nodes, f.live)
         roots = [*s.rhs, *s.observed, *s.graph.switches]
@@ -142,7 +142,7 @@ class CModel:
             yield from _elimination_text(self._elimination)
 
     def _tangent(self, node: int) -> int:
-        """The node's derivative along the directions that stand in yd, wd and dp."""
+        """Return the node of a node's derivative along the directions in yd, wd and dp."""
         g = self.structure.graph
         total = g.zero
         for group, direction in (("y", "yd"), ("w", "wd"), ("p", "dp")):
@@ -156,7 +156,7 @@ class CModel:
 
 
 def tableau() -> str:
-    """The text of tableau.h: the coefficients of the integrator."""
+    """Return the text of tableau.h: the coefficients of the integrator."""
     tables = {
         "RODAS_A": steps.RODAS_A,
         "RODAS_C": steps.RODAS_C,
@@ -210,7 +210,7 @@ _BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 
 def c_number(value: float) -> str:
-    """A C constant of exactly this double."""
+    """Return a C constant of exactly this double."""
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):
@@ -220,7 +220,7 @@ def c_number(value: float) -> str:
 
 
 def c_string(text: str) -> str:
-    """A C string literal in ASCII."""
+    """Return a C string literal in ASCII."""
     escaped = "".join(
         c if " " <= c <= "~" and c not in '\\"?' else "".join(f"\\{b:03o}" for b in c.encode("utf-8")) for c in text
     )
@@ -228,17 +228,17 @@ def c_string(text: str) -> str:
 
 
 def c_array(kind: str, name: str, items: Iterable[str]) -> str:
-    """A constant array; one element that is never read where there are none."""
+    """Return a constant array; it has one element that is never read where there are no items."""
     listed = list(items)
     filler = "0" if "*" not in kind else '""'
     return f"const {kind} {name}[{max(len(listed), 1)}] = {{{', '.join(listed) or filler}}};"
 
 
 def c_function(graph: Graph, name: str, stores: Sequence[tuple[int, int]], live: bool = False) -> str:
-    """The function `void name(const Args *a, double *out)` that stores nodes at places of `out`.
+    """Return the function `void name(const Args *a, double *out)` that stores nodes in elements of `out`.
 
-    live: conditions by comparison instead of by frozen mode. Everything is computed before anything is stored, so that
-    `out` may be one of the arguments.
+    stores: pairs of an index and a node. live: conditions by comparison instead of by frozen mode. Everything is computed
+    before anything is stored, so that `out` may be one of the arguments.
     """
     lines: dict[int, str] = {}
     groups: set[str] = set()
@@ -262,7 +262,7 @@ def _arguments(graph: Graph, node: int, live: bool) -> tuple[int, ...]:
 
 
 def _order(graph: Graph, roots: Sequence[int], live: bool) -> list[int]:
-    """The nodes needed, each after what it is computed from."""
+    """Return the nodes needed, each after its arguments."""
     done: dict[int, None] = {}
     stack = list(reversed(roots))
     while stack:
