@@ -197,7 +197,7 @@ def read_capabilities(path: str | Path) -> Capabilities:
         problem = f"{e.what}, but {e.got}"
     offered = zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True)
     default = {"start": "startTime", "stop": "stopTime", "tolerance": "tolerance", "step": "stepSize"}
-    said = {words: getattr(given.defaultExperiment, attribute, None) for words, attribute in default.items()}
+    stated = {words: getattr(given.defaultExperiment, attribute, None) for words, attribute in default.items()}
     return Capabilities(
         path=file,
         name=given.modelName or file.stem,
@@ -209,7 +209,7 @@ def read_capabilities(path: str | Path) -> Capabilities:
         platforms=FrozenMap({k: tuple(v) for k, v in platforms(names).items()}),
         sources=has_sources(names),
         problem=problem,
-        experiment=FrozenMap({k: float(v) for k, v in said.items() if v is not None}),
+        experiment=FrozenMap({k: float(v) for k, v in stated.items() if v is not None}),
         indicators=int(given.numberOfEventIndicators or 0),
         log_categories=tuple(c.name for c in given.logCategories),
         groups=groups,

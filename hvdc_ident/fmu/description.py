@@ -8,10 +8,10 @@ import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.fmu.archive import DESCRIPTION, check_archive, check_identifier, first_bytes, machine_of
+from hvdc_ident.fmu.archive import DESCRIPTION, Folder, check_archive, check_identifier, first_bytes, machine_of
 from hvdc_ident.immutable import FrozenMap
 
 Interface = Literal["model-exchange", "co-simulation"]
@@ -106,6 +106,13 @@ class Description:
         return known[name]
 
 
+class Setup(NamedTuple):
+    """What a worker begins with: an FMU's description, and the folder that it is unpacked into, whose lock is inherited."""
+
+    description: Description
+    folder: Folder
+
+
 def read_description(path: Path, interface: Interface | None = None, *, binary: bool = True) -> Description:
     """Check an FMU and return its description; model exchange where it offers both interfaces and none is named.
 
@@ -131,8 +138,8 @@ def read_description(path: Path, interface: Interface | None = None, *, binary: 
     states, derivatives = _states(path, given) if kind == "model-exchange" else (FrozenMap(), ())
     numbers = [v for v in given.modelVariables if v.type in (*REAL, *WHOLE)]
     variables = FrozenMap({v.name: _variable(v) for v in numbers if not v.dimensions})
-    found = {c: [v for v in variables.values() if v.causality == c] for c in ("parameter", "input", "output")}
-    outputs = FrozenMap({v.name: v for v in found["output"]})
+    by_causality = {c: [v for v in variables.values() if v.causality == c] for c in ("parameter", "input", "output")}
+    outputs = FrozenMap({v.name: v for v in by_causality["output"]})
     experiment = given.defaultExperiment
     return Description(
         path=path,
@@ -141,8 +148,8 @@ def read_description(path: Path, interface: Interface | None = None, *, binary: 
         interface=kind,
         identifier=identifier,
         token=given.instantiationToken or "",
-        parameters=_merged(found["parameter"]),
-        inputs=_merged(found["input"]),
+        parameters=_merged(by_causality["parameter"]),
+        inputs=_merged(by_causality["input"]),
         outputs=outputs,
         states=states,
         derivatives=derivatives,
@@ -229,14 +236,14 @@ def has_sources(names: Iterable[str]) -> bool:
 
 def platforms(names: Iterable[str]) -> dict[str, list[str]]:
     """Return the libraries in an FMU by the folder of their platform; empty folders too."""
-    found: dict[str, list[str]] = {}
+    folders: dict[str, list[str]] = {}
     for name in names:
         parts = name.replace("\\", "/").split("/")
         if parts[0] == "binaries" and len(parts) > 2:
-            libraries = found.setdefault(parts[1], [])
+            libraries = folders.setdefault(parts[1], [])
             if len(parts) == 3 and parts[2].endswith((".so", ".dll", ".dylib")):
                 libraries.append(parts[2])
-    return {p: found[p] for p in sorted(found)}
+    return {p: folders[p] for p in sorted(folders)}
 
 
 def check_binary(path: Path, names: Iterable[str], version: int, identifier: str) -> None:
@@ -361,13 +368,13 @@ def _number(text: object) -> float | None:
 
 def _merged(variables: Iterable[Variable]) -> FrozenMap[Variable]:
     """Return variables by name, one for each value reference, with the other names of it as aliases."""
-    found: dict[tuple[int, bool], Variable] = {}
+    merged: dict[tuple[int, bool], Variable] = {}
     for v in variables:
         key = (v.reference, v.kind in REAL)
-        first = found.get(key)
+        first = merged.get(key)
         if first is None:
-            found[key] = v
+            merged[key] = v
             continue
         start = first.start if first.start is not None else v.start
-        found[key] = replace(first, also=(*first.also, v.name), start=start, unit=first.unit or v.unit)
-    return FrozenMap({v.name: v for v in found.values()})
+        merged[key] = replace(first, also=(*first.also, v.name), start=start, unit=first.unit or v.unit)
+    return FrozenMap({v.name: v for v in merged.values()})

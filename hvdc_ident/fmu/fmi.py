@@ -33,19 +33,19 @@ def why_not_loaded(error: Exception, folder: str, d: Description) -> tuple[str, 
     """Return why an FMU's shared library cannot be loaded, and what to try, in words without its temporary folder."""
     from fmpy import platform, platform_tuple, sharedLibraryExtension
 
-    place = Path(folder, "binaries", platform if d.version == 2 else platform_tuple)
-    library = place / f"{d.identifier}{sharedLibraryExtension}"
+    library_folder = Path(folder, "binaries", platform if d.version == 2 else platform_tuple)
+    library = library_folder / f"{d.identifier}{sharedLibraryExtension}"
     if missing := _missing_libraries(library):
         hint = "install them, or put the folder they are in into LD_LIBRARY_PATH"
         return f"the FMU's binary needs shared libraries that are not here: {', '.join(missing)}", hint
-    said = " ".join(str(error).split()).replace(f"{library.parent}/", "")
-    if "undefined symbol" in said:
-        function = said.rpartition(":")[2].strip()
+    message = " ".join(str(error).split()).replace(f"{library.parent}/", "")
+    if "undefined symbol" in message:
+        function = message.rpartition(":")[2].strip()
         return (
             f"the FMU's binary lacks the function {function}",
             f"export it again{f' from {d.tool}' if d.tool else ''}",
         )
-    reason = said.rpartition(f"{library.name}: ")[2] or said
+    reason = message.rpartition(f"{library.name}: ")[2] or message
     return f"the FMU's binary {library.name} cannot be loaded: {reason[:200]}", "copy or export the FMU again"
 
 
@@ -55,10 +55,10 @@ def _missing_libraries(library: Path) -> list[str]:
     if command is None or not library.is_file():
         return []
     try:
-        said = subprocess.run([command, str(library)], capture_output=True, text=True, timeout=10, check=False).stdout
+        output = subprocess.run([command, str(library)], capture_output=True, text=True, timeout=10, check=False).stdout
     except (OSError, subprocess.TimeoutExpired):
         return []
-    return [line.split()[0] for line in said.splitlines() if line.strip().endswith("not found")]
+    return [line.split()[0] for line in output.splitlines() if line.strip().endswith("not found")]
 
 
 def refusal(d: Description, message: str) -> str:
@@ -274,7 +274,7 @@ class FmiLibrary:
     # --- initialisation ---
 
     def setup_experiment(self, start: float, stop: float | None, tolerance: float | None) -> None:
-        """Tell the experiment, FMI 2.0; before values are set, for some FMUs put their own values back here."""
+        """Set up the experiment, FMI 2.0; before values are set, for some FMUs restore their own values in it."""
         self.progress[START] = self.progress[NOW] = start
         self.progress[STOP] = nan if stop is None else stop
         if self.version == 2:
@@ -338,13 +338,13 @@ class FmiLibrary:
 
     def get_nominals(self) -> Array:
         """(nx,) typical sizes of the states, as the FMU says them."""
-        found = Vector(self.nx)
+        nominals = Vector(self.nx)
         if self.nx:
             if self.version == 2:
-                self.fmu.fmi2GetNominalsOfContinuousStates(self.component, found.pointer, self.nx)
+                self.fmu.fmi2GetNominalsOfContinuousStates(self.component, nominals.pointer, self.nx)
             else:
-                self.fmu.fmi3GetNominalsOfContinuousStates(self.component, found.pointer, self.nx)
-        return found.values
+                self.fmu.fmi3GetNominalsOfContinuousStates(self.component, nominals.pointer, self.nx)
+        return nominals.values
 
     def get_indicators(self) -> Array:
         """(nz,), a copy."""

@@ -213,13 +213,13 @@ class ModelExchangeRun:
         derivatives = self.library.get_derivatives()
         if not self.columns:
             return derivatives.copy()
-        found = np.empty(y.size)
-        found[: self.nx] = derivatives
+        result = np.empty(y.size)
+        result[: self.nx] = derivatives
         assert self.equations is not None
         for j in range(self.columns):
             part = slice((j + 1) * self.nx, (j + 2) * self.nx)
-            found[part] = self.equations.derivatives(j, y[part])
-        return found
+            result[part] = self.equations.derivatives(j, y[part])
+        return result
 
     def _jacobian(self, t: float, y: Array) -> Array:
         """Return the matrix of the stiff method's iteration: A on the diagonal, without the coupling of S to x."""

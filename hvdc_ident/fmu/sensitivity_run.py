@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field, replace
+from dataclasses import asdict, astuple, replace
 from hashlib import sha256
-from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,8 +15,6 @@ from hvdc_ident.fmu import co_simulation, model_exchange
 from hvdc_ident.fmu.derivatives import (
     SHORT_STEP,
     SUFFICIENT,
-    DifferenceStep,
-    PointEvaluation,
     SensitivityEquations,
     difference,
     difference_pair,
@@ -25,21 +22,21 @@ from hvdc_ident.fmu.derivatives import (
     noise_of,
     rms,
 )
-from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.fmi import FmiError, VariableGroup
 from hvdc_ident.fmu.instance import (
     NOISE_FACTOR,
     Instance,
-    LoadFmu,
     RunEnded,
     RunFailed,
-    failure,
     find_reuse,
     isolated,
     moving,
 )
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.processes.messages import Message
+
+if TYPE_CHECKING:
+    from hvdc_ident.fmu.worker import RequestHandler
 
 STEPS_KEPT = 1000  # of differences, and noise levels, that a worker remembers
 LOST_IN_NOISE = 0.5  # relative error from which a derivative is not distinguished from noise
@@ -54,103 +51,7 @@ REUSE_NOTES = {
 }
 
 
-@dataclass
-class RequestHandler:
-    """A worker's answers to requests, and what it has learned of the FMU.
-
-    load_fmu: loads it into this process. restart_deadline: called between the runs of one request. learned: passed on to
-    later workers by the pool, see `hvdc_ident.fmu.worker_pool`. steps, noise: of differences, by a digest of the
-    experiment. last: digest and outputs of the last run. runs: of the present request.
-    """
-
-    description: Description
-    load_fmu: LoadFmu
-    restart_deadline: Callable[[], None]
-    learned: dict[str, Any] = field(default_factory=dict)
-    steps: dict[bytes, DifferenceStep] = field(default_factory=dict)
-    noise: dict[bytes, Array] = field(default_factory=dict)
-    last: tuple[bytes, Array] | None = None
-    loaded: Instance | None = None
-    runs: int = 0
-
-    @property
-    def instance(self) -> Instance:
-        """The FMU in this process, loaded when it is first used."""
-        if self.loaded is None:
-            self.loaded = self.load_fmu(self.learned)
-        return self.loaded
-
-    @property
-    def isolated(self) -> bool:
-        """True where each run has a process of its own: it needs one, or its reuse is not known yet."""
-        return self.learned.get("restart", "process") == "process"
-
-    def load(self) -> Message:
-        """Make a first instance, so that what prevents it is reported at once."""
-
-        def work() -> Message:
-            self.instance.instantiate()
-            return {}, {}
-
-        return self._guarded(work)
-
-    def failed(self, error: Exception) -> RunFailed:
-        """Return an error as RunFailed, and abandon the instance, which cannot be trusted even to free itself."""
-        failed = failure(error, self.loaded.library.messages if self.loaded else ())
-        if self.loaded:
-            self.loaded.abandon()
-        return failed
-
-    def do(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-        """Return the answer to a request, with what was learned.
-
-        heading: "found" in it has the steps of differences and the noise of runs that other workers have found.
-        """
-        self.runs = 0
-        for name, value in heading.get("found", {}).items():
-            kind, _, key = name.partition(" ")
-            if kind == "step":
-                self.steps.setdefault(bytes.fromhex(key), DifferenceStep(*value))
-            else:
-                self.noise.setdefault(bytes.fromhex(key), np.array(value))
-        known = len(self.steps), len(self.noise)
-        if heading["do"] == "simulate":
-            result, out = _ExperimentRun(self, heading, arrays).answer()
-        else:
-            work = {"point": self._point, "starts": self._starts}[heading["do"]]
-            result, out = self._guarded(lambda: work(heading, arrays))
-        found = {f"step {k.hex()}": astuple(s) for k, s in islice(self.steps.items(), known[0], None)}
-        found |= {f"noise {k.hex()}": n.tolist() for k, n in islice(self.noise.items(), known[1], None)}
-        return {**result, "found": found, "learned": self.learned, "whole runs": self.runs}, out
-
-    def _guarded(self, work: Callable[[], Message]) -> Message:
-        """Return the result of work that is done in a separate process where runs are."""
-        return isolated(lambda send: send(work()))[0] if self.isolated else work()
-
-    def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-        """Return derivatives, outputs and their Jacobian at a point."""
-        point = PointEvaluation(
-            self.instance, heading["values"], arrays.get("x"), arrays["u"], heading["time"], tuple(heading["outputs"])
-        )
-        derivatives, outputs = point.evaluate()
-        jacobian = point.jacobian(heading["parameters"], heading["sizes"], check=heading["check"])
-        return {"error": jacobian.error, "near": jacobian.near}, {
-            "x": point.x,
-            "derivatives": derivatives,
-            "outputs": outputs,
-            "jacobian": jacobian.matrix,
-            "directional": jacobian.directional.astype(float),
-            "nominals": self.instance.nominals(),
-        }
-
-    def _starts(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-        """Return the parameters' values where none is set."""
-        d = self.description
-        self.instance.begin({}, np.array([v.start or 0.0 for v in d.inputs.values()]), 0.0, None, None)
-        return {}, {"parameters": VariableGroup(self.instance.library, tuple(d.parameters.values())).get().copy()}
-
-
-class _ExperimentRun:
+class SensitivityRun:
     """One experiment: a run, and derivatives by the best method for each parameter.
 
     Parameters include inputs, whose derivatives are by constants added to them, and directions of all inputs: constants

@@ -266,11 +266,11 @@ def _digest_of(inputs: Mapping[str, InputSignal]) -> str:
 
 def _passed_over(time: Array, inputs: Mapping[str, InputSignal], moved: Mapping[str, InputSignal]) -> NDArray[np.bool_]:
     """Return which rows, (n,), a jump of the inputs passes over as it moves; a row at a jump is after it."""
-    found = np.zeros(time.size, dtype=bool)
+    rows = np.zeros(time.size, dtype=bool)
     for before, after in zip(inputs.values(), moved.values(), strict=True):
         for a, b in zip(before.breaks.tolist(), after.breaks.tolist(), strict=False):
-            found |= (time >= min(a, b)) & (time < max(a, b))
-    return found
+            rows |= (time >= min(a, b)) & (time < max(a, b))
+    return rows
 
 
 def _has_spikes(derivative: InputSignal) -> bool:
@@ -283,11 +283,11 @@ def _has_spikes(derivative: InputSignal) -> bool:
 # --- the models that signals pass through ---
 
 
-def terminal_of(model: FmuModel, place: str) -> tuple[Side, int] | None:
+def terminal_of(model: FmuModel, point: str) -> tuple[Side, int] | None:
     """Return on which side an insertion point lies, and its number there; None for what is none."""
-    name = place.removeprefix("outputs.")
-    if place in model.inputs:
-        return "input", list(model.inputs).index(place)
+    name = point.removeprefix("outputs.")
+    if point in model.inputs:
+        return "input", list(model.inputs).index(point)
     return ("output", list(model.outputs).index(name)) if name in model.outputs else None
 
 
@@ -321,10 +321,10 @@ def added(model: FmuModel, use: EffectUse) -> dict[str, Parameter]:
 def _check(model: FmuModel, use: EffectUse) -> None:
     """Check an effect's insertion points, the signals that it reads, and its parameters; raises what `added` raises."""
     where = f"effect '{use.effect}' at {', '.join(use.at)}"
-    for place in use.at:
-        if terminal_of(model, place) is None:
+    for point in use.at:
+        if terminal_of(model, point) is None:
             raise unknown_name(
-                "insertion point", place, model.insertion_points, where=f"model '{model.name}', which is closed inside"
+                "insertion point", point, model.insertion_points, where=f"model '{model.name}', which is closed inside"
             )
     for name, value in use.parameters.items():
         if isinstance(value, str):
@@ -338,14 +338,14 @@ def _check(model: FmuModel, use: EffectUse) -> None:
     if use.expression:
         names = {s.name for s in parse(use.expression, where=f"{where}, expression").free_symbols}
         read = sorted(names - use.parameters.keys() - {"time"})
-    for k, place in enumerate(use.at):
+    for k, point in enumerate(use.at):
         for name, key in [*((n, "from") for n in use.sources[k : k + 1]), *((n, "expression") for n in read)]:
-            _check_reading(model, place, name, f"{where}, {key}")
+            _check_reading(model, point, name, f"{where}, {key}")
 
 
-def _check_reading(model: FmuModel, place: str, name: str, where: str) -> None:
+def _check_reading(model: FmuModel, point: str, name: str, where: str) -> None:
     """Raise where an effect at a terminal cannot read a signal."""
-    terminal, source = terminal_of(model, place), terminal_of(model, name)
+    terminal, source = terminal_of(model, point), terminal_of(model, name)
     assert terminal is not None
     if source is None:
         known = model.inputs if terminal[0] == "input" else [s for s in model.insertion_points if s not in model.inputs]

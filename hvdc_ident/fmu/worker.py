@@ -9,27 +9,122 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, field
 from functools import partial
+from itertools import islice
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from typing import Any
 
-from hvdc_ident.fmu.archive import Folder
-from hvdc_ident.fmu.description import Description
-from hvdc_ident.processes.messages import BEGAN, NOW, PROCESS, START, STOP, packed, unpacked
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.fmu.derivatives import DifferenceStep, PointEvaluation
+from hvdc_ident.fmu.description import Description, Setup
+from hvdc_ident.fmu.fmi import VariableGroup, why_not_loaded
+from hvdc_ident.fmu.instance import Instance, LoadFmu, RunFailed, failure, isolated
+from hvdc_ident.fmu.sensitivity_run import SensitivityRun
+from hvdc_ident.processes.messages import BEGAN, NOW, PROCESS, START, STOP, Message, packed, unpacked
 from hvdc_ident.processes.server import resident, space
 
 
-class Setup(NamedTuple):
-    """An FMU's description, and the folder that it is unpacked into, whose lock is inherited."""
+@dataclass
+class RequestHandler:
+    """A worker's answers to requests, and what it has learned of the FMU.
+
+    load_fmu: loads it into this process. restart_deadline: called between the runs of one request. learned: passed on to
+    later workers by the pool, see `hvdc_ident.fmu.worker_pool`. steps, noise: of differences, by a digest of the
+    experiment. last: digest and outputs of the last run. runs: of the present request.
+    """
 
     description: Description
-    folder: Folder
+    load_fmu: LoadFmu
+    restart_deadline: Callable[[], None]
+    learned: dict[str, Any] = field(default_factory=dict)
+    steps: dict[bytes, DifferenceStep] = field(default_factory=dict)
+    noise: dict[bytes, Array] = field(default_factory=dict)
+    last: tuple[bytes, Array] | None = None
+    loaded: Instance | None = None
+    runs: int = 0
+
+    @property
+    def instance(self) -> Instance:
+        """The FMU in this process, loaded when it is first used."""
+        if self.loaded is None:
+            self.loaded = self.load_fmu(self.learned)
+        return self.loaded
+
+    @property
+    def isolated(self) -> bool:
+        """True where each run has a process of its own: it needs one, or its reuse is not known yet."""
+        return self.learned.get("restart", "process") == "process"
+
+    def load(self) -> Message:
+        """Make a first instance, so that what prevents it is reported at once."""
+
+        def work() -> Message:
+            self.instance.instantiate()
+            return {}, {}
+
+        return self._guarded(work)
+
+    def failed(self, error: Exception) -> RunFailed:
+        """Return an error as RunFailed, and abandon the instance, which cannot be trusted even to free itself."""
+        failed = failure(error, self.loaded.library.messages if self.loaded else ())
+        if self.loaded:
+            self.loaded.abandon()
+        return failed
+
+    def do(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
+        """Return the answer to a request, with what was learned.
+
+        heading: "found" in it has the steps of differences and the noise of runs that other workers have found.
+        """
+        self.runs = 0
+        for name, value in heading.get("found", {}).items():
+            kind, _, key = name.partition(" ")
+            if kind == "step":
+                self.steps.setdefault(bytes.fromhex(key), DifferenceStep(*value))
+            else:
+                self.noise.setdefault(bytes.fromhex(key), np.array(value))
+        known = len(self.steps), len(self.noise)
+        if heading["do"] == "simulate":
+            result, out = SensitivityRun(self, heading, arrays).answer()
+        else:
+            work = {"point": self._point, "starts": self._starts}[heading["do"]]
+            result, out = self._guarded(lambda: work(heading, arrays))
+        found = {f"step {k.hex()}": astuple(s) for k, s in islice(self.steps.items(), known[0], None)}
+        found |= {f"noise {k.hex()}": n.tolist() for k, n in islice(self.noise.items(), known[1], None)}
+        return {**result, "found": found, "learned": self.learned, "whole runs": self.runs}, out
+
+    def _guarded(self, work: Callable[[], Message]) -> Message:
+        """Return the result of work that is done in a separate process where runs are."""
+        return isolated(lambda send: send(work()))[0] if self.isolated else work()
+
+    def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
+        """Return derivatives, outputs and their Jacobian at a point."""
+        point = PointEvaluation(
+            self.instance, heading["values"], arrays.get("x"), arrays["u"], heading["time"], tuple(heading["outputs"])
+        )
+        derivatives, outputs = point.evaluate()
+        jacobian = point.jacobian(heading["parameters"], heading["sizes"], check=heading["check"])
+        return {"error": jacobian.error, "near": jacobian.near}, {
+            "x": point.x,
+            "derivatives": derivatives,
+            "outputs": outputs,
+            "jacobian": jacobian.matrix,
+            "directional": jacobian.directional.astype(float),
+            "nominals": self.instance.nominals(),
+        }
+
+    def _starts(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
+        """Return the parameters' values where none is set."""
+        d = self.description
+        self.instance.begin({}, np.array([v.start or 0.0 for v in d.inputs.values()]), 0.0, None, None)
+        return {}, {"parameters": VariableGroup(self.instance.library, tuple(d.parameters.values())).get().copy()}
 
 
 def prepare(setup: Setup) -> None:
-    """Load what workers need: what one of them loads later would count as the FMU's memory."""
-    import hvdc_ident.fmu.sensitivity_run  # noqa: F401
-
+    """Load what workers need beside this module: what one of them loads later would count as the FMU's memory."""
     if setup.description.interface == "model-exchange":
         import scipy.integrate  # noqa: F401
 
@@ -41,10 +136,6 @@ def finish(setup: Setup) -> None:
 
 def serve(connection: Connection, progress: memoryview[float], setup: Setup, learned: Mapping[str, Any]) -> None:
     """Answer requests until the connection closes or the FMU ends the process. learned: by earlier workers."""
-    from hvdc_ident.fmu.fmi import why_not_loaded
-    from hvdc_ident.fmu.instance import Instance, RunFailed
-    from hvdc_ident.fmu.sensitivity_run import RequestHandler
-
     folder = str(setup.folder.binaries)
 
     def load(learned: dict[str, Any]) -> Instance:

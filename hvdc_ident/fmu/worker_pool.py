@@ -25,8 +25,7 @@ from typing import Any
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, require_known
 from hvdc_ident.fmu.archive import Folder, shared_folder, unpacked_folder
-from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.worker import Setup
+from hvdc_ident.fmu.description import Description, Setup
 from hvdc_ident.processes import MIB, Budget, ChildProcess, Ending, Message, Supervisor, Watch, packed, unpacked
 from hvdc_ident.processes.server import is_worker
 from hvdc_ident.processes.supervisor import last_line
@@ -412,8 +411,8 @@ def _combined(parameters: list[str], shares: list[list[str]], parts: list[Messag
     (first, out), notes = parts[0], dict(parts[0][0]["notes"])
     gradients, errors = out["gradients"].copy(), out["errors"].copy()
     for names, (answer, columns) in zip(shares[1:], parts[1:], strict=True):
-        places = [parameters.index(n) for n in names]
-        gradients[:, :, places], errors[places] = columns["gradients"][:, :, places], columns["errors"][places]
+        at = [parameters.index(n) for n in names]
+        gradients[:, :, at], errors[at] = columns["gradients"][:, :, at], columns["errors"][at]
         for name, text in answer["notes"].items():
             if notes.setdefault(name, text) != text:  # both list some of the parameters
                 listed = {*notes[name].split(", "), *text.split(", ")}
@@ -422,17 +421,17 @@ def _combined(parameters: list[str], shares: list[list[str]], parts: list[Messag
     return {**first, "notes": notes, "whole runs": runs}, {**out, "gradients": gradients, "errors": errors}
 
 
-def idle_cores(own: int) -> int:
+def idle_cores(busy: int) -> int:
     """Return the number of processes that may work at once, one for each idle core and at least 1.
 
-    own: how many worked for the caller lately; they count as load. A process that a pool has started is one of several
+    busy: processes that worked for the caller lately; they count as load. A process that a pool has started is one of several
     that share the cores already.
     """
     if is_worker() or multiprocessing.parent_process() is not None:
         return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
-        others = max(os.getloadavg()[0] - own, 0.0)
+        others = max(os.getloadavg()[0] - busy, 0.0)
     except OSError:
         others = 0.0
     return max(1, round(cores - others))
@@ -442,8 +441,8 @@ CALL = re.compile(r"\b(fmi[23][A-Z]\w*)\s*\(|\b_(dlopen)\(")
 BOUND_NAME = re.compile(r"fmi[23][A-Z]\w*")  # name of a function that `hvdc_ident.fmu.fmi` has bound
 
 
-def key(name: str, value: float) -> str:
-    """Return how a limit is given: in the study, on the command line and in Python."""
+def setting(name: str, value: float) -> str:
+    """Return how a limit is set: in the study, on the command line and in Python."""
     text = f"{value:.10g}"
     return f'`{name} = {text}` in the study\'s [model], --{name} {text}, or limits={{"{name}": {text}}} in Python'
 
@@ -459,16 +458,16 @@ def call_of(end: Ending) -> str:
 
 
 def more_memory(budget: Budget) -> str:
-    """Return the way to give more, in words."""
-    return f"a larger limit in MiB, if it needs that much: {key('memory', budget.larger)}"
+    """Return the hint how to give more memory."""
+    return f"a larger limit in MiB, if it needs that much: {setting('memory', budget.larger)}"
 
 
 def crash(end: Ending, budget: Budget, when: str) -> tuple[str, str]:
-    """Return a process that ended by itself, in words, and what to try. when: "in the run"."""
+    """Return the message on a process that ended by itself, and a hint. when: "in the run"."""
     how = f"its process {end}" if end.code < 0 else f"it ended itself with exit code {end.code} and no result"
-    place = call_of(end)
+    call = call_of(end)
     taken = budget.taken(end.resident, end.space)
-    what = f"the FMU crashed {when}{f', {place}' if place else ''}: {how}"
+    what = f"the FMU crashed {when}{f', {call}' if call else ''}: {how}"
     if budget.exhausted(taken):
         return f"{what}; {budget.told(taken)}", more_memory(budget)
     if end.code == -signal.SIGKILL:
@@ -479,7 +478,7 @@ def crash(end: Ending, budget: Budget, when: str) -> tuple[str, str]:
 def overdue(
     end: Ending, budget: Budget, what: str, limit: tuple[str, float], instants: Sequence[float], still: float | None
 ) -> tuple[str, str]:
-    """Return a process that was ended for its deadline, in words, and what to try.
+    """Return the message on a process that was ended at its deadline, and a hint.
 
     what: the work. limit: the deadline's key and value, s. instants: first, last and present instant of the run, s, nan
     where not known. still: for how long, in s, the instant had not moved; None where it moved to the end.
@@ -496,16 +495,15 @@ def overdue(
             f"the FMU is slow: at t = {now:.6g} s{scale} when the deadline of {deadline:g} s for one run came, its process"
             f" was ended; at this pace {times:.2g} times the deadline would do"
         )
-        hint = f"a longer deadline: {key(name, _above(1.2 * enough))}"
+        hint = f"a longer deadline: {setting(name, _above(1.2 * enough))}"
     else:
         text = f"the FMU hangs: no result of the {what} after {deadline:g} s, its process was ended"
-        place = [f"at t = {now:.6g} s{scale}"] if reached else []
-        place += list(filter(None, [call_of(end)]))
-        if place and still is not None and reached:
-            text += f"; it had stood {', '.join(place)} for {still:.2g} s"
-        elif place:
-            text += f"; it was {', '.join(place)}"
-        hint = f"a longer deadline, if it is only slow: {key(name, _above(5.0 * deadline))}"
+        position = ", ".join(filter(None, [f"at t = {now:.6g} s{scale}" if reached else "", call_of(end)]))
+        if reached and still is not None:
+            text += f"; it had stood {position} for {still:.2g} s"
+        elif position:
+            text += f"; it was {position}"
+        hint = f"a longer deadline, if it is only slow: {setting(name, _above(5.0 * deadline))}"
     if budget.exhausted(taken):
         return f"{text}; {budget.told(taken)}", more_memory(budget)
     return text, hint

@@ -113,7 +113,7 @@ class ExportedVariables:
         s, first = self.code.structure, self.first
         graph, nx, nu = s.graph, s.sizes.nx, s.sizes.nu
         seen: set[int] = set()
-        stack, found, unknowns = [node], set(), False
+        stack, references, unknowns = [node], set(), False
         while stack:
             n = stack.pop()
             if n in seen:
@@ -123,10 +123,10 @@ class ExportedVariables:
             stack.extend((graph.switches[key[1]],) if key[0] == "switch" else graph.arguments(n))
             if key[0] == "leaf" and key[1] == "y":
                 unknowns = unknowns or key[2] >= nx
-                found |= {first["states"] + key[2]} if key[2] < nx else set()
+                references |= {first["states"] + key[2]} if key[2] < nx else set()
             elif key[0] == "leaf" and key[1] == "w":
-                found.add(key[2] if key[2] <= nu else 0)  # delayed and sampled signals change with time
-        return frozenset(found), unknowns
+                references.add(key[2] if key[2] <= nu else 0)  # delayed and sampled signals change with time
+        return frozenset(references), unknowns
 
     # --- the ranges ---
 
