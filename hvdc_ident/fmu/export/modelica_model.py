@@ -20,18 +20,18 @@ from hvdc_ident.model import Model
 
 
 def save_modelica(model: Model, path: str | Path) -> Path:
-    """The path, once the model's Modelica text is written there; the Modelica model has the file's name."""
+    """Write a model's Modelica text; return the path. The Modelica model has the file's name."""
     path = Path(path)
     return write_text(path, modelica(model, path.stem))
 
 
 def modelica(model: Model, name: str = "", steady: bool | None = None) -> str:
-    """The Modelica text of a model, each signal under its own name.
+    """Return the Modelica text of a model, each signal under its own name.
 
     name: of the Modelica model (default: the model's own, as an identifier). steady: True writes the steady start as
     initial equations, so that parameters and inputs move it; False writes its numbers, which every tool can start
     from; None is True but for a model with sampled values, for tools seldom solve for discrete values. Raises
-    ExpressionError for an expression that Modelica has no words for.
+    ExpressionError for an expression that Modelica cannot state.
     """
     numbers = bool(model.sampled) if steady is None else not steady
     return "\n".join(_Writer(model, name, numbers).lines()) + "\n"
@@ -39,13 +39,13 @@ def modelica(model: Model, name: str = "", steady: bool | None = None) -> str:
 
 def output_name(model: Model, name: str) -> str:
     """Return the name of an output in the Modelica text: NAME_output where NAME is another variable."""
-    own = name in model.states or name in model.signals or name in model.algebraic
-    shown = own and model.outputs[name].value == symbol(name)
-    return name if shown or name not in model.names else f"{name}_output"
+    variable = name in model.states or name in model.signals or name in model.algebraic
+    same = variable and model.outputs[name].value == symbol(name)
+    return name if same or name not in model.names else f"{name}_output"
 
 
 class _Writer:
-    """Collects declarations and equations of one model."""
+    """The declarations and equations of one model."""
 
     def __init__(self, model: Model, name: str, numbers: bool) -> None:
         self.model = model
@@ -61,7 +61,7 @@ class _Writer:
         self.numbers = numbers
 
     def lines(self) -> Iterator[str]:
-        """The whole text, line by line."""
+        """Yield the lines of the text."""
         m = self.model
         equations = list(self._equations())
         initial = list(self._initial())
@@ -152,7 +152,7 @@ def _declared(kind: str, name: str, attributes: Iterable[str], unit: str, descri
 
 
 def _unit(unit: str) -> list[str]:
-    """The unit attribute, for units that Modelica's grammar of units knows; others stand in the description."""
+    """Return the unit attribute, for units of Modelica's grammar; others are put into the description."""
     return [f'unit = "{unit}"'] if unit in SI else []
 
 
@@ -173,12 +173,12 @@ KEYWORDS = frozenset(
 
 
 def identifier(name: str) -> str:
-    """A variable's name in Modelica: itself, or quoted where Modelica has another use for the word."""
+    """Return a variable's name in Modelica, quoted where it is a keyword or a built-in function."""
     return f"'{name}'" if name in KEYWORDS else name
 
 
 class ModelicaPrinter:
-    """Writes expressions; what a choice needs more than once becomes a variable of its own, kept in `helpers`."""
+    """Writes expressions. An operand that a conditional expression uses several times becomes a variable in `helpers`."""
 
     def __init__(self, fresh: Callable[[], str]) -> None:
         self._fresh = fresh
@@ -186,7 +186,7 @@ class ModelicaPrinter:
         self.helpers: dict[str, str] = {}
 
     def __call__(self, e: Any) -> str:
-        """The text of an expression, in parentheses unless it is an atom or a call."""
+        """Return the text of an expression, in parentheses unless it is an atom or a call."""
         if isinstance(e, sp.Symbol):
             return "time" if e.name == "time" else identifier(e.name)
         if e.is_Rational and not e.is_Integer:
@@ -267,7 +267,7 @@ class ModelicaPrinter:
         raise ExpressionError(f"Modelica text has no word for the condition '{c}'", expected="a comparison")
 
     def _name(self, e: Any) -> str:
-        """The text of an expression that is used several times: an atom, or the name of a helper."""
+        """Return the text of an expression that is used several times: an atom, or the name of a helper."""
         if isinstance(e, sp.Symbol) or e.is_Number:
             return self(e)
         if e not in self._named:
