@@ -107,7 +107,7 @@ class Description:
 
 
 class Setup(NamedTuple):
-    """What a worker begins with: an FMU's description, and the folder that it is unpacked into, whose lock is inherited."""
+    """Setup of a worker: an FMU's description, and the folder that it is unpacked into, whose lock is inherited."""
 
     description: Description
     folder: Folder

@@ -22,7 +22,7 @@ from hvdc_ident.processes.messages import Message
 from hvdc_ident.processes.server import die_like, in_new_process
 
 Reuse = Literal["reset", "instance", "process"]
-"""What each run begins with: a reset of the instance, a new instance, or a new process."""
+"""Way in which each run begins: with a reset of the instance, a new instance, or a new process."""
 REPEAT_TOLERANCE = 1e-9
 """Share of an output's largest value by which a repeated run may differ. The same program from the same state repeats
 itself to the last digit; sums in another order, as of threads, change that by rounding: 1e-16 in each of a million."""

@@ -172,7 +172,7 @@ class FmuModel:
         return self
 
     def parameterised(self, name: str) -> FmuModel:
-        """Never: an FMU has one parameterisation. Raises UnknownNameError."""
+        """Raise UnknownNameError: an FMU has one parameterisation."""
         raise unknown_name("parameterisation", name, (), where=f"model '{self.name}'")
 
     def simulate(
