@@ -18,7 +18,6 @@ Interface = Literal["model-exchange", "co-simulation"]
 INTERFACES: tuple[Interface, ...] = ("model-exchange", "co-simulation")
 REAL = ("Real", "Float64", "Float32")
 WHOLE = ("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Boolean")
-SETTABLE = ("parameter", "input")
 
 
 @dataclass(frozen=True)
