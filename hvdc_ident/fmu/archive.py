@@ -27,9 +27,9 @@ from xml.parsers import expat
 
 from hvdc_ident.errors import ModelError
 
-MOST_ENTRIES = 10_000
-MOST_BYTES = 2**30
-MOST_RATIO = 200
+MOST_ENTRIES = 10_000  # in an archive
+MOST_BYTES = 2**30  # unpacked
+MOST_RATIO = 200  # of unpacked to packed bytes; a zip bomb reaches 1000
 MOST_LEVELS = 100  # of elements in each other; a description has six
 MOST_XML = 64 * 2**20  # bytes of a model description; a hundred thousand variables take half of it
 DESCRIPTION = "modelDescription.xml"

@@ -26,7 +26,7 @@ FmiError = FMICallException
 """Raised by a call that returned discard, error or fatal; `.function`, `.status`."""
 WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
 Function = Callable[..., None]
-MESSAGES_KEPT = 30
+MESSAGES_KEPT = 30  # of the FMU in a run: the last one is quoted where the run fails
 
 
 def why_not_loaded(error: Exception, folder: str, d: Description) -> tuple[str, str]:

@@ -18,8 +18,8 @@ from hvdc_ident.fmu.fmi import DISCARD, FmiError, VariableGroup
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
 from hvdc_ident.fmu.piecewise_linear import Interpolant, PackedInputs
 
-MAX_STEPS = 200_000
-MAX_EVENTS = 100_000
+MAX_STEPS = 200_000  # of a run
+MAX_EVENTS = 100_000  # of a run
 MAX_CHATTER = 50  # state events within CHATTER_SPAN of each other
 CHATTER_SPAN = 1e-9  # share of the span
 MAX_RETRIES = 8  # shorter steps tried where the FMU discards a point

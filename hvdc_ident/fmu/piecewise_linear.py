@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, InputSignal
 
-FIRST_INTERVALS = 256
+FIRST_INTERVALS = 256  # of a grid, before it is refined
 LINE_TOLERANCE = 1e-5  # deviation from lines, in shares of the signal's range
-MAX_HALVINGS = 24
-MAX_POINTS = 40_000
+MAX_HALVINGS = 24  # of an interval, which leave 2e-10 of the span around a jump
+MAX_POINTS = 40_000  # of a refined grid
 
 
 @dataclass(frozen=True, eq=False)
