@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,14 @@ SAME_NAME = ({"coupling", "droop"}, {"lag", "inductance"})
 SUMS: Mapping[str, Sequence[set[str]]] = {
     "station": ({"Pref", "Pm", "err"}, {"E", "V"}),
     "drive": ({"wref", "wm", "err"}, {"torque", "friction", "load"}, {"v", "emf"}),
-}
+    "machine": ({"Vref", "Vm", "err"}, {"Pref", "order"}),
+    "converter": (
+        {"Pref", "erp"}, {"Qref", "err"}, {"idref", "erd"}, {"iqref", "erq"}, {"xd", "vcd"}, {"xq", "vcq"}, {"xl", "wl"},
+    ),
+}  # fmt: skip
 """Slots that only enter one sum together: what is added at one might as well be added at another."""
+ONLY_RECORDED: Mapping[str, Sequence[str]] = {"machine": ("Qe",), "converter": ("V", "df")}
+"""Signals that nothing reads but the output of the same name: every effect at one is the same at the other."""
 ADDED = ("offset", "disturbance", "coupling", "droop", "conductance", "loss")
 MAIN = {
     "lag": "T", "delay": "T", "window-mean": "T", "sample-hold": "Ts", "second-order": "wn", "inner-loop": "wn",
@@ -26,6 +33,10 @@ MAIN = {
 }  # fmt: skip
 """The parameter that measures the effect."""
 OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")
+BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
+"""Edges of the bins of stated probabilities."""
+SURE = 0.95
+"""The probability from which an effect is named."""
 
 
 # --- one case ---
@@ -38,6 +49,8 @@ def same_effect(a: str, b: str) -> bool:
 
 def same_place(plant: str, effect: str, a: str, b: str) -> bool:
     """Return True if an effect is the same at both insertion points."""
+    if any({a, b} == {signal, f"outputs.{signal}"} for signal in ONLY_RECORDED.get(plant, ())):
+        return True
     return a == b or (effect in ADDED and any({a, b} <= group for group in SUMS[plant]))
 
 
@@ -62,7 +75,7 @@ def outcome(line: Line) -> str:
     if "failed" in line:
         return "failed"
     truths, found = line["truth"], line["found"]
-    sets = [r for group in line["ambiguity"] for r in group]
+    sets = [r for group in line["ambiguity"] for r in group] + [m for f in effects_found(line) for m in members(f)]
     if line["verdict"] not in ("named", "ambiguous"):
         return "abstained"
     if (
@@ -80,22 +93,59 @@ def outcome(line: Line) -> str:
     return "wrong"
 
 
+def effects_found(line: Line) -> list[Line]:
+    """Return the findings that are effects; none from a room without findings, or where a parameter explains the gap."""
+    return [f for f in line.get("findings", []) if f["effect"] != "parameter"]
+
+
+def members(finding: Line) -> list[Line]:
+    """Return what a finding stands for: each of its names at each of its likely places."""
+    names = list(dict.fromkeys((finding["effect"], *finding["same_as"])))
+    return [{"effect": n, "at": p["at"], "from": p.get("from", "")} for n in names for p in finding["places"]]
+
+
+def named(line: Line) -> bool:
+    """Return True if every hidden effect is named and no other, each at any insertion point."""
+    if "failed" in line or line["verdict"] != "named":
+        return False
+    told = effects_found(line)
+    groups = [{f["effect"], *f["same_as"]} for f in told] or [{f["effect"]} for f in line["found"]]
+    truths = [t["effect"] for t in line["truth"]]
+
+    def meets(group: set[str], effect: str) -> bool:
+        return any(same_effect(name, effect) for name in group)
+
+    all_found = all(any(meets(g, t) for g in groups) for t in truths)
+    return all_found and all(any(meets(g, t) for t in truths) for g in groups) and len(groups) == len(truths)
+
+
 def limit_above(count: int, of: int, level: float = 0.95) -> float:
     """Return the upper Clopper-Pearson limit of a proportion."""
     return 1.0 if count >= of else float(stats.beta.ppf(level, count + 1, of - count))
+
+
+def limits(count: int, of: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the two-sided Clopper-Pearson limits of a proportion."""
+    tail = 0.5 * (1.0 - level)
+    low = 0.0 if count == 0 else float(stats.beta.ppf(tail, count, of - count + 1))
+    return low, limit_above(count, of, 1.0 - tail)
 
 
 # --- all cases ---
 
 
 def summary(lines: Sequence[Line]) -> dict[str, Any]:
-    """Return everything that the study reports, as plain numbers."""
+    """Return everything that the study reports, as plain numbers.
+
+    Messy records count in `by_plant`, `calibration` and the numbers of cases only.
+    """
     made = [x for x in lines if not x.get("unreachable")]
-    by_part = {p: [x for x in made if x["part"] == p] for p in ("single", "pair", "clean", "outside", "left-out")}
+    tidy = [x for x in made if not x.get("messy")]
+    by_part = {p: [x for x in tidy if x["part"] == p] for p in ("single", "pair", "clean", "outside", "left-out")}
     single = by_part["single"]
     large = [x for x in single if x["size"] >= 10.0]
     return {
-        "cases": {p: len(x) for p, x in by_part.items()},
+        "cases": {p: sum(x["part"] == p for x in made) for p in by_part},
         "unreachable": len(lines) - len(made),
         "seconds": _quantiles([x["seconds"] for x in made]),
         "outcomes_by_size": {
@@ -103,6 +153,8 @@ def summary(lines: Sequence[Line]) -> dict[str, Any]:
         },
         "large": _shares(large),
         "pairs": _shares(by_part["pair"]),
+        "by_plant": by_plant(made),
+        "calibration": calibration(made),
         "by_noise": _by(large, "noise"),
         "by_excitation": _by(large, "excitation"),
         "by_channels": _by(large, "removed"),
@@ -134,6 +186,7 @@ def _shares(lines: Sequence[Line]) -> dict[str, Any]:
     return {
         "cases": n,
         **found,
+        "named": sum(map(named, lines)) / n if n else None,
         "right_or_covered": (found["right"] + found["covered"]) / n if n else None,
         "wrong_names": wrong / n if n else None,
         "wrong_names_limit": limit_above(wrong, n) if n else None,
@@ -142,6 +195,80 @@ def _shares(lines: Sequence[Line]) -> dict[str, Any]:
 
 def _by(lines: Sequence[Line], key: str) -> dict[str, Any]:
     return {str(v): _shares([x for x in lines if x[key] == v]) for v in sorted({x[key] for x in lines}, key=str)}
+
+
+def by_plant(lines: Sequence[Line]) -> dict[str, Any]:
+    """Return the statistics of large effects, pairs, records without an effect, and strangers, by plant and cleanliness."""
+    table: dict[str, Any] = {}
+    for plant, messy in sorted({(x["plant"], bool(x.get("messy"))) for x in lines}):
+        own = [x for x in lines if x["plant"] == plant and bool(x.get("messy")) == messy]
+        parts = {p: [x for x in own if x["part"] == p] for p in ("single", "pair", "clean", "outside")}
+        large = [x for x in parts["single"] if x["size"] >= 10.0]
+        clean = [x for x in parts["clean"] if "failed" not in x]
+        false = sum(x["verdict"] == "named" for x in clean)
+        strangers = _strangers(parts["outside"])
+        table[f"{plant}, {'messy' if messy else 'tidy'}"] = {
+            "large": _shares(large) | {"places": _places(large)},
+            "pair": _shares(parts["pair"]),
+            "clean": {
+                "cases": len(clean),
+                "named": false,
+                "limit": limit_above(false, len(clean)) if clean else None,
+                "evidence_without_name": sum(x["verdict"] in ("ambiguous", "unnameable") for x in clean),
+            },
+            "outside": {k: strangers[k] for k in ("cases", "confident_wrong_names", "limit")},
+            "seconds": _quantiles([x["seconds"] for x in own]),
+        }
+    return table
+
+
+def _places(lines: Sequence[Line]) -> float | None:
+    """Return the mean number of likely insertion points of the rightly named effects; None without any."""
+    counts = [
+        len({(tuple(m["at"]), m["from"]) for m in members(f)}) for x in lines if named(x) for f in effects_found(x)
+    ]
+    return float(np.mean(counts)) if counts else None
+
+
+def calibration(lines: Sequence[Line]) -> dict[str, Any]:
+    """Return how many findings are right, by their stated probability.
+
+    A finding is right if its effect is hidden, at any insertion point: its probability is the sum over its places. placed: its
+    insertion point is one of its likely places too. sure: those said with at least SURE, by plant and cleanliness too. Findings
+    in records without an effect are wrong; parameters off their given values are no findings of effects and do not count.
+    """
+    said: list[tuple[str, float, bool, bool]] = []
+    for x in lines:
+        if "failed" in x:
+            continue
+        room = f"{x['plant']}, {'messy' if x.get('messy') else 'tidy'}"
+        truths = [] if x["part"] == "clean" else x["truth"]
+        for f in effects_found(x):
+            told = members(f)
+            right = any(_is(x, t, m, place=False) for t in truths for m in told)
+            said.append((room, f["probability"], right, right and any(_is(x, t, m) for t in truths for m in told)))
+
+    def row(part: Sequence[tuple[str, float, bool, bool]]) -> dict[str, Any]:
+        n, right = len(part), sum(r for _, _, r, _ in part)
+        return {
+            "findings": n,
+            "stated": float(np.mean([p for _, p, _, _ in part])) if n else None,
+            "right": right / n if n else None,
+            "limits": limits(right, n) if n else None,
+            "placed": sum(q for *_, q in part) / n if n else None,
+        }
+
+    edges = list(pairwise(BINS))
+    return {
+        "bins": {
+            f"{low:g} to {high:g}": row([s for s in said if low <= s[1] < high or (high == BINS[-1] and s[1] == high)])
+            for low, high in edges
+        },
+        "sure": row([s for s in said if s[1] >= SURE]),
+        "sure_by_plant": {
+            r: row([s for s in said if s[0] == r and s[1] >= SURE]) for r in sorted({s[0] for s in said})
+        },
+    }
 
 
 def _confusion(lines: Sequence[Line]) -> dict[str, dict[str, int]]:

@@ -17,6 +17,8 @@ def report(found: Mapping[str, Any]) -> str:
         _table("Single effects by size (units)", found["outcomes_by_size"], OUTCOMES),
         "Size 10 and above: " + _said(found["large"]),
         "Pairs: " + _said(found["pairs"]),
+        *_by_plant(found["by_plant"]),
+        *_calibration(found["calibration"]),
         _table("Size 10 and above, by noise", found["by_noise"], ("cases", *OUTCOMES)),
         _table("by excitation", found["by_excitation"], ("cases", *OUTCOMES)),
         _table("with a channel removed", found["by_channels"], ("cases", *OUTCOMES)),
@@ -50,14 +52,44 @@ def _said(shares: Mapping[str, Any]) -> str:
     if not shares["cases"]:
         return "none"
     return (
-        f"{shares['cases']} cases, right or covered {shares['right_or_covered']:.1%}, wrong names "
+        f"{shares['cases']} cases, right or covered {shares['right_or_covered']:.1%}, named {shares['named']:.1%}, wrong names "
         f"{shares['wrong_names']:.1%} (upper limit {shares['wrong_names_limit']:.1%})"
     )
+
+
+def _by_plant(found: Mapping[str, Any]) -> list[str]:
+    """Return the tables by plant and cleanliness of the records."""
+    shares = ("cases", "right_or_covered", "named", "wrong_names", "wrong_names_limit", *OUTCOMES)
+
+    def of(part: str) -> dict[str, Any]:
+        return {room: row[part] for room, row in found.items() if row[part] and row[part].get("cases", 1)}
+
+    return [
+        _table("Size 10 and above, by plant and records", of("large"), (*shares, "places")),
+        _table("Pairs, by plant and records", of("pair"), shares),
+        _table("Clean cases, by plant and records", of("clean"), ("cases", "named", "limit", "evidence_without_name")),
+        _table("Outside, by plant and records", of("outside"), ("cases", "confident_wrong_names", "limit")),
+        _table("Seconds a diagnosis, by plant and records", of("seconds"), ("5 %", "median", "95 %", "largest")),
+    ]
+
+
+def _calibration(found: Mapping[str, Any]) -> list[str]:
+    """Return the tables of stated probabilities; none from a room that states none."""
+    if not any(row["findings"] for row in found["bins"].values()):
+        return []
+    columns = ("findings", "stated", "right", "limits", "placed")
+    sure = {"all": found["sure"], **found["sure_by_plant"]}
+    return [
+        _table("Effects found, by stated probability", found["bins"], columns),
+        _table("Effects found, said with at least 95 %", sure, columns),
+    ]
 
 
 def _plain(values: Any) -> str:
     if isinstance(values, Mapping):
         return ", ".join(f"{k} {_plain(v)}" for k, v in values.items()) or "none"
+    if isinstance(values, tuple | list):
+        return " to ".join(map(_plain, values))
     return f"{values:.3g}" if isinstance(values, float) else str(values)
 
 
