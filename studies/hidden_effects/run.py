@@ -9,7 +9,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ if str(HERE) not in sys.path:
 
 from hidden.cases import PARTS, Design, designs, factorial, made  # noqa: E402
 from hidden.judging import summary  # noqa: E402
+from hidden.plants import FIRST, PLANTS  # noqa: E402
 from hidden.reporting import report  # noqa: E402
 
 SEED = 42
@@ -34,7 +35,14 @@ def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
     try:
         case = made(design, seed)
         if case is None:
-            return {"case": design.name, "part": design.part, "effects": list(design.effects), "unreachable": True}
+            return {
+                "case": design.name,
+                "part": design.part,
+                "plant": design.plant,
+                "messy": design.messy,
+                "effects": list(design.effects),
+                "unreachable": True,
+            }
         making = time.perf_counter() - begin
         return diagnosed(case, seed=design.number, sindy=sindy) | {"making": making}
     except Exception:  # a mistake in the program: a line of its own, and the others go on
@@ -44,7 +52,13 @@ def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
             "plant": design.plant,
             "effects": list(design.effects),
         }
-        told |= {"size": design.size, "noise": design.noise, "excitation": design.excitation, "removed": design.removed}
+        told |= {
+            "messy": design.messy,
+            "size": design.size,
+            "noise": design.noise,
+            "excitation": design.excitation,
+            "removed": design.removed,
+        }
         return told | {"failed": traceback.format_exc(), "crash": True, "seconds": time.perf_counter() - begin}
 
 
@@ -63,13 +77,24 @@ def lines(path: Path, crashes: bool = False) -> dict[str, dict[str, Any]]:
 
 
 def pending(
-    parts: list[str], seed: int, limit: int | None, done: set[str], full: bool = False, least: float = 0.0
+    parts: list[str],
+    seed: int,
+    limit: int | None,
+    done: set[str],
+    full: bool = False,
+    least: float = 0.0,
+    plants: Sequence[str] = FIRST,
+    messy: Sequence[bool] = (False,),
 ) -> Iterator[Design]:
     """Return the cases still to be done, the parts in turn, so that an early stop has cases of each.
 
-    limit: of each part; least: size of a hidden effect.
+    limit: of each part, of each kind of records, and of the first two plants and each of the others; least: size of a hidden
+    effect. messy: which records.
     """
-    every = [factorial(seed)] if full else [designs(p, seed) for p in parts]
+    groups = [
+        group for group in (tuple(p for p in plants if p in FIRST), *((p,) for p in plants if p not in FIRST)) if group
+    ]
+    every = [factorial(seed)] if full else [designs(p, seed, g, m) for m in messy for g in groups for p in parts]
     tables = [[d for d in table if d.size >= least or d.part == "clean"][:limit] for table in every]
     shares = [(k / len(t), n, d) for n, t in enumerate(tables) for k, d in enumerate(t)]
     for _, _, design in sorted(shares, key=lambda s: s[:2]):
@@ -77,10 +102,26 @@ def pending(
             yield design
 
 
+def numbered(text: str) -> list[str]:
+    """Return the plants' names from their numbers, such as "1,2,3,4"."""
+    names = list(PLANTS)
+    numbers = [int(n) for n in text.split(",") if n.strip().isdigit() and 0 < int(n) <= len(names)]
+    if len(numbers) != len(text.split(",")):
+        raise argparse.ArgumentTypeError(f"numbers from 1 to {len(names)} with commas between them, not '{text}'")
+    return [names[n - 1] for n in sorted(set(numbers))]
+
+
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Return the summary; results are kept line by line, and a second call resumes the first."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    plants = ", ".join(f"{k} {n}" for k, n in enumerate(PLANTS, start=1))
+    parser.add_argument(
+        "--plants", type=numbered, default=list(FIRST), help=f"numbers of plants: {plants}; default 1,2"
+    )
+    parser.add_argument(
+        "--messy", choices=("no", "yes", "both"), nargs="?", const="yes", default="no", help="which records"
+    )
     parser.add_argument("--limit", type=int, help="cases of each part at most")
     parser.add_argument("--least", type=float, default=0.0, help="leave out smaller effects, by their size in units")
     parser.add_argument("--workers", type=int, default=2)
@@ -95,7 +136,9 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     path = out / "cases.jsonl"
     done = lines(path)
     if not asked.judge_only:
-        todo = list(pending(asked.parts, asked.seed, asked.limit, set(done), asked.full, asked.least))
+        messy = {"no": (False,), "yes": (True,), "both": (False, True)}[asked.messy]
+        asked_for = asked.limit, set(done), asked.full, asked.least, asked.plants, messy
+        todo = list(pending(asked.parts, asked.seed, *asked_for))
         _work(todo, asked, path, len(done))
     done = lines(path, crashes=True)
     found = summary(list(done.values()))

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hidden.plants import Plant
+from hidden.plant import INTERVAL, Plant
 from hidden.simulator import Run, Signal
 
-ROWS, INTERVAL, EVENT = 300, 4e-3, 0.2
+ROWS, EVENT = 300, 0.2
+"""Rows of a record; s: the event of a plant with pace 1."""
 EXCITATIONS = ("small", "rich")
 VARIANTS = 4
 """How many campaigns there are of each plant and excitation: the sizes and the order of the kicks differ."""
@@ -33,18 +34,26 @@ def campaign(plant: Plant, excitation: str, variant: int) -> tuple[Run, Run, Run
             first: _steps(rest[first], (EVENT, -0.8 * size[first]), (0.7, 0.5 * size[first])),
             second: _ramp(rest[second], EVENT + 0.2, 0.9, 0.8 * size[second]),
         }
-        return Run(one), Run(two), Run(held)
-    one = {
-        first: _steps(rest[first], (EVENT, 3 * size[first]), (0.7, -3 * size[first])),
-        second: _steps(rest[second], (0.95, size[second])),
-    }
-    two = {first: _multisine(rest[first], size[first], rng), second: _multisine(rest[second], 0.5 * size[second], rng)}
-    third = 0.9 * size[first]
-    held = {
-        first: _steps(rest[first], (EVENT, third), (0.45, third), (0.7, -3 * third)),
-        second: _steps(rest[second], (0.95, -1.2 * size[second])),
-    }
-    return Run(one), Run(two), Run(held)
+    else:
+        one = {
+            first: _steps(rest[first], (EVENT, 3 * size[first]), (0.7, -3 * size[first])),
+            second: _steps(rest[second], (0.95, size[second])),
+        }
+        two = {
+            first: _multisine(rest[first], size[first], rng),
+            second: _multisine(rest[second], 0.5 * size[second], rng),
+        }
+        third = 0.9 * size[first]
+        held = {
+            first: _steps(rest[first], (EVENT, third), (0.45, third), (0.7, -3 * third)),
+            second: _steps(rest[second], (0.95, -1.2 * size[second])),
+        }
+    return _paced(one, plant.pace), _paced(two, plant.pace), _paced(held, plant.pace)
+
+
+def _paced(inputs: Mapping[str, Signal], pace: float) -> Run:
+    """Return the run with all its times in multiples of the pace."""
+    return Run({n: Signal(tuple((t * pace, v) for t, v in s.points)) for n, s in inputs.items()})
 
 
 def _steps(rest: float, *moves: tuple[float, float]) -> Signal:

@@ -1,37 +1,14 @@
-"""The two small plants of the study as plain functions; their cards for the package are in `cards/`."""
+"""The plants of the study by name, and the two small ones; their cards for the package are in `cards/`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
-See = Callable[[str, Array], Array]
-Flow = Callable[[list[Array], Mapping[str, Array], Mapping[str, Array], See], list[Array]]
-
-
-@dataclass(frozen=True)
-class Plant:
-    """A plant: values of parameters and inputs, initial guesses of its states, and its equations.
-
-    flow(x, inputs, parameters, see): derivatives of the states; every signal passes through `see(slot, value)`, which
-    returns and keeps the value for its readers. fitted: the fit parameters. kicks: by input, the size of a small step.
-    slots: insertion points other than the outputs; a signal comes after those that it may read.
-    """
-
-    name: str
-    parameters: Mapping[str, float]
-    inputs: Mapping[str, float]
-    states: Mapping[str, float]
-    outputs: tuple[str, ...]
-    fitted: tuple[str, ...]
-    kicks: Mapping[str, float]
-    slots: tuple[str, ...]
-    resistance: tuple[str, str]
-    flow: Flow
+from hidden.converter import CONVERTER
+from hidden.machine import MACHINE
+from hidden.plant import Array, Plant, See
 
 
 def _station(x: list[Array], u: Mapping[str, Array], p: Mapping[str, Array], see: See) -> list[Array]:
@@ -90,4 +67,7 @@ DRIVE = Plant(
     resistance=("", ""),
     flow=_drive,
 )
-PLANTS = {p.name: p for p in (STATION, DRIVE)}
+PLANTS = {p.name: p for p in (STATION, DRIVE, MACHINE, CONVERTER)}
+"""In the order of their numbers, which begin with 1."""
+FIRST = (STATION.name, DRIVE.name)
+"""Those that share the designs of the study's first version; each of the others has designs of its own."""

@@ -9,11 +9,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hidden.campaigns import INTERVAL, ROWS, campaign
+from hidden.campaigns import ROWS, campaign
 from hidden.noise import whitened
 from hidden.operators import WITH_SOURCE
-from hidden.plants import PLANTS, Plant
-from hidden.simulator import STEP, Hidden, Run, simulate
+from hidden.plant import INTERVAL, STEP, Plant
+from hidden.plants import PLANTS
+from hidden.simulator import Hidden, Run, simulate
 
 Array = NDArray[np.floating]
 UNIT = 4.15
@@ -24,10 +25,10 @@ NEAR = 0.03
 """A change of a parameter, as a logarithm, up to which its answer counts as linear."""
 ROUNDS, SETTLED = 8, 1e-2
 """Of a refit: runs at most, and the relative fall of the sum of squares at which it has ended."""
-COARSE = 2e-3
-"""s: the step of the plant without effects in such a refit. All inputs' corners lie on it."""
 WIDTH = 5.0
 """The bounds of a fitted parameter: its true value divided and multiplied by this."""
+PACED = {"T": 1, "Ts": 1, "compute": 1, "T1": 1, "T2": 1, "wn": -1, "rate": -1, "frequency": -1}
+"""Parameters of effects that are times, with 1, or rates, with -1."""
 LATE = 1e-7
 """By how much a sampler's period is longer than its steps. Rows and samples both begin with the record: without it they
 would meet exactly, and which of the two comes first would be a matter of rounding."""
@@ -78,8 +79,17 @@ TIMES = ("lag", "delay", "window-mean", "sample-hold", "second-order", "inner-lo
 """Sized by a time, which the simulator's step bounds from below."""
 
 
+def paced(effect: str, values: Mapping[str, Array], pace: float) -> dict[str, Array]:
+    """Return the effect's parameters at a plant with another pace than 1."""
+    powers = {**PACED, "k": -1} if effect == "drift" else PACED
+    return {n: v * pace ** powers.get(n, 0) for n, v in values.items()}
+
+
 def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, resistance: float) -> dict[str, Array]:
-    """Return the effect's parameters for sizes x (any shape, growing with the effect). rng: for the other choices."""
+    """Return the effect's parameters for sizes x (any shape, growing with the effect), at a plant with pace 1.
+
+    rng: for the other choices.
+    """
     sign, one = rng.choice([-1.0, 1.0]), np.ones_like(x)
     ratio = about.range / max(about.other_range, 1e-9)
     match effect:
@@ -150,7 +160,7 @@ class Nominal:
     runs: tuple[Run, Run, Run]
     outputs: Array
     slopes: Array  # (rows, 2, parameters, outputs), of the fitted experiments
-    coarse: Array  # (rows, 2, outputs), what those of a run at COARSE lack
+    coarse: Array  # (rows, 2, outputs), what those of a run at the coarse step lack
     slots: Mapping[str, Array]  # (rows, 2)
 
 
@@ -172,7 +182,7 @@ def nominal(plant_name: str, excitation: str, variant: int) -> Nominal:
     slopes = (moved[:, :, 1] - moved[:, :, 0]).transpose(0, 2, 1, 3) / size[:, None]
     slots = {s: found[:, :2, n + k] for k, s in enumerate(plant.slots)}
     slots |= {f"outputs.{o}": found[:, :2, k] for k, o in enumerate(plant.outputs)}
-    coarse = found[:, :2, :n] - simulate(plant, runs[:2], step=COARSE)
+    coarse = found[:, :2, :n] - simulate(plant, runs[:2], step=plant.coarse * plant.step)
     return Nominal(plant, runs, found[:, :3, :n], slopes, coarse, slots)
 
 
@@ -185,9 +195,9 @@ def about(base: Nominal, at: str, source: str) -> About:
     )  # fmt: skip
 
 
-def on_jumps(runs: Sequence[Run]) -> NDArray[np.bool_]:
+def on_jumps(runs: Sequence[Run], interval: float = INTERVAL) -> NDArray[np.bool_]:
     """Return (rows, runs), True for rows on a jump of an input: a recording does not state which side such a row shows."""
-    rows = [[round(t / INTERVAL) for signal in run.inputs.values() for t in signal.jumps] for run in runs]
+    rows = [[round(t / interval) for signal in run.inputs.values() for t in signal.jumps] for run in runs]
     return np.stack([np.isin(np.arange(ROWS), own) for own in rows], axis=1)
 
 
@@ -199,7 +209,7 @@ def units(base: Nominal, answer: Array, sigma: Array, kind: str, channels: Seque
     not count.
     """
     pick = list(channels)
-    gone = on_jumps(base.runs[:2])
+    gone = on_jumps(base.runs[:2], base.plant.interval)
 
     def residual(y: Array) -> Array:
         """Return the residuals (N, n) of outputs (rows, 2, n, outputs)."""
@@ -279,7 +289,7 @@ def _plant(base: Nominal, logs: Array) -> tuple[Array, Array]:
                 shift = logs[k] + 1e-3 * (np.arange(p) == j - 1)
                 values = {q: plant.parameters[q] * float(np.exp(v)) for q, v in zip(plant.fitted, shift, strict=True)}
                 batch.append(Run(run.inputs, values))
-    found = simulate(plant, batch, step=COARSE)
+    found = simulate(plant, batch, step=plant.coarse * plant.step)
     found = found.reshape(found.shape[0], 2, n, p + 1, -1)
     slopes = (found[:, :, :, 1:] - found[:, :, :, :1]) / 1e-3
     return found[:, :, :, 0] + base.coarse[:, :, None], slopes
@@ -305,7 +315,7 @@ def sized(
     x = np.geomspace(low, high, GRID)
     signal = about(base, at, source)
     resistance = plant.parameters.get(plant.resistance[1], 1.0)
-    values = parameters(effect, x, signal, np.random.default_rng(seed), resistance)
+    values = paced(effect, parameters(effect, x, signal, np.random.default_rng(seed), resistance), plant.pace)
     tiled = {n: np.tile(v, 2) for n, v in values.items()}
     runs = [r for r in base.runs[:2] for _ in range(GRID)]
     answer = simulate(plant, runs, [Hidden(effect, at, tiled, source)])
@@ -329,6 +339,7 @@ def sized(
     if chosen < (low if effect in TIMES else 0.2 * low):
         return None
     point = parameters(effect, np.array([chosen]), signal, np.random.default_rng(seed), resistance)
+    point = paced(effect, point, plant.pace)
     return Hidden(effect, at, {n: float(v[0]) for n, v in point.items()}, source)
 
 
