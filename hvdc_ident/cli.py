@@ -68,8 +68,9 @@ def demo(
     from hvdc_ident.study.study import load_study
 
     with console.progress() as progress:
+        options = work.options(console, progress)
         study = load_study(write_demo(out, seed=work.seed, progress=progress))
-        done = _run_all(study, out, work.options(console, progress))
+        done = _run_all(study, out, options)
     _tell_run(study, out, done, console, lambda line: pasteable(line, study.path, out, None))
 
 

@@ -124,7 +124,10 @@ class Work:
     seed: Seed = 0
 
     def options(self, console: Console, progress: Progress) -> StageOptions:
-        """Return the stages' options."""
+        """Return the stages' options. Raises InputError for an executor of an unknown name."""
+        from hvdc_ident.study.executors import check_executor
+
+        check_executor(self.executor)
         return StageOptions(self.workers, self.seed, progress, executor=self.executor, announce=console.announce)
 
 

@@ -188,6 +188,9 @@ def test_convert_cuts_by_time_and_counts(tmp_path: Path) -> None:
         (("export", "--to", "x.fmu", "--fmi", "1"), "no FMU is written in this version of FMI"),
         (("export", "--to", "x.mo", "--kind", "me"), "this ending is another format's"),
         (("fit", "--executor", "spark://h:1"), "on this machine or by a dask scheduler"),
+        (("run", "--executor", "foo"), "expected local, dask://HOST:PORT or dask+tls://HOST:PORT, got 'foo'"),
+        (("diagnose", "--executor", "dask://"), "on this machine or by a dask scheduler"),
+        (("export", "--to", "x.xyz"), "expected one of .csv, .fmu"),
         (("fit", "--force", "gain"), "no candidate 'gain'"),
     ],
 )

@@ -13,19 +13,33 @@ if TYPE_CHECKING:
     from hvdc_ident.study.executors.dask import DaskPool
 
 
-__all__ = ["LocalPool", "open_executor"]
+__all__ = ["LocalPool", "check_executor", "open_executor"]
 
 
 LOCAL = "local"
+DASK = ("dask://", "dask+tls://")
+
+
+def check_executor(name: str) -> None:
+    """Raise InputError for a name of no executor; whether a scheduler answers at its address shows when it is opened."""
+    if name not in ("", LOCAL) and not any(name.startswith(kind) and name != kind for kind in DASK):
+        raise InputError(
+            "no such executor: work is done on this machine or by a dask scheduler",
+            where="--executor",
+            expected=f"{LOCAL}, {' or '.join(f'{kind}HOST:PORT' for kind in DASK)}",
+            got=repr(name),
+            hint="--workers 2 for this machine, or --executor dask://127.0.0.1:8786 once `dask scheduler` runs",
+        )
 
 
 @contextmanager
 def open_executor(name: str, workers: int) -> Iterator[OpenPool | DaskPool | None]:
-    """The executor, open; None where the work stays in this process.
+    """Yield the executor, open; None where the work stays in this process.
 
     name: "" or "local" for this machine, with so many workers; "dask://HOST:PORT" or "dask+tls://HOST:PORT" for the
     workers of a dask scheduler. Raises InputError for another name, or where the scheduler cannot be used.
     """
+    check_executor(name)
     if name in ("", LOCAL):
         if workers <= 1:
             yield None
@@ -33,14 +47,6 @@ def open_executor(name: str, workers: int) -> Iterator[OpenPool | DaskPool | Non
         with LocalPool(workers).open() as pool:
             yield pool
         return
-    if not name.startswith(("dask://", "dask+tls://")):
-        raise InputError(
-            "no such executor: work is done on this machine or by a dask scheduler",
-            where="--executor",
-            expected="local, dask://HOST:PORT or dask+tls://HOST:PORT",
-            got=repr(name),
-            hint="--workers 2 for this machine, or --executor dask://127.0.0.1:8786 once `dask scheduler` runs",
-        )
     from hvdc_ident.study.executors.dask import DaskPool
 
     with DaskPool.at(name) as cluster:
