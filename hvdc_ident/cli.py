@@ -94,19 +94,21 @@ def check(
     study: Annotated[
         Path, typer.Argument(metavar="STUDY|FMU", help="A study file (TOML), or an FMU.", show_default=False)
     ],
-    find: Annotated[str, option("--find", "TEXT", "Of an FMU: variables with TEXT.")] = "",
-    all_: Annotated[bool, typer.Option("--all", help="Of an FMU: every variable.")] = False,
+    find: Annotated[str, option("--find", "TEXT", "List only the variables of an FMU that contain TEXT.")] = "",
+    all_: Annotated[bool, typer.Option("--all", help="List every variable of an FMU.")] = False,
     build: Annotated[
-        bool, typer.Option("--compile", help="Of an FMU: compile the C sources in it into a new file beside it.")
+        bool, typer.Option("--compile", help="Compile the C sources of an FMU into a new file beside it.")
     ] = False,
     seed: Seed = 0,
     console: Console,
     access: Access,
     out: Out = None,
 ) -> None:
-    """Validate study, model and data, and compare the levels before each event; run no stage.
+    """Validate study, model and data; run no stage.
 
-    Of an FMU: list its variables, what it offers, and what a short run finds.
+    The levels before each event are compared with the model's.
+
+    For an FMU, list its variables and what it offers, and report what a short run finds.
     """
     if study.suffix.lower() == ".fmu":
         _check_fmu(study, find, access.limits, console, every=all_ or bool(find), build=build)
@@ -159,7 +161,7 @@ def run_(
     console: Console,
     access: Access,
 ) -> None:
-    """Every stage the study asks for, then the report.
+    """Run every stage that the study asks for, then write the report.
 
     A second run redoes only what changed; after a kill it goes on.
     """
@@ -234,7 +236,7 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
 
 
 def letter(*, study: StudyFile, out: Out = None, work: Work, console: Console, access: Access) -> None:
-    """One page for the owner of the model: what it misses, why, and what is attached."""
+    """Write one page for the model's owner. It states what the model misses, why, and what is attached."""
     from hvdc_ident.study.export import letter as write
 
     loaded = access.study(study)
@@ -254,7 +256,7 @@ def report(
     console: Console,
     access: Access,
 ) -> None:
-    """Build the page again from the results in DIR."""
+    """Build the report again from the results in DIR."""
     from hvdc_ident.report.page import write_pdf, write_report
 
     if not source.exists():
@@ -304,7 +306,7 @@ def export(
     console: Console,
     access: Access,
 ) -> None:
-    """Write the model or its linear model in the format of FILE's ending."""
+    """Write the model or its linear model. The ending of FILE selects the format."""
     from hvdc_ident.study.export import write
 
     written = write(access.study(study), to, linear, fmu.options(), values, out, reduced=reduced)
@@ -331,7 +333,7 @@ def convert(
     ] = None,
     console: Console,
 ) -> None:
-    """Any waveform format to CSV or Parquet; or, with --list, what a file holds."""
+    """Convert waveforms of any format to CSV or Parquet. With --list, list a file's signals."""
     from hvdc_ident.formats import convert as to_csv
     from hvdc_ident.formats import list_signals
 
@@ -365,14 +367,14 @@ def convert(
 
 
 def models(*, console: Console) -> None:
-    """The shipped models, one line each."""
+    """List the shipped models, one a line."""
     from hvdc_ident.models import summaries
 
     _catalogue("models", summaries(), console)
 
 
 def effects(*, console: Console) -> None:
-    """The catalogue of effects, one line each, with sizes that show on a per-unit signal. Those that `diagnose` tries
+    """List the effects that a model may lack. Each has sizes that show on a per-unit signal; those that `diagnose` tries
     only where they are named say so."""
     from hvdc_ident.effects import Effect
     from hvdc_ident.effects import effects as known
@@ -384,7 +386,7 @@ def effects(*, console: Console) -> None:
 
 
 def formats(*, console: Console) -> None:
-    """The waveform formats, one line each."""
+    """List the waveform formats, one a line."""
     from hvdc_ident.formats import formats as known
 
     _catalogue("formats", {name: f"{f.SUMMARY} ({', '.join(f.SUFFIXES)})" for name, f in known().items()}, console)

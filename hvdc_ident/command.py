@@ -82,7 +82,7 @@ class Console:
     """The command's output: text on stdout, or JSON there and nothing else; progress goes to stderr."""
 
     json: Annotated[bool, typer.Option("--json", help="Print the result's JSON on stdout and nothing else.")] = False
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but errors.")] = False
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False
 
     def say(self, *lines: str) -> None:
         """Print lines for people, unless stdout is asked to hold JSON or to stay empty."""
@@ -151,13 +151,14 @@ class Access:
 
     trust: Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")] = False
     deadline: Annotated[
-        float | None, _limit("--deadline", "S", "seconds", "300", "Of an FMU: seconds one run may take; default 60.")
+        float | None,
+        _limit("--deadline", "S", "seconds", "300", "Seconds that one run of an FMU may take; default 60."),
     ] = None
     load: Annotated[
-        float | None, _limit("--load", "S", "seconds", "300", "Of an FMU: seconds it may take to begin; default 60.")
+        float | None, _limit("--load", "S", "seconds", "300", "Seconds that an FMU may take to begin; default 60.")
     ] = None
     memory: Annotated[
-        float | None, _limit("--memory", "MIB", "MiB", "4096", "Of an FMU: MiB it may take; default 2048.")
+        float | None, _limit("--memory", "MIB", "MiB", "4096", "MiB of memory that an FMU may take; default 2048.")
     ] = None
 
     @property

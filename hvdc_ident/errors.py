@@ -111,6 +111,13 @@ LINE = 100
 """Characters: a message shows as many known names as a line holds, and never more than 12."""
 
 
+def nearest(name: str, known: Iterable[str]) -> list[str]:
+    """Return the known names that are most like a name, at most 3 that are equally like it; none where all are far from it."""
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    likeness = {n: difflib.SequenceMatcher(None, n, name).ratio() for n in near}
+    return [n for n in near if likeness[n] == max(likeness.values())]
+
+
 def unknown_name(
     kind: str, name: str, known: Iterable[str], *, where: str = "", listing: str = "", hint: str = ""
 ) -> UnknownNameError:
@@ -119,7 +126,7 @@ def unknown_name(
     listing: what lists all of them, said where the message cannot. hint: what to try where none is near.
     """
     names = [str(k) for k in known]
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    near = nearest(name, names)
     if not near and name.strip():  # the end of a path in a hierarchy is near to none of its names
         part = name.strip().casefold()
         near = sorted((n for n in names if part in n.casefold()), key=len)[:3]

@@ -81,7 +81,13 @@ def _profile(content: bytes, where: str) -> ToleranceProfile:
         raise StudyError("the tolerance profile is not TOML", where=where, got=str(e)) from None
     _keys(table, ("schema", "name", "version", "title", "source", "notes", "windows", "limits"), where)
     if table["schema"] != 1:
-        raise StudyError("a schema this version does not read", where=where, expected="1", got=str(table["schema"]))
+        raise StudyError(
+            "this version of hvdc_ident does not read this schema",
+            where=where,
+            expected="1",
+            got=str(table["schema"]),
+            hint="schema = 1, or the version of hvdc_ident that the file was written for",
+        )
     windows, limits = table["windows"], table["limits"]
     _keys(windows, LENGTHS, f"{where}, windows")
     _keys(limits, ("unit", *WINDOWS), f"{where}, limits")

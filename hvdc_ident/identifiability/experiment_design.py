@@ -455,8 +455,11 @@ def _text(
         return f"{r.design.text(units)}, recording {record}"
 
     def gain(name: str) -> str:
-        before = "not at all" if now[name] is None else f"±{now[name]:.3g}"
-        return f"{name} would be known to ±{then[name]:.3g} {units.get(name, '')}".rstrip() + f" (now {before})"
+        before = "none" if now[name] is None else f"±{now[name]:.3g}"
+        return (
+            f"{name} would get a 95 % confidence interval of ±{then[name]:.3g} {units.get(name, '')}".rstrip()
+            + f" (now {before})"
+        )
 
     gains = sorted((n for n in then if ratio(n) < WORTH), key=ratio)
     if not gains:

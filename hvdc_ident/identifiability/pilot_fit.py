@@ -244,11 +244,13 @@ class CramerRaoBounds:
             std, unit = self.std[name], self.units[name]
             at = f"{name:{width}}  {quantity(value, unit)}"
             if std is None:
-                found.append(f"{at}: not told there, held")
+                found.append(f"{at}: not determined there, held")
             else:
                 share = f" ({100.0 * HALF_95 * std / abs(value):.2g} %)" if value else ""
                 held = f" with {listed(self.conditional_on[name])} held" if name in self.conditional_on else ""
-                found.append(f"{at}: would be known to \u00b1{quantity(HALF_95 * std, unit, 2)}{share}{held}")
+                found.append(
+                    f"{at}: expected 95 % confidence interval \u00b1{quantity(HALF_95 * std, unit, 2)}{share}{held}"
+                )
         return [*found, *(f"{words[:1].upper()}{words[1:]}." for words in self.combinations)]
 
     def to_dict(self) -> dict[str, Any]:

@@ -137,15 +137,15 @@ def unjudged_verdict(judged: Verdict, times: float, half: float) -> Verdict:
     if judged.verdict == "at-bound":
         return judged.noted(f"Not to be believed before the misfit is explained: {why}.")
     text = f"Not judged: {why}. Against that misfit it is {judged.verdict}; "
-    text += f"against the noise alone it would be known to ±{_with_unit(half, judged.unit)}."
+    text += f"against the noise alone its 95 % confidence interval would be ±{_with_unit(half, judged.unit)}."
     return replace(judged, verdict="not-judged", reason=text)
 
 
 def with_misfit_remark(judged: Verdict, times: float, half: float) -> Verdict:
     """Return a weak verdict with the remark that only the misfit makes it so. times: the misfit over the noise. half: as above."""
     return judged.noted(
-        f"That is the misfit's doing, {times_text(times)} the noise: against the noise alone it would be known to "
-        f"±{_with_unit(half, judged.unit)}; diagnose first."
+        f"That is the misfit's doing, {times_text(times)} the noise: against the noise alone its 95 % "
+        f"confidence interval would be ±{_with_unit(half, judged.unit)}; diagnose first."
     )
 
 

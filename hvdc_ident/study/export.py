@@ -74,8 +74,12 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
     if found is not None and (wanted == "fitted" or not why):
         return found
     if wanted == "fitted":
-        hint = f"hvdc-ident fit {study.path}, or --values given"
-        raise StudyError("there are no fitted values", where=study.path.name, got=why, hint=hint)
+        raise StudyError(
+            f"there are no fitted values: {why}",
+            where=study.path.name,
+            expected=f"a finished fit of the study and its files as they are now, in {folder or study.folder}",
+            hint=f"hvdc-ident fit {study.path}, or --values given",
+        )
     return _given(study, "" if why == NONE else why)
 
 
@@ -218,7 +222,13 @@ def write(
         )
     if ending not in formats() and not (nonlinear and ending in _WRITERS):
         known = sorted({*formats(), *(_WRITERS if nonlinear else ())})
-        raise StudyError("no export has this ending", where=str(path), expected=f"one of {', '.join(known)}")
+        raise StudyError(
+            "no export has this ending",
+            where=str(path),
+            expected=f"one of {', '.join(known)}",
+            got=f"'{ending}'" if ending else "no ending",
+            hint=f"{path.stem or 'model'}{'.fmu' if nonlinear else '.mat'}, or the file with another of these endings",
+        )
     if values is not None and not isinstance(source, Study):
         raise StudyError("a model has one set of values: its own", where="values", expected="a study", got=repr(values))
     selected = (

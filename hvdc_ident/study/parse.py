@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import tomllib
 import types
@@ -13,7 +12,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hvdc_ident.errors import StudyError
+from hvdc_ident.errors import StudyError, nearest
+from hvdc_ident.formats import formats
 from hvdc_ident.study.schema import StudyFile
 
 LARGEST = 1_000_000  # bytes; a study of a thousand experiments has a third of it
@@ -43,12 +43,26 @@ def is_study_file(path: Path) -> bool:
 def parse_study(content: bytes, path: Path) -> StudyFile:
     """The study file's tables. Raises StudyError: not text or TOML, another schema, a key or value that is wrong."""
     where = path.name
-    table = _toml(content, where)
+    try:
+        table = _toml(content, where)
+    except StudyError:
+        _refuse_other_kinds(path)
+        raise
     if "schema" not in table:
-        raise StudyError("the study does not say its schema", where=where, expected="schema = 1 in the first line")
+        raise StudyError(
+            "the study does not state its schema",
+            where=where,
+            expected="schema = 1 in the first line",
+            got="no key schema",
+            hint="`hvdc-ident new DIR` writes a commented study",
+        )
     if table["schema"] != 1 or isinstance(table["schema"], bool):
         raise StudyError(
-            "a schema this version does not read", where=f"{where}, schema", expected="1", got=_shown(table["schema"])
+            "this version of hvdc_ident does not read this schema",
+            where=f"{where}, schema",
+            expected="1",
+            got=_shown(table["schema"]),
+            hint="schema = 1, or the version of hvdc_ident that the file was written for",
         )
     return checked(table, where)
 
@@ -59,6 +73,21 @@ def checked(table: dict[str, Any], where: str) -> StudyFile:
         return StudyFile.model_validate(table)
     except ValidationError as e:
         raise _first(e, table, where) from None
+
+
+def _refuse_other_kinds(path: Path) -> None:
+    """Raise StudyError for a file whose ending is that of waveforms or of an FMU."""
+    ending = path.suffix.lower()
+    if ending == ".fmu":
+        what, hint = "an FMU", f"`hvdc-ident check {path.name}` lists its variables; a study names it in [model] source"
+    elif any(ending in f.SUFFIXES for f in formats().values()):
+        convert = f"`hvdc-ident convert {path.name} --list ''` lists its signals"
+        what, hint = "a file of waveforms", f"{convert}; a study names it in data of an [[experiment]]"
+    else:
+        return
+    raise StudyError(
+        f"this is {what}, not a study", where=path.name, expected="a study file (TOML)", got=f"'{ending}'", hint=hint
+    )
 
 
 def _toml(content: bytes, where: str) -> dict[str, Any]:
@@ -76,7 +105,10 @@ def _toml(content: bytes, where: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as e:
         what = str(e)
         raise StudyError(
-            f"not valid TOML: {what[:1].lower()}{what[1:]}", where=where, expected="a TOML study file"
+            f"not valid TOML: {what[:1].lower()}{what[1:]}",
+            where=where,
+            expected="a study file (TOML)",
+            hint="mend this line; `hvdc-ident new DIR` writes a study to compare it with",
         ) from None
     except RecursionError:
         raise StudyError("not valid TOML: brackets nested too deeply", where=where) from None
@@ -164,7 +196,7 @@ def _inner(inner: Any, part: int | str) -> Any:
 def _unknown_key(key: str, outer: tuple[int | str, ...], table: dict[str, Any], where: str) -> StudyError:
     kind = _table_at(outer)
     known = [field.alias or name for name, field in kind.model_fields.items()] if kind else []
-    near = difflib.get_close_matches(key, known, n=2, cutoff=0.5)
+    near = nearest(key, known)
     hint = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
     place = _place(outer, table)
     full = f"{where}, {place}" if place else where

@@ -124,7 +124,7 @@ class EffectTable(TomlTable):
 class ModelTable(TomlTable):
     """[model]: where the model comes from and what differs from it.
 
-    Of an FMU: deadline: s that one run may take; load: s that it may take to begin; memory: MiB that it may take.
+    deadline: s that one run of an FMU may take; load: s that it may take to begin; memory: MiB that it may take.
     """
 
     source: Name

@@ -112,7 +112,7 @@ def test_a_profile_of_ones_own_is_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("schema = 1", "schema = 2", "a schema this version does not read"),
+        ("schema = 1", "schema = 2", "does not read this schema"),
         ("max = 0.08", "max = -0.08", "'max' is wrong"),
         ("max = 0.08", 'max = "a"', "'max' is wrong"),
         ("max = 0.08", "most = 0.08", "keys are wrong"),

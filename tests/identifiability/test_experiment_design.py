@@ -50,7 +50,7 @@ def test_the_input_that_shows_what_is_not_seen_is_recommended() -> None:
     assert found is not None and "w" in found.best.design.inputs
     assert found.now.directions == 1 and found.best.criteria.directions == 2
     assert found.half_widths_now["k"] is None and found.half_widths["k"] is not None
-    assert "k would be known to ±" in found.text and "(now not at all)" in found.text
+    assert "k would get a 95 % confidence interval of ±" in found.text and "(now none)" in found.text
 
 
 def test_the_predicted_interval_is_what_the_experiment_gives() -> None:

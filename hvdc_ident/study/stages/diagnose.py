@@ -120,7 +120,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 STAGE = Stage(
     name="diagnose",
     file="discrepancy.json",
-    summary="What the model lacks, if the recordings tell.",
+    summary="Find what the model lacks, if the recordings tell.",
     run=run,
     wanted=lambda study: study.settings.diagnose is not None,
     order=50,

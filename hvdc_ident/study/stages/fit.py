@@ -204,7 +204,7 @@ def _searched(data: Mapping[str, Any]) -> list[str]:
 STAGE = Stage(
     name="fit",
     file="fit.json",
-    summary="Estimates of the identifiable candidates, with their intervals.",
+    summary="Estimate the identifiable candidates, with their intervals.",
     run=run,
     wanted=lambda study: study.settings.fit is not None,
     order=40,

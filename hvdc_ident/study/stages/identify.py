@@ -121,7 +121,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 STAGE = Stage(
     name="identify",
     file="identifiability.json",
-    summary="What the recordings tell about the candidates.",
+    summary="Judge which candidates the recordings determine.",
     run=run,
     wanted=lambda study: study.settings.identifiability is not None or study.settings.fit is not None,
     order=30,

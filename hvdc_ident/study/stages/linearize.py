@@ -132,7 +132,7 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
 STAGE = Stage(
     name="linearize",
     file="linearization.json",
-    summary="The operating point, linear model, modes and transfer functions.",
+    summary="Linearise the model; compute its modes and transfer functions.",
     run=run,
     wanted=lambda study: study.settings.linearize is not None or bool(study.responses),
     order=45,

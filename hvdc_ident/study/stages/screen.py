@@ -72,7 +72,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 STAGE = Stage(
     name="screen",
     file="screening.json",
-    summary="Which candidates matter over their whole ranges.",
+    summary="Rank the candidates by their effect over their whole ranges.",
     run=run,
     wanted=lambda study: study.settings.screening is not None,
     order=27,

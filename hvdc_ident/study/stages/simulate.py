@@ -99,7 +99,7 @@ def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
 STAGE = Stage(
     name="simulate",
     file="simulation.json",
-    summary="The model at its given values, against every recording.",
+    summary="Compare the model at its given values with every recording.",
     run=run,
     wanted=lambda study: bool(study.experiments),
     order=10,

@@ -138,7 +138,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 STAGE = Stage(
     name="sweep",
     file="sweep.json",
-    summary="The errors over a range of parameters.",
+    summary="Compute the errors over a range of parameters.",
     run=run,
     wanted=lambda study: bool(study.settings.sweep),
     order=25,
