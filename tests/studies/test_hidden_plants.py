@@ -154,6 +154,17 @@ def test_both_simulators_agree_on_effects(name, effect, at, source, values):
     assert np.abs(mine - theirs).max() < 0.01 * size + 2e-4 * np.ptp(plain)
 
 
+@pytest.mark.parametrize(("plant", "at"), [(MACHINE, "Pref"), (CONVERTER, "Pref")], ids=lambda p: getattr(p, "name", p))
+def test_a_disturbance_has_acted_until_the_plant_repeats_itself(plant, at):
+    values = {"amplitude": 0.02, "frequency": 4.0 / plant.pace, "phase": 1.0}
+    hidden = [Hidden("disturbance", at, values)]
+    one, two = (
+        simulate(plant, [Run()], hidden, rows=100, step=plant.coarse * plant.step, lead=k * plant.lead)[:, 0]
+        for k in (1, 2)
+    )
+    assert (np.abs(one - two).max(axis=0) < 0.01 * np.ptp(one, axis=0)).all()
+
+
 @pytest.mark.parametrize("plant", NEW, ids=lambda p: p.name)
 def test_a_plants_experiments_and_effects_keep_its_pace(plant):
     slow, first = plant.pace, PLANTS["drive"]

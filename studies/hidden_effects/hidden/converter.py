@@ -115,6 +115,7 @@ CONVERTER = Plant(
     scheme="trapezoidal",
     pace=0.25,
     coarse=4,
+    lead=0.25,
     turning=_turning,
     timed=True,
 )  # fmt: skip

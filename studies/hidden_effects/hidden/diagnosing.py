@@ -175,7 +175,8 @@ def _sindy(
         residuals.append(np.asarray(e.measured.values - told))
         drivers.append(np.column_stack([told, *(i for i in inputs)]))
     moving = np.ptp(np.concatenate(drivers), axis=0) > 1e-9
-    law, terms = predicted(residuals, [d[:, moving] for d in drivers], np.asarray(case.times, dtype=np.float64))
+    times = np.asarray(case.times / plant.pace, dtype=np.float64)
+    law, terms = predicted(residuals, [d[:, moving] for d in drivers], times)
     sigma = case.sigma[list(case.channels)]
     misfit = None if law is None else float(np.sqrt(np.mean(((residuals[-1] - law) / sigma) ** 2)))
     return {"augmented": misfit, "terms": float(terms)}

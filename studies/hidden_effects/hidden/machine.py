@@ -86,4 +86,5 @@ MACHINE = Plant(
     flow=_machine,
     scheme="trapezoidal",
     pace=10.0,
+    lead=40.0,
 )  # fmt: skip

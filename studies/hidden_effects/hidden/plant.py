@@ -24,7 +24,8 @@ class Plant:
     returns and keeps the value for its readers. fitted: the fit parameters. kicks: by input, the size of a small step.
     slots: insertion points other than the outputs; a signal comes after those that it may read. scheme: how it is integrated.
     pace: of its rows, steps, experiments and effects' times, in multiples of those of the first plants. coarse: steps of the
-    simulator that one step of the refits has. turning(x): derivatives of the states in steady state (default: 0). timed: True
+    simulator that one step of the refits has. lead: time in s that a run without a steady start waits for rest before its first
+    row, several times the plant's largest time constant. turning(x): derivatives of the states in steady state (default: 0). timed: True
     if flow reads the time, as the input "time".
     """
 
@@ -41,6 +42,7 @@ class Plant:
     scheme: Literal["runge-kutta", "trapezoidal"] = "runge-kutta"
     pace: float = 1.0
     coarse: int = 10
+    lead: float = 1.0
     turning: Callable[[list[Array]], list[Array]] | None = None
     timed: bool = False
 

@@ -17,11 +17,9 @@ from hidden.operators import CATALOGUE, OUTSIDE, Operator
 from hidden.plant import INTERVAL, STEP, Plant
 
 Array = NDArray[np.floating]
-LEAD = 1.0
-"""s: how long a run that has no steady start waits for rest before its first row, of a plant with pace 1."""
 CORRECTIONS = 2
 """Of the trapezoidal rule in a step: with the fastest root times half a step at 0.03 the last one changes 1e-5 of the step."""
-__all__ = ["INTERVAL", "LEAD", "STEP", "Hidden", "Run", "Signal", "simulate"]
+__all__ = ["INTERVAL", "STEP", "Hidden", "Run", "Signal", "simulate"]
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ def simulate(
     kind = _RungeKutta if plant.scheme == "runge-kutta" else _Trapezoidal
     interval = plant.interval if interval is None else interval
     step = plant.step if step is None else step
-    lead = LEAD * plant.pace if lead is None else lead
+    lead = plant.lead if lead is None else lead
     return kind(plant, runs, hidden, rows, interval, watch, step, lead, coarse).result()
 
 
