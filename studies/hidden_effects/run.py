@@ -114,7 +114,7 @@ def numbered(text: str) -> list[str]:
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Return the summary; results are kept line by line, and a second call resumes the first."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=[p for p in PARTS if p != "triple"])
     plants = ", ".join(f"{k} {n}" for k, n in enumerate(PLANTS, start=1))
     parser.add_argument(
         "--plants", type=numbered, default=list(FIRST), help=f"numbers of plants: {plants}; default 1,2"

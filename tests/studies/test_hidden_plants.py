@@ -189,6 +189,7 @@ def test_other_plants_add_cases_and_change_none():
         untidy = cases.designs(part, 3, messy=True)
         assert tuple(replace(d, messy=False) for d in untidy) == alone
         assert all(d.name.endswith("-messy") for d in untidy)
+    assert all(len(set(d.effects)) == 3 for d in cases.designs("triple", 3, tuple(PLANTS)))
     single = cases.designs("single", 3, ("converter",))
     levels = [d.size for d in single]
     assert {levels.count(s) for s in cases.SIZES} == {len(single) // len(cases.SIZES)}

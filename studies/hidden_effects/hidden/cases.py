@@ -29,9 +29,9 @@ FIRM = 1.0
 """Units by which the answer may change at half the step."""
 LOUDNESS = (math.log(2e-3), math.log(2e-2))
 """Of the noise: its standard deviation in shares of an output's range, as logarithms."""
-PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60}
+PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60, "triple": 40}
 """How many cases each part has, of the first two plants together."""
-MORE = {"single": 160, "pair": 30, "clean": 200, "outside": 25, "left-out": 30}
+MORE = {"single": 160, "pair": 30, "clean": 200, "outside": 25, "left-out": 30, "triple": 20}
 """How many each part has of every other plant."""
 
 
@@ -130,6 +130,9 @@ def _designs(part: str, rng: np.random.Generator, count: int, plants: Sequence[s
         plant = "station" if name == "inductance" else row["plant"]
         if part == "pair":
             effects = (name, str(rng.choice([n for n in names if n not in (name, "inductance")])))
+        if part == "triple":
+            others = [n for n in names if n not in (name, "inductance")]
+            effects = (name, *map(str, rng.choice(others, size=2, replace=False)))
         if part == "clean" and row["noise"] == "unreached":
             effects = ("limit",)
         yield Design(part, first + number, effects=effects, **(row | {"plant": plant}))

@@ -33,6 +33,7 @@ MAIN = {
 }  # fmt: skip
 """The parameter that measures the effect."""
 OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")
+PARTS = ("single", "pair", "clean", "outside", "left-out", "triple")
 BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
 """Edges of the bins of stated probabilities."""
 SURE = 0.95
@@ -141,7 +142,7 @@ def summary(lines: Sequence[Line]) -> dict[str, Any]:
     """
     made = [x for x in lines if not x.get("unreachable")]
     tidy = [x for x in made if not x.get("messy")]
-    by_part = {p: [x for x in tidy if x["part"] == p] for p in ("single", "pair", "clean", "outside", "left-out")}
+    by_part = {p: [x for x in tidy if x["part"] == p] for p in PARTS}
     single = by_part["single"]
     large = [x for x in single if x["size"] >= 10.0]
     return {
@@ -153,6 +154,7 @@ def summary(lines: Sequence[Line]) -> dict[str, Any]:
         },
         "large": _shares(large),
         "pairs": _shares(by_part["pair"]),
+        "triples": _shares(by_part["triple"]),
         "by_plant": by_plant(made),
         "calibration": calibration(made),
         "by_noise": _by(large, "noise"),
@@ -202,7 +204,7 @@ def by_plant(lines: Sequence[Line]) -> dict[str, Any]:
     table: dict[str, Any] = {}
     for plant, messy in sorted({(x["plant"], bool(x.get("messy"))) for x in lines}):
         own = [x for x in lines if x["plant"] == plant and bool(x.get("messy")) == messy]
-        parts = {p: [x for x in own if x["part"] == p] for p in ("single", "pair", "clean", "outside")}
+        parts = {p: [x for x in own if x["part"] == p] for p in PARTS}
         large = [x for x in parts["single"] if x["size"] >= 10.0]
         clean = [x for x in parts["clean"] if "failed" not in x]
         false = sum(x["verdict"] == "named" for x in clean)
@@ -210,6 +212,7 @@ def by_plant(lines: Sequence[Line]) -> dict[str, Any]:
         table[f"{plant}, {'messy' if messy else 'tidy'}"] = {
             "large": _shares(large) | {"places": _places(large)},
             "pair": _shares(parts["pair"]),
+            "triple": _shares(parts["triple"]),
             "clean": {
                 "cases": len(clean),
                 "named": false,

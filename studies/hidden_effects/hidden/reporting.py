@@ -17,6 +17,7 @@ def report(found: Mapping[str, Any]) -> str:
         _table("Single effects by size (units)", found["outcomes_by_size"], OUTCOMES),
         "Size 10 and above: " + _said(found["large"]),
         "Pairs: " + _said(found["pairs"]),
+        "Three effects: " + _said(found["triples"]),
         *_by_plant(found["by_plant"]),
         *_calibration(found["calibration"]),
         _table("Size 10 and above, by noise", found["by_noise"], ("cases", *OUTCOMES)),
@@ -67,6 +68,7 @@ def _by_plant(found: Mapping[str, Any]) -> list[str]:
     return [
         _table("Size 10 and above, by plant and records", of("large"), (*shares, "places")),
         _table("Pairs, by plant and records", of("pair"), shares),
+        _table("Three effects, by plant and records", of("triple"), shares),
         _table("Clean cases, by plant and records", of("clean"), ("cases", "named", "limit", "evidence_without_name")),
         _table("Outside, by plant and records", of("outside"), ("cases", "confident_wrong_names", "limit")),
         _table("Seconds a diagnosis, by plant and records", of("seconds"), ("5 %", "median", "95 %", "largest")),
