@@ -151,6 +151,11 @@ class Rewrite(Protocol):
     def __call__(self, u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr: ...
 
 
+Equality = Callable[[Mapping[str, float], Array], Mapping[str, float] | None]
+"""Values of the other effect, as far as they are known, from the effect's own and from the signal that it brings in (empty where
+it brings in none); None where the two are not the same equation."""
+
+
 @dataclass(frozen=True)
 class Effect:
     """One entry of the catalogue.
@@ -167,7 +172,7 @@ class Effect:
     share; None for what is no delay of any kind. numpy_form: y of u in numpy, where the equations are too many to be
     evaluated for thousands of sizes. generalises: effects that it becomes at the end of a parameter's range, and whose data
     it therefore explains, at the price of that parameter. reversal: the parameter by more than which the signal has to
-    reverse for the effect to be more than a shift.
+    reverse for the effect to be more than a shift. equals: other effects that are the same equation at the same place.
     """
 
     name: str
@@ -189,6 +194,7 @@ class Effect:
     numpy_form: Callable[[Array, Mapping[str, Array]], Array] | None = None
     generalises: tuple[str, ...] = ()
     reversal: str = ""
+    equals: FrozenMap[Equality] = field(default_factory=FrozenMap)
 
     def delay_with(self, values: Mapping[str, float]) -> float | None:
         """Return the equivalent delay with these values, s; None for what is no delay of any kind."""

@@ -42,4 +42,6 @@ EFFECT = Effect(
         }
     ),
     needs_source=True,
+    # The magnitude of a signal that keeps its sign is that signal, or its opposite.
+    equals=FrozenMap({"loss": lambda p, source: {} if (source > 0.0).all() or (source < 0.0).all() else None}),
 )

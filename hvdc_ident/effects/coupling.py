@@ -41,4 +41,11 @@ EFFECT = Effect(
         }
     ),
     needs_source=True,
+    equals=FrozenMap(
+        {
+            "droop": lambda p, source: {"k": -p["k"]} if p["k"] < 0.0 else None,
+            # Counted from a start value of 0, the other signal is its change.
+            "conductance": lambda p, source: {"g": -p["k"]} if source.size and source[0] == 0.0 else None,
+        }
+    ),
 )

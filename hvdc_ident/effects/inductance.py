@@ -31,4 +31,5 @@ EFFECT = Effect(
     states="the current, one per insertion point",
     confusable=FrozenMap({"lag": "nothing from outside: the same with T = L/R"}),
     resistance="R",
+    equals=FrozenMap({"lag": lambda p, source: {"T": p["L"] / p["R"]} if p.get("L") and p.get("R") else {}}),
 )

@@ -25,7 +25,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     equivalent_delay=lambda p: p["T"],
-    sentence="{at} follows its order with a first-order lag of {T}",
+    sentence="{at} of the plant follows that of the model with a first-order lag of {T}",
     excited_by="a step or fast ramp of the signal, recorded at several samples per time constant",
     example=FrozenMap({"T": 0.002}),
     states="y, one per insertion point",

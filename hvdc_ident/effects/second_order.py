@@ -36,7 +36,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     equivalent_delay=lambda p: 2 * p["zeta"] / p["wn"],
     generalises=("lag",),
-    sentence="{at} follows its order as a second-order system of {wn} and damping {zeta}, {equivalent_delay} late",
+    sentence="{at} of the plant follows that of the model as a second-order system of {wn} and damping {zeta}, {equivalent_delay} late",
     excited_by="a step of the signal, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.5}),
     states="y and its rate v = y'/wn, one pair per insertion point",
