@@ -425,7 +425,7 @@ def diagnose(
     """Return what the model lacks, if the data tell: the verdict, the missing effects, and the gap before and after.
 
     model, data, parameters, report: as in `fit`. effects: names of the catalogue that are tried (default: all).
-    settings: keys of a study's [diagnose]: material, most, thorough. executor, progress: as in `fit`.
+    settings: keys of a study's [diagnose]: tolerance, most, thorough, budget. executor, progress: as in `fit`.
 
     Raises StudyError where data or parameters are missing, ComputationError where the data identify no parameter.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -216,8 +217,10 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
 
         loaded = access.study(study)
         folder = out or loaded.folder
-        with within(budget), console.progress() as progress:
+        searched = "budget" in stage.takes  # it answers with what it has by then; the others are interrupted
+        with within(None if searched else budget), console.progress() as progress:
             options = work.options(console, progress)
+            options = replace(options, budget=budget) if searched else options
             hint = "NAME = {min = ..., max = ...} in [parameters], which makes a parameter a candidate"
             require_known("candidate", options.force, loaded.candidates, "--force", hint)
             done = run_stage(loaded, stage.name, folder, options)

@@ -61,7 +61,7 @@ Budget = Annotated[
     option(
         "--budget",
         "SECONDS",
-        "Stop after so long; what was finished by then is kept, and the same command goes on.",
+        "Stop after so long. What was finished is kept, and the same command goes on; diagnose answers with what it has by then.",
         parser=_number("--budget", "seconds, at least 0.001", "600", 0.001),
     ),
 ]

@@ -1,22 +1,23 @@
 """Find where simulation and data disagree, name the missing effect, add it, show the gap shrink.
 
-The rooms inside, each of which imports only from those above it:
+A hypothesis is the model with some effects at insertion points, their sizes and its parameters refitted together. The way
+of one diagnosis through the modules:
 
-    noise       the noise of the records: size, correlation, resolution
-    signatures  the change of the outputs with a candidate effect at a slot, without compiling it in
-    refits      the fit of the model with effects in it, and its tests
-    scores      scores before any refit: where model and data differ, which candidates could explain it
-    trials      candidates picked and refitted, and what a refit must bring to count
-    outside     forms outside the catalogue: laws, filters, curves
-    search      round after round: score, refit, choose, add
-    findings    the result: ambiguity sets, explanations, sizes, frequency responses
-    verdict     the verdict and the checks against it
-
-`diagnosis.diagnose` goes through them.
+    nominal, record_noise   the model without effects at its own best, and the noise of the records
+    signatures, scores      how the outputs would differ if an effect were there, and how far chi2 would then fall
+    latent                  what any effect at an insertion point could explain: a bound, and the signal that is truly there
+    proposals, refit, race  effects with sizes that promise most, refitted together with the parameters
+    explore, size_profile   their neighbours (another place, another kind of delay), and sizes that no slope leads to
+    released                parameters that were held, set free where the records speak against their values
+    rounds, search          one effect after the other, each looked for again beside the others, or done without
+    outside, alternatives   forms that the catalogue has no name for
+    evidence, classes       what each hypothesis gains; effects that are one equation, wherever they are
+    remainder, verdict      what is left, whether anything more could explain it, and what is told
+    diagnosis, result       the verb and its result
 """
 
 from hvdc_ident.discrepancy.diagnosis import diagnose
-from hvdc_ident.discrepancy.findings.conclusion import Diagnosis
 from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.result import Diagnosis
 
 __all__ = ["Diagnosis", "DiagnosisOptions", "diagnose"]

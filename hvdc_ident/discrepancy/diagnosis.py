@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import numpy as np
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.discrepancy.findings.ambiguity import separating
-from hvdc_ident.discrepancy.findings.bode import responses
-from hvdc_ident.discrepancy.findings.conclusion import Diagnosis, FoundEffect
-from hvdc_ident.discrepancy.findings.explain import found_of
-from hvdc_ident.discrepancy.findings.gap import at_given, gap
+from hvdc_ident.discrepancy.bode import responses
+from hvdc_ident.discrepancy.candidate_table import detectable, lines
+from hvdc_ident.discrepancy.classes import compared, separating
+from hvdc_ident.discrepancy.context import Course, SearchContext
+from hvdc_ident.discrepancy.explain import at_given, found_of, gap, off_given
+from hvdc_ident.discrepancy.latent import Reach
+from hvdc_ident.discrepancy.localise import localise
+from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
-from hvdc_ident.discrepancy.refits.nominal import Nominal, nominal
-from hvdc_ident.discrepancy.refits.refit import Refit, judged
-from hvdc_ident.discrepancy.refits.residual_tests import Binned
-from hvdc_ident.discrepancy.scores.localise import localise
-from hvdc_ident.discrepancy.search.forward import SearchOutcome, from_either_side
+from hvdc_ident.discrepancy.refit import Refit, judged
+from hvdc_ident.discrepancy.residual_checks import Binned
+from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
+from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
 from hvdc_ident.discrepancy.signatures.candidates import entries
-from hvdc_ident.discrepancy.trials.context import SearchContext
-from hvdc_ident.discrepancy.verdict.judge import Judgement, judge, tests_of
-from hvdc_ident.discrepancy.verdict.lines import detectable, lines
+from hvdc_ident.discrepancy.verdict import Judgement, findings_of, headline, judge, tests_of
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
+from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Simulator
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
@@ -36,9 +40,9 @@ CLOSED = (
     "not, and no form outside the catalogue was looked for."
 )
 
-SPARED = (
-    "No single effect came near the noise. What the scores tell little of was not refitted; a thorough search does that "
-    "(thorough = true in [diagnose])."
+UNTRIED = (
+    "No single effect came near the noise. {} proposals that promise less were not refitted; a thorough search does that "
+    "(thorough = true in [diagnose], and no budget)."
 )
 
 
@@ -49,7 +53,7 @@ def diagnose(
     *,
     effects: Iterable[str] | Literal["all"] = "all",
     places: Iterable[str | tuple[str, ...]] | None = None,
-    material: Mapping[str, float] | None = None,
+    tolerance: Mapping[str, float] | None = None,
     held: Mapping[str, float] | None = None,
     report: Mapping[str, Any] | None = None,
     options: DiagnosisOptions | None = None,
@@ -65,7 +69,7 @@ def diagnose(
     to try, "all" beside others for what is tried by default. places: slots to try them at, a tuple for one effect at several
     slots with shared parameters (default:
     every slot, and families of like slots).
-    material: by output, an error (in its unit) below which a gap is of no interest. held: values of other parameters.
+    tolerance: by output, an error (in its unit) below which a gap is of no interest. held: values of other parameters.
     report: `IdentifiabilityReport.to_dict()` of these data, whose identifiable set is fitted; without one, the set that
     the sensitivities at the pilot fit can tell apart.
 
@@ -76,15 +80,18 @@ def diagnose(
     given, free = tuple(experiments), tuple(parameters)
     model = recording(_model_of(subject), (o for e in given for o in e.outputs))
     names: Any = "all" if effects == "all" else tuple(e.name for e in entries(effects))
-    _check_material(material or {}, given)
+    _check_tolerance(tolerance or {}, given)
     search = SearchContext(
-        names, None if places is None else tuple(places), FrozenMap(material or {}), chosen, seed, executor, progress
-    )
+        names, None if places is None else tuple(places), FrozenMap(tolerance or {}), chosen, seed, executor,
+        None if progress is None else Course(progress),
+        math.inf if chosen.budget is None else time.monotonic() + chosen.budget,
+    )  # fmt: skip
     search.tell(0, 1, "the nominal model, refitted")
     start, notes = nominal(
         ModelSimulator(model), given, free, held or {}, report, starts=chosen.starts, seed=seed, executor=executor
     )
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
+    search = replace(search, held=tuple(f for f in free if f.name not in first.problem.names))
     outcome = from_either_side(search, first)
     judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)
@@ -95,8 +102,8 @@ def diagnose(
         other = fallback(search, outcome.rounds[0])
     if not inside:
         notes = (*notes, CLOSED)
-    if outcome.rounds[0].spared and judgement.verdict != "named":
-        notes = (*notes, SPARED)
+    if (untried := outcome.rounds[0].untried) and judgement.verdict != "named":
+        notes = (*notes, UNTRIED.format(untried))
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
 
 
@@ -114,14 +121,14 @@ def _model_of(subject: AnyModel | Simulator) -> AnyModel:
     )
 
 
-def _check_material(material: Mapping[str, float], experiments: tuple[Experiment, ...]) -> None:
+def _check_tolerance(tolerance: Mapping[str, float], experiments: tuple[Experiment, ...]) -> None:
     measured = list(dict.fromkeys(o for e in experiments for o in e.outputs))
-    for output, band in material.items():
+    for output, band in tolerance.items():
         if output not in measured:
-            raise unknown_name("measured output", output, measured, where="material")
+            raise unknown_name("measured output", output, measured, where="tolerance")
         if not band > 0:
             raise StudyError(
-                "an error band is not above 0", where=f"material of '{output}'", expected="above 0", got=f"{band:g}"
+                "an error band is not above 0", where=f"tolerance of '{output}'", expected="above 0", got=f"{band:g}"
             )
 
 
@@ -139,20 +146,25 @@ def _assembled(
     in_place = judgement.verdict in ("named", "ambiguous")
     tests = judgement.tests
     effects: tuple[FoundEffect, ...] = ()
-    last = first
+    last = outcome.refit if judgement.verdict == "no-evidence" else first
     if in_place:
         last = outcome.refit
         effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
     elif other is not None and other.refit is not None:
         last = other.refit
         tests = tests_of(search, last)
-    augmented = None if last is first else last.model.with_values(_own(last))
+    augmented = last.model.with_values(_own(last)) if last.placed else None
     given = at_given(first, {f.name: f.given for f in free})
     responses_found = responses(model, first, augmented, last)
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
+    findings = findings_of(search, outcome, judgement, effects)
+    text = headline(judgement, findings)
+    if judgement.verdict == "no-evidence" and (moved := off_given(last, given)) is not None:
+        findings, text = (moved,), moved.text
+    left, bound = judgement.remainder, outcome.rounds[0].reach
     return Diagnosis(
         verdict=judgement.verdict,
-        text=judgement.text if other is None else f"{judgement.text} {other.text}",
+        text=text if other is None else f"{text} {other.text}",
         effects=effects,
         ambiguity=sets,
         separating_experiment=separating(sets, {o for e in last.problem.experiments for o in e.outputs}) or judgement.experiment,
@@ -172,7 +184,20 @@ def _assembled(
         },
         notes=notes,
         doubt=judgement.doubt,
+        findings=findings,
+        remainder={} if left is None else plain(left) | {"below_tolerance": left.below_tolerance},
+        hypotheses=compared(first, outcome),
+        latent={} if bound is None else _latent(bound),
     )  # fmt: skip
+
+
+def _latent(bound: Reach) -> dict[str, Any]:
+    """By insertion point the bound on the share that any effect there could explain, and at the best the course of what is missing."""
+    curves = {
+        place: {experiment: {"time": c[0], "value": c[1]} for experiment, c in courses.items()}
+        for place, courses in bound.curves.items()
+    }
+    return {p: {"bound": share, "curve": plain(curves.get(p, {}))} for p, share in bound.shares.items()}
 
 
 def _own(refit: Refit) -> dict[str, float]:

@@ -15,15 +15,13 @@ class DiagnosisOptions:
     bootstraps: noise records drawn for it (p is at least 1/(n + 1)).
     named_bic: the delta BIC that a named effect must exceed.
     set_bic: rivals within it join the ambiguity set.
-    shortlist: number of the best by score that are refitted.
-    collinear: cosine from which a candidate is refitted beside its partner.
-    refits: candidates refitted in one round, at most.
     most: effects, at most.
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
     refuted: share of what an effect explains that may be left, in structure, in the region it was put there for.
     starts: runs of the nominal multistart.
     fallback: search for a form outside the catalogue.
     thorough: refit candidates, too, whose scores tell little, where no other comes near the noise.
+    budget: seconds after which nothing further is looked for; None: no limit.
 
     Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.
     """
@@ -32,15 +30,13 @@ class DiagnosisOptions:
     bootstraps: int = 200
     named_bic: float = 10.0
     set_bic: float = 6.0
-    shortlist: int = 5
-    collinear: float = 0.9
-    refits: int = 24
     most: int = 3
     holdout_share: float = 0.1
     refuted: float = 0.1
     starts: int = 2
     fallback: bool = True
     thorough: bool = False
+    budget: float | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.significance < 1 and self.bootstraps * self.significance >= 1):
@@ -50,5 +46,5 @@ class DiagnosisOptions:
                 expected=f"at least {1 / self.significance:.0f} bootstraps",
                 got=f"{self.bootstraps}",
             )
-        if min(self.shortlist, self.refits, self.most, self.starts) < 1:
-            raise StudyError("a budget of a diagnosis is below 1", where="options of a diagnosis")
+        if min(self.most, self.starts) < 1:
+            raise StudyError("a number of effects or starts is below 1", where="options of a diagnosis")

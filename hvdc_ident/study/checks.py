@@ -66,7 +66,7 @@ def check_questions(study: Study, where: str) -> None:
         with located(f"{where}, fit.tolerance"):
             tolerance(s.fit.tolerance, study.path.parent)
     if s.diagnose:
-        require_known("measured output", s.diagnose.material, measured, f"{where}, diagnose.material")
+        require_known("measured output", s.diagnose.tolerances, measured, f"{where}, diagnose.tolerance")
         if s.diagnose.effects != "all":
             from hvdc_ident.effects import effects
 

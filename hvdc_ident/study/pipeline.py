@@ -214,6 +214,7 @@ def standing(study: Study, name: str, folder: Path) -> tuple[dict[str, Any], str
         return data, f"the {name} in {folder} ended as {data.get('status', 'failed')}: {end}"
     known: dict[str, Any] = data["options"] if isinstance(data.get("options"), dict) else {}
     taken: dict[str, Any] = {n: tuple(known[n]) for n in wanted.takes if isinstance(known.get(n), list)}
+    taken |= {n: known[n] for n in wanted.takes if isinstance(known.get(n), float)}
     if _kept(study, wanted, folder, StageOptions(seed=int(data.get("seed", 0)), **taken)) is None:
         return data, f"the {name} in {folder} is of another version of hvdc_ident, or not whole"
     return data, ""

@@ -497,13 +497,27 @@ class FitTable(TomlTable):
 
 
 class DiagnoseTable(TomlTable):
-    """[diagnose]: which effects to try ("all" may stand beside others), what is too small to matter, how many effects may be
-    missing at most, and whether what the scores tell little of is refitted too where nothing else comes near the noise."""
+    """[diagnose]: which effects to try ("all" may stand beside others), by output the error below which a gap is of no interest
+    (`tolerance`; `material` is its earlier name), how many effects may be missing at most, whether what promises little is
+    refitted too where nothing comes near the noise, and the seconds after which nothing further is looked for."""
 
     effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = "all"
+    tolerance: dict[Name, Positive] = {}
     material: dict[Name, Positive] = {}
     most: Annotated[int, Field(ge=1)] = 3
     thorough: bool = False
+    budget: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_name(self) -> DiagnoseTable:
+        if self.tolerance and self.material:
+            raise ValueError("material: it is the earlier name of tolerance; give one of them")
+        return self
+
+    @property
+    def tolerances(self) -> dict[str, float]:
+        """By output, the error below which a gap is of no interest, in its unit."""
+        return self.tolerance or self.material
 
 
 class StudyFile(TomlTable):

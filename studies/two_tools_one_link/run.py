@@ -64,7 +64,7 @@ ROLES = {  # part left out: windows fitted, windows held out; the droop does nex
     "droop of the ac voltage controls": (("voltage steps",), ("P ramp",)),
 }
 COARSE = 1e-2  # s: sampling of what is diagnosed
-OPTIONS = DiagnosisOptions(fallback=False, refits=8, shortlist=4)  # no form outside the catalogue is looked for
+OPTIONS = DiagnosisOptions(fallback=False)  # no form outside the catalogue is looked for
 FAULT = ("fault", (7.95, 10.0))  # compared between the tools only
 BANDS = {"Ip1": 1e-3, "Ip2": 1e-3, "Q1": 1e-3, "Q2": 1e-3, "U1": 2e-4, "V1": 2e-4}
 """What is compared, and what each weighs, pu: not noise, the records have none; a tenth of a per cent of the ratings."""

@@ -14,12 +14,11 @@ from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, Model
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.findings.ambiguity import formula_rivals
-from hvdc_ident.discrepancy.refits.refit import run
-from hvdc_ident.discrepancy.trials.context import Round
-from hvdc_ident.discrepancy.trials.formula import formula_job
-from hvdc_ident.discrepancy.trials.library import Term
-from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler
+from hvdc_ident.discrepancy.classes import formula_rivals
+from hvdc_ident.discrepancy.context import Round
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler
+from hvdc_ident.discrepancy.formula import Term, formula_job
+from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -85,11 +84,12 @@ def test_a_formula_with_a_parameter_more_is_a_rival_where_it_needs_all_of_them()
     coupling = beside(before, "coupling", "outputs.w", {"k": 0.01}, {"k": (-1.0, 1.0)}, source="load")
     winner = CandidateFit(Pick(0, 0, 1.0, 1.0), run(coupling), 100.0)
     found = cast(Round, SimpleNamespace(winner=winner, ruler=Ruler(1800, 1800.0, 1.0)))
-    for std, gain, members in ((1e-3, 93.0, 2), (10.0, 93.0, 1), (1e-3, 80.0, 1)):
+    for std, gain, near in ((1e-3, 93.0, 1), (10.0, 93.0, 0), (1e-3, 80.0, 0)):
         last = refit.placed[-1]
         spread = FrozenMap({last.names[n]: std * abs(v) for n, v in refit.sizes(last).items()})
         formula = CandidateFit(winner.pick, replace(refit, std=spread), gain)
-        assert len(formula_rivals(found, [formula], DiagnosisOptions())) == members
+        behind, rivals = formula_rivals(found, [formula], DiagnosisOptions())
+        assert behind == 0.0 and len(rivals) == near
 
 
 def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> None:
@@ -98,7 +98,7 @@ def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> N
     found = diagnose(
         model(), shown(apply_effects(model(), [clipped]), still="load"), FREE, effects=bends, places=["load"]
     )
-    assert found.verdict == "ambiguous"
+    assert found.verdict == "named"
     assert {r.effect for r in found.ambiguity[0]} == set(bends)
     more = {"effect": "gain", "at": "load", "parameters": {"k": 1.2}}
     found = diagnose(model(), shown(apply_effects(model(), [more]), still="load"), FREE, effects=bends, places=["load"])

@@ -47,7 +47,9 @@ def looped(inputs: dict[str, InputSignal]) -> Array:
 def test_a_loop_is_named() -> None:
     """At the torque, or at the error behind which a linear controller passes it on."""
     found = diagnose(model(), records(looped), FREE, options=DiagnosisOptions(bootstraps=100))
-    assert found.verdict == "ambiguous" and found.remaining["adequate"]
+    assert found.verdict == "named" and found.remaining["adequate"]
+    (told,) = found.findings
+    assert told.probability > 0.95 and sum(p.probability for p in told.places) == pytest.approx(1.0)
     (alike,) = found.ambiguity
     assert {(r.effect, r.at) for r in alike} == {("inner-loop", ("torque",)), ("inner-loop", ("err",))}
     sizes = found.effects[0].parameters

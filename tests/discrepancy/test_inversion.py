@@ -9,13 +9,13 @@ import pytest
 from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, experiments, model
 from refits import plain
 from scipy.integrate import solve_ivp
+from scipy.stats import norm
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.scores.inversion import Inversion
-from hvdc_ident.discrepancy.scores.scan import _looked
-from hvdc_ident.discrepancy.scores.scored import Whitening, runs
+from hvdc_ident.discrepancy.latent import TRIED, Inversion
+from hvdc_ident.discrepancy.scores import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import SignalScales, effects
 from hvdc_ident.immutable import FrozenMap
@@ -166,8 +166,15 @@ def test_one_slot_of_a_run_answers_as_among_all() -> None:
         assert np.array_equal(all_of_it, one)
 
 
-def test_where_no_size_is_worth_a_run_noise_alone_is_left() -> None:
-    right = np.zeros((20, 1 + 2 + 7))  # residual, two parameters, seven records of noise
-    found = _looked([], right, 2, None, None, "")
-    assert found.columns == () and found.t.shape == (0,)
-    assert np.maximum(np.arange(7.0), found.largest).tolist() == list(range(7))
+def test_the_evidence_of_a_latent_input_is_that_of_a_gaussian_with_its_prior() -> None:
+    """Against the marginal likelihood computed from the covariance of the residual itself, by scipy."""
+    nominal = plain(experiments(lag=0.03)).nominal()
+    paths = {n: p for n, p in runs(model(), nominal).items() if isinstance(p, Along)}
+    latent = Inversion.of(nominal, paths, "wm")
+    told = float(latent.log_evidence(latent.wanted[:, None])[0])
+    likely = []
+    for size in TRIED / latent.strength[0]:
+        spread = np.sqrt(1.0 + (size * latent.strength) ** 2)
+        likely.append(norm.logpdf(latent.wanted, scale=spread).sum() - norm.logpdf(latent.wanted).sum())
+    assert told == pytest.approx(max(likely), rel=1e-9) and told > 100.0
+    assert latent.log_evidence(np.zeros((latent.strength.size, 1)))[0] == pytest.approx(0.0, abs=1e-6)

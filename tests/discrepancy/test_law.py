@@ -13,12 +13,11 @@ from refits import plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.outside.hidden import Regression
-from hvdc_ident.discrepancy.outside.law import _levels, law
-from hvdc_ident.discrepancy.search.rounds import one_round
-from hvdc_ident.discrepancy.trials.context import SearchContext
-from hvdc_ident.discrepancy.trials.library import hats
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, explore
+from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.formula import hats
+from hvdc_ident.discrepancy.outside.law import Regression, _levels, law
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, parse_card, write_card
@@ -160,22 +159,28 @@ def test_a_law_is_near_only_where_it_beats_what_the_catalogue_has() -> None:
     assert beside is None or not beside.near
 
 
-def test_more_is_refitted_where_a_thorough_search_is_asked_for() -> None:
-    def rough(seen: dict[str, Array]) -> Array:
-        """The torque by a meter that jumps where the speed passes a level, either way by itself."""
-        return seen["torque"] + 0.05 * np.tanh((seen["w"] - 1.02) / 0.01)
+def rough(seen: dict[str, Array]) -> Array:
+    """The torque by a meter that jumps where the speed passes a level, either way by itself."""
+    return seen["torque"] + 0.05 * np.tanh((seen["w"] - 1.02) / 0.01)
 
+
+def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(explore, "FIELD", 4)
     records, names, done = metered("torque", rough), ["lag", "gain", "limit", "deadband"], dict[bool, Diagnosis]()
-    looks: dict[bool, list[str]] = {False: [], True: []}
     for thorough in (False, True):
-        done[thorough] = diagnose(
-            model(), records, FREE, effects=names, options=DiagnosisOptions(bootstraps=100, thorough=thorough),
-            progress=lambda _done, _total, text, told=looks[thorough]: told.append(text),
-        )  # fmt: skip
-    assert any(text.startswith("round 1: from every size") for text in looks[False])
-    assert not any(text.startswith("round 1: the other candidates") for text in looks[False])
-    assert any(text.startswith("round 1: the other candidates") for text in looks[True])
+        options = DiagnosisOptions(bootstraps=100, thorough=thorough)
+        done[thorough] = diagnose(model(), records, FREE, effects=names, options=options)
     tried = {k: [c for c in d.candidates if c.delta_bic is not None] for k, d in done.items()}
     assert len(tried[True]) > len(tried[False])
     assert any("thorough" in note for note in done[False].notes)
     assert not any("thorough" in note for note in done[True].notes)
+
+
+def test_a_budget_ends_the_search_and_what_was_not_tried_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(explore, "FIELD", 4)
+    options = DiagnosisOptions(bootstraps=100, budget=1e-6)
+    found = diagnose(
+        model(), metered("torque", rough), FREE, effects=["lag", "gain", "limit", "deadband"], options=options
+    )
+    assert any("were not refitted" in note for note in found.notes)
+    assert len({line.round for line in found.candidates}) == 1

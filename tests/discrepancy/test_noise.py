@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import SIGMA, TIME, experiments
 
-from hvdc_ident.discrepancy.noise.records import noise_of, without_tone
+from hvdc_ident.discrepancy.record_noise import noise_of, without_tone
 
 
 def test_white_noise_stands_as_given() -> None:

@@ -9,10 +9,10 @@ import pytest
 from cases import experiments
 from refits import beside, plain
 
+from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.options import DiagnosisOptions
-from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, run
-from hvdc_ident.discrepancy.trials.context import SearchContext
-from hvdc_ident.discrepancy.trials.race import Race
+from hvdc_ident.discrepancy.race import Race
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -63,24 +63,13 @@ def test_a_start_given_twice_is_run_once(before: Refit, monkeypatch: pytest.Monk
     assert np.array_equal(one.theta, two.theta)
 
 
-def test_those_that_promise_most_are_admitted_whoever_shares_their_model(before: Refit) -> None:
-    """The promise is where one Gauss-Newton step of all unknowns, without bounds, would come to if the model were linear."""
-    one, other = job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)
-    at = len(before.theta)
-
-    def sized(j: RefitJob, size: float) -> RefitJob:
-        begin = j.begins[0].copy()
-        begin[at] = size
-        return replace(j, begins=(begin,))
-
-    jobs = [*(sized(one, s) for s in (0.2, 0.02, 0.05)), *(sized(other, s) for s in (0.3, 0.05)), sized(one, 0.04)]
-    expected = []
-    for j in jobs:
-        blocks = j.problem.blocks(j.begins[0])
-        r, slopes = np.concatenate([b.residual for b in blocks]), np.vstack([b.jacobian for b in blocks])
-        step = np.linalg.lstsq(slopes / np.linalg.norm(slopes, axis=0), r, rcond=None)[0]
-        expected.append(float(np.sum((r - slopes / np.linalg.norm(slopes, axis=0) @ step) ** 2)))
-    admitted = Race(entrants=2).admitted(SEARCH, jobs, "race")
-    assert admitted == sorted(np.argsort(expected)[:2].tolist())
-    assert {jobs[k].placed[-1].candidate.at for k in admitted} == {("wm",)}
-    assert Race(entrants=6).admitted(SEARCH, jobs, "race") == list(range(6)) == Race().admitted(SEARCH, jobs, "race")
+def test_the_bar_never_goes_back_and_tells_the_best_so_far() -> None:
+    seen: list[tuple[int, int, str]] = []
+    course = Course(lambda done, total, text: seen.append((done, total, text)))
+    for total in (1, 40, 40, 7):
+        for done in range(total + 1):
+            course.step(done, total, "refits")
+        course.lead(f"after {total}", 1.0 / total)
+    assert [d for d, _, _ in seen] == sorted(d for d, _, _ in seen)
+    assert all(0 <= d < t == 100 for d, t, _ in seen)
+    assert seen[0][2] == "refits" and seen[-1][2] == "refits; best so far: after 40, 0.025 times the noise is left"

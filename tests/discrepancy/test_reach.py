@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, experiments, model
+from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import plain
 from scipy.linalg import block_diag
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.scores.inversion import Inversion
-from hvdc_ident.discrepancy.scores.reach import SHARE, reach
-from hvdc_ident.discrepancy.scores.scored import Whitening, runs
+from hvdc_ident.discrepancy.latent import SHARE, Inversion, reach
+from hvdc_ident.discrepancy.scores import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import SignalScales, effects, size_grid
 
@@ -95,3 +94,20 @@ def test_every_size_of_a_closer_look_lies_within_the_bounds_of_its_probe(effect:
     low, high = probe.free[name]
     assert sizes.size > 500 and low <= sizes.min() and sizes.max() <= high
     assert probe.values[name] == sizes[0]
+
+
+def test_the_course_of_what_is_missing_follows_the_hidden_friction() -> None:
+    """A friction that grows with the square of the speed: scipy has it, the drive has not."""
+    data = experiments(drag=lambda w: TRUE["b"] * w + 0.4 * (w - 1.0) ** 2)
+    nominal = plain(data).nominal()
+    found = reach(nominal, runs(model(), nominal), ["drag", "outputs.w", "err"], None)
+    assert found is not None and set(found.curves) <= {"drag", "outputs.w", "err"}
+    time, value = found.curves["drag"]["fit-1"]
+    (first,) = [e for e in data if e.name == "fit-1"]
+    assert first.measured is not None
+    missing = 0.4 * (np.interp(time, first.time, first.measured["w"]) - 1.0) ** 2
+    means = [
+        np.convolve(course, np.ones(15) / 15.0, "valid") for course in (value, missing)
+    ]  # over the noise of single rows
+    assert np.corrcoef(*means)[0, 1] > 0.98
+    assert found.shares["drag"] == pytest.approx(1.0, abs=0.05) and found.shares["outputs.w"] < 0.5

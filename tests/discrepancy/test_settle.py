@@ -9,16 +9,15 @@ import pytest
 from cases import experiments
 from refits import beside, plain
 
+from hvdc_ident.discrepancy import search as searching
+from hvdc_ident.discrepancy.context import Round, SearchContext
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, clear
 from hvdc_ident.discrepancy.options import DiagnosisOptions
-from hvdc_ident.discrepancy.refits.refit import Refit, run
-from hvdc_ident.discrepancy.scores.scored import runs
-from hvdc_ident.discrepancy.search import settle
-from hvdc_ident.discrepancy.search.forward import forward
-from hvdc_ident.discrepancy.search.rounds import one_round
-from hvdc_ident.discrepancy.search.settle import _last, settled
-from hvdc_ident.discrepancy.trials.context import Round, SearchContext
-from hvdc_ident.discrepancy.trials.refit_jobs import job_of
-from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, Ruler, clear
+from hvdc_ident.discrepancy.refit import Refit, run
+from hvdc_ident.discrepancy.refit_jobs import job_of
+from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.scores import runs
+from hvdc_ident.discrepancy.search import _last, forward, settled
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of
@@ -73,7 +72,7 @@ def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest
     search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     begun = one_round(search, first, 1)
     lost = CandidateFit(begun.trials[-1].pick, replace(begun.trials[-1].refit, failure="it does not run"), -np.inf)
-    monkeypatch.setattr(settle, "one_round", lambda *_: replace(begun, trials=begun.trials[:-1], failed=(lost,)))
+    monkeypatch.setattr(searching, "one_round", lambda *_: replace(begun, trials=begun.trials[:-1], failed=(lost,)))
     _, kept, _ = settled(search, first, lagged, [replace(begun, winner=begun.trials[0], trials=())], 1)
     assert kept[0].failed == (lost,)
 
@@ -87,7 +86,7 @@ def test_what_could_not_be_looked_for_again_stays_and_is_told(first: Refit, monk
     def stopped(*_: object) -> Round:
         raise SimulationError("the simulation stopped", got="step-limit")
 
-    monkeypatch.setattr(settle, "one_round", stopped)
+    monkeypatch.setattr(searching, "one_round", stopped)
     here, kept, notes = settled(search, first, lagged, [begun], 1)
     assert [p.candidate.label for p in here.placed] == ["lag at wm"] and kept == [begun]
     assert len(notes) == 1 and "lag at wm" in notes[0] and "step-limit" in notes[0]

@@ -16,17 +16,16 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.refits.refit import Refit, RefitJob, run
-from hvdc_ident.discrepancy.refits.residual_tests import loud_after_breaks
-from hvdc_ident.discrepancy.search.akin import as_late, carried, with_begun
-from hvdc_ident.discrepancy.search.looks import Stand, _twins
-from hvdc_ident.discrepancy.search.rounds import one_round
+from hvdc_ident.discrepancy.context import Course, SearchContext
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, clear
+from hvdc_ident.discrepancy.explore import _neighbours
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.refit_jobs import as_given, job
+from hvdc_ident.discrepancy.refitted import best_each, once_more, refitted
+from hvdc_ident.discrepancy.residual_checks import loud_after_breaks
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.trials.context import SearchContext
-from hvdc_ident.discrepancy.trials.hops import _polished, hopped
-from hvdc_ident.discrepancy.trials.refit_jobs import as_given, job
-from hvdc_ident.discrepancy.trials.refitted import on_bound, once_more, refitted
-from hvdc_ident.discrepancy.trials.select import CandidateFit, Pick, clear
+from hvdc_ident.discrepancy.size_profile import _polished, hopped
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -183,7 +182,8 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     names = {c.effect: k for k, c in enumerate(opened.candidates)}
     late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
     trial = CandidateFit(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
-    begun = [t for t in with_begun(search, opened, [trial], as_late(opened, [trial]), 1) if t is not trial]
+    opened, picks = _neighbours(opened, [trial], [trial], [], set())
+    begun = refitted(search, opened, picks, "neighbours")
     assert {opened.candidates[t.pick.candidate].effect for t in begun} == {"window-mean", "lag"}
     best = min(begun, key=lambda t: t.refit.chi2)
     assert opened.candidates[best.pick.candidate].effect == "window-mean"
@@ -191,7 +191,7 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     assert best.refit.chi2 < late.chi2
 
 
-def test_what_looks_like_a_refit_that_ended_on_a_bound_is_refitted_too() -> None:
+def test_the_same_effect_elsewhere_is_refitted_where_the_best_is_on_a_bound() -> None:
     """A controller that hardly sees its set-point: small, it leaves the trace of feedback times k; large, gains would be off bounds."""
     deaf = apply_effects(
         model(),
@@ -199,19 +199,14 @@ def test_what_looks_like_a_refit_that_ended_on_a_bound_is_refitted_too() -> None
     )
     recorded = answered(deaf, experiments(), seed=0)
     search = SearchContext(("coupling",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    first = plain(recorded)
-    found = one_round(search, first, 1)
-    places = {(c.at, c.source): k for k, c in enumerate(found.candidates)}
+    opened = one_round(search, plain(recorded), 1)
+    places = {(c.at, c.source): k for k, c in enumerate(opened.candidates)}
     seen, told = places[("wm",), "w"], places[("err",), "ref"]
-    opened = replace(found, same={seen: [Pick(told, 0, 1.0, 1.0)]})
     trials = refitted(search, opened, [Pick(seen, 0, 1.0, 1.0)], "the feedback")
-    assert on_bound(trials[0].refit)
-    stand = Stand(search, opened, first.nominal(), 1, (), (), tuple(trials))
-    _, more = _twins(stand).trials
-    assert more.pick.candidate == told
+    opened, picks = _neighbours(opened, trials, trials, [], set())
+    assert told in {p.candidate for p in picks}
+    (more,) = refitted(search, opened, [p for p in picks if p.candidate == told][:1], "the set-point")
     assert more.refit.chi2 < 1.2 * more.refit.rows < trials[0].refit.chi2
-    inside = replace(trials[0], refit=replace(trials[0].refit, theta=more.refit.theta))
-    assert not on_bound(inside.refit) and _twins(replace(stand, trials=(inside,))).trials == (inside,)
 
 
 def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> None:
@@ -240,8 +235,10 @@ def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
     at = {c.at: k for k, c in enumerate(opened.candidates)}
     near = run(beginning(first, "sample-hold", "err", {"Ts": period, "compute": 0.0}))
     near = replace(near, theta=np.array([TRUE["Kp"], TRUE["Ki"], period]))
-    moved = carried(search, opened, [CandidateFit(Pick(at[("err",)], 0, 1.0, 0.0), near, 0.0)], 1)
-    best = {opened.candidates[t.pick.candidate].at: t.refit for t in moved}
+    lead = CandidateFit(Pick(at[("err",)], 0, 1.0, 0.0), near, 0.0)
+    opened, picks = _neighbours(opened, [lead], [lead], [], set())
+    moved = refitted(search, opened, picks, "neighbours")
+    best = {opened.candidates[t.pick.candidate].at: t.refit for t in best_each(moved)}
     assert set(best) == {("wm",), ("ref",)}
     assert best[("wm",)].chi2 < 1.2 * best[("wm",)].rows < near.chi2
 
@@ -252,7 +249,7 @@ def test_of_one_effect_the_best_is_looked_for_again_first(least: float, places: 
     looks: list[str] = []
     search = SearchContext(
         ("sample-hold",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0,
-        progress=lambda _done, _total, text: looks.append(text),
+        course=Course(lambda _done, _total, text: looks.append(text.partition(";")[0])),
     )  # fmt: skip
     first = plain(records(sampled))
     opened = replace(one_round(search, first, 1), trials=())

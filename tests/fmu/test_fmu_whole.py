@@ -128,7 +128,7 @@ def test_the_page_has_every_stage_and_its_figures(whole):
     assert {"Gains", "Error before and after", "Provenance"} <= set(sections)
     for words in (
         "From perfect data of these signals every candidate could be told (numerical, local)",
-        "lag at y",
+        "y of the plant follows that of the model with a first-order lag",
         "The model is closed inside",
         "the gap shrinks by",
         "differs from central differences by",

@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hvdc_ident.cli import app
+from hvdc_ident.discrepancy.context import slot_signals
 from hvdc_ident.discrepancy.signatures.response import along
-from hvdc_ident.discrepancy.trials.context import slot_signals
 from hvdc_ident.fit.noise_model import autoregression
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.study import load_study

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.formula import Law, filled, labelled
 from hvdc_ident.discrepancy.outside.filtered import shape, transfer_function
-from hvdc_ident.discrepancy.outside.hidden import Regression, over_signal, over_time, regression
-from hvdc_ident.discrepancy.outside.law import STABLE, law
-from hvdc_ident.discrepancy.refits.refit import Refit
-from hvdc_ident.discrepancy.scores.scored import Path
+from hvdc_ident.discrepancy.outside.law import STABLE, Regression, law, over_signal, over_time, regression
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.signatures.candidates import kind_of, source_signals
-from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.trials.formula import Law, filled, labelled
 from hvdc_ident.effects import effects
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap

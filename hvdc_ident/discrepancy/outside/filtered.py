@@ -13,15 +13,15 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.evidence import CandidateFit, best_of
+from hvdc_ident.discrepancy.formula import Law
+from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.outside.law import standing
-from hvdc_ident.discrepancy.refits.nominal import Nominal
-from hvdc_ident.discrepancy.refits.refit import Refit
-from hvdc_ident.discrepancy.scores.scored import scored
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.refitted import refitted
+from hvdc_ident.discrepancy.scores import scored
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect, candidates
-from hvdc_ident.discrepancy.trials.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.trials.formula import Law
-from hvdc_ident.discrepancy.trials.refitted import refitted
-from hvdc_ident.discrepancy.trials.select import CandidateFit, best_of
 from hvdc_ident.immutable import FrozenMap
 
 BESIDES = ("low", "high")

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 MOST = 12
 SHOWN = 5e-3
 """A smaller share of the gap is none."""
+PLACES = 4
+"""Likely places that are shown of each effect."""
 CHANNELS = 3
 """Channels that are drawn, those in which the record tells most frequencies: more would be too small to read."""
 
@@ -31,6 +33,7 @@ def _render(results: Results) -> str:
     parts = [
         _lead(found),
         _effects(found),
+        _findings(found),
         _curve(found),
         _sets(found),
         _gap(found, units),
@@ -68,6 +71,24 @@ def _effects(found: dict[str, Any]) -> str:
         among = f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
         lines.append(f"<li>{text(str(e.get('text', '')).rstrip('.'))}: {'; '.join(sizes)}. {among}</li>")
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
+
+
+def _findings(found: dict[str, Any]) -> str:
+    """What is missing apart from where, with probabilities, where more than one effect or place is likely."""
+    rows = []
+    for f in found.get("findings") or []:
+        delay = f.get("equivalent_delay") or {}
+        likely = f["places"][:PLACES]
+        where = "; ".join(f"{', '.join(p['at'])} ({p['probability']:.0%})" for p in likely)
+        where += f"; and {len(f['places']) - PLACES} more" if len(f["places"]) > PLACES else ""
+        value = delay.get("value")
+        late = "" if value is None else number(1e3 * value, 3)
+        rows.append([text(", ".join(f["same_as"])), text(f"{f['probability']:.0%}"), text(where), late])
+    if not rows or (len(rows) == 1 and len(found["findings"][0]["places"]) < 2):
+        return ""
+    return "<h3>What may be missing, and where</h3>" + table(
+        ["effect", "probability", "likely at", "delay, ms"], rows, words=(0, 1, 2)
+    )
 
 
 def _sets(found: dict[str, Any]) -> str:

@@ -36,7 +36,8 @@ class StageOptions:
     announce: who is told, in lines, what to know before the work begins, or while a long one goes on.
     keep: who writes a first answer, so that it stands where the work is interrupted; the stage runner sets it.
     force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
-    None: nothing is kept. executor: where the work is done, "" for this machine.
+    None: nothing is kept. executor: where the work is done, "" for this machine. budget: seconds after which a search that can
+    answer at any time begins nothing further; None: as the study says.
     """
 
     workers: int = 1
@@ -45,6 +46,7 @@ class StageOptions:
     force: tuple[str, ...] = ()
     folder: Path | None = None
     executor: str = ""
+    budget: float | None = None
     announce: Callable[[Sequence[str]], None] = unheard
     keep: Callable[[Mapping[str, Any]], None] = unkept
 

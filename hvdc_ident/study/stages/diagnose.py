@@ -22,7 +22,7 @@ class NothingIdentified(ComputationError):
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
-    from hvdc_ident.discrepancy.findings.sizes import size_curves
+    from hvdc_ident.discrepancy.size_curves import size_curves
     from hvdc_ident.model import Model
     from hvdc_ident.study.pipeline import executor_of
 
@@ -33,7 +33,9 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         return StageResult({"status": "failed", "message": why}, failed=why)
     with executor_of(study, options, "diagnose") as executor:
         try:
-            found = diagnosed(study, report, seed=options.seed, executor=executor, progress=options.progress)
+            found = diagnosed(
+                study, report, seed=options.seed, budget=options.budget, executor=executor, progress=options.progress
+            )
         except NothingIdentified as e:
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
@@ -53,10 +55,11 @@ def diagnosed(
     report: Mapping[str, Any],
     *,
     seed: int = 0,
+    budget: float | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Return the diagnosis of the study's model. report: on its candidates, as its `to_dict`.
+    """Return the diagnosis of the study's model. report: on its candidates, as its `to_dict`. budget: seconds, instead of the study's.
 
     Raises StudyError where it lacks data or candidates, NothingIdentified where the report leaves no parameter to be fitted.
     """
@@ -76,9 +79,9 @@ def diagnosed(
         study.experiments,
         tuple(study.candidates.values()),
         effects="all" if asked.effects == "all" else list(asked.effects),
-        material=asked.material,
+        tolerance=asked.tolerances,
         report=report,
-        options=DiagnosisOptions(most=asked.most, thorough=asked.thorough),
+        options=DiagnosisOptions(most=asked.most, thorough=asked.thorough, budget=budget or asked.budget),
         seed=seed,
         executor=executor,
         progress=progress,
@@ -94,7 +97,10 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The verdict, what is missing, what it changes, and what to measure to be sure."""
     if "verdict" not in data:
         return [str(data.get("message", ""))]
-    lines = [f"{data['verdict']}: {data['text']}", *(e["text"] + "." for e in data["effects"])]
+    lines = [f"{data['verdict']}: {data['text']}"]
+    findings = data.get("findings") or []
+    if data["verdict"] != "named" and data["effects"]:
+        lines += [f"Probability {f['probability']:.0%}: {f['text']}" for f in findings]
     pooled = data["gap"]["pooled"]
     shown = [
         f"{n} {pooled[n]['fit']:.3g}" for n in ("nominal", "refitted", "augmented") if pooled[n]["fit"] is not None
@@ -125,6 +131,7 @@ STAGE = Stage(
     wanted=lambda study: study.settings.diagnose is not None,
     order=50,
     after=("identify", "fit"),
+    takes=("budget",),
     tell=lines_of,
     searches=True,
 )

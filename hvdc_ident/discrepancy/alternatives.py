@@ -1,0 +1,84 @@
+"""Alternatives to a named effect outside the catalogue: powers, magnitudes and products of signals at its slot, a notch,
+a resonance.
+
+A saturation bends by the third order, a coupling is a product at its operating point: whoever has only the catalogue's
+name for it takes a form for told that the data do not tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.evidence import CandidateFit
+from hvdc_ident.discrepancy.formula import Term, at_run, formula_job, terms
+from hvdc_ident.discrepancy.outside.filtered import filters
+from hvdc_ident.discrepancy.outside.law import regression
+from hvdc_ident.discrepancy.race import done
+from hvdc_ident.discrepancy.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.refitted import PRICE
+from hvdc_ident.discrepancy.rounds import gained
+from hvdc_ident.discrepancy.scores import Path
+from hvdc_ident.discrepancy.signatures.candidates import additive, source_signals
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import ModelError
+from hvdc_ident.model import Model
+
+TRIED = 6
+"""Formulas, the best by regression, that are refitted."""
+
+
+def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
+    """The refits of forms outside the catalogue in the winner's stead; those that failed are left out.
+
+    Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
+    winner's pick. No formula of signals at one time is a delay: for one kind of these or another filters, wherever they are.
+    """
+    winner = found.winner
+    assert winner is not None and found.ruler is not None
+    placed = winner.refit.placed[-1]
+    effect = effects()[placed.candidate.effect]
+    if effect.equivalent_delay is not None and not effect.needs_grid:
+        tried = filters(search, found, found.before.nominal()) if found.filters is None else found.filters
+        return tuple(gained(t, found.before, found.ruler) for t in tried)
+    # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
+    remembers = effect.states != "none" and not effect.needs_source
+    if remembers or effect.needs_grid or additive(effect):
+        return ()
+    if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
+        return ()
+    jobs = _jobs(found, placed.candidate.at[0], placed.candidate.source)
+    texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
+    refits = [r for r in done(search, jobs, texts) if not r.failure]
+    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits)
+
+
+def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
+    """The formulas that by regression leave least for what their coefficients cost."""
+    paths = found.answers()
+    library, formulas = _formulas(found.before, paths, place.removeprefix("outputs."), source)
+    regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
+    ranked = []
+    for formula in formulas:
+        coefficients, gain = regressed.solved(formula)
+        if coefficients.all():
+            ranked.append((gain - PRICE * len(formula), [library[k] for k in formula], coefficients))
+    ranked.sort(key=lambda r: -r[0])
+    jobs = []
+    for _, chosen, coefficients in ranked[:TRIED]:
+        try:
+            jobs.append(formula_job(found.before, place, chosen, coefficients))
+        except ModelError:  # a formula that would close a loop through itself is none of this model
+            continue
+    return jobs
+
+
+def _formulas(
+    before: Refit, paths: Mapping[str, Path], own: str, source: str
+) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
+    """A library, the slot's own signal first in it, and formulas as places in that: powers, magnitudes and products of the
+    signal with what is brought in, or with any; each also beside a gain."""
+    others = (source,) if source else source_signals(before.model, slot_signals(before.model, paths))
+    library = terms([own, *(s for s in others if s != own)])
+    near = [k for k, t in enumerate(library) if t.form != "x" and (own in t.signals or source in t.signals)]
+    return library, [*((k,) for k in near), *((k, 0) for k in near)]

@@ -1,0 +1,298 @@
+"""Which candidates explain the data as well as the one that was put in, and what would tell them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.discrepancy.context import Round
+from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
+from hvdc_ident.discrepancy.explain import advice
+from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.refit import Refit, unseen
+from hvdc_ident.discrepancy.result import EffectSize, Finding, Hypothesis, Place, Rival
+from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
+from hvdc_ident.effects import effects, split_sources
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed, quantity
+
+NEEDED = 4.0
+"""Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
+SLIGHT = 1e-3
+"""Share of what a form explains by which a formula may explain more and not refute it: of so much the noise is not known."""
+MISSED = 0.15
+"""Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
+
+
+def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
+    """The winner and every candidate within delta BIC of it, the best first, and those that are the same equation.
+
+    tries: whether an effect is one of those that are looked for.
+    """
+    assert found.winner is not None and found.ruler is not None
+    behind_by = behinds(found.trials)
+    # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
+    sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
+    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
+    alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
+    group: list[Rival] = []
+    for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
+        c = found.candidates[trial.pick.candidate]
+        one_more = trial.refit.count - found.winner.refit.count == 1
+        spared = one_more and (not alone or _as_likely(found, c, options))
+        if not good or behind > options.set_bic + (found.ruler.price if spared else 0.0):
+            continue
+        sizes = trial.refit.sizes(trial.refit.placed[-1])
+        group.append(Rival(c.effect, c.at, behind, FrozenMap(sizes), c.source))
+    group += _unfitted(found, best_gain(found.trials), options)
+    group += _at_rest(found, group)
+    group += _equal(found, group, tries)
+    each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
+    same: dict[tuple[str, tuple[str, ...], str], str] = {}
+    for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
+        each.setdefault((r.effect, r.at, r.source), r)
+        if r.same_as:
+            same[r.effect, r.at, r.source] = r.same_as
+    return tuple(replace(r, same_as=same.get(key, "")) for key, r in each.items())
+
+
+def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
+    """Return True where a form with one more parameter stays possible though the winner is alone: at the same place, where the
+    data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
+    """
+    assert found.winner is not None and found.ruler is not None
+    best = found.candidates[found.winner.pick.candidate]
+    one, two = effects()[best.effect], effects()[other.effect]
+    weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
+    delays = one.equivalent_delay is not None and two.equivalent_delay is not None and one.name not in two.generalises
+    return other.at == best.at and (weak or delays)
+
+
+def formula_rivals(
+    found: Round, formulas: Sequence[CandidateFit], options: DiagnosisOptions
+) -> tuple[float, tuple[Rival, ...]]:
+    """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
+    where one is further ahead than they can be told apart.
+
+    formulas: refitted in the winner's stead. One that explains as much with a parameter more, and would not without any of
+    its own, is not refuted by the price of that, which is not counted then: of a product around its operating point a gain
+    makes a coupling.
+    """
+    assert found.winner is not None and found.ruler is not None
+    own, *behind = behinds([found.winner, *formulas])
+    within = max(options.set_bic, SLIGHT * found.winner.told)
+    if own > within:
+        return np.inf, ()
+    near = []
+    for b, t in zip(behind, formulas, strict=True):
+        one_more = t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit)
+        short = max(b - found.ruler.price, 0.0) if one_more else b
+        if short <= within:
+            near.append(_rival(t, short))
+    return own, tuple(sorted(near, key=lambda r: r.delta_bic))
+
+
+def _all_needed(refit: Refit) -> bool:
+    """Return True where every parameter of the last effect is clearly off 0."""
+    sizes, names = refit.sizes(refit.placed[-1]), refit.placed[-1].names
+    stds = {n: refit.std.get(names[n]) for n in sizes}
+    return all(std is not None and abs(sizes[n]) > NEEDED * std for n, std in stds.items())
+
+
+def _rival(trial: CandidateFit, behind: float) -> Rival:
+    placed = trial.refit.placed[-1]
+    c, sizes = placed.candidate, FrozenMap(trial.refit.sizes(placed))
+    return Rival(c.effect, c.at, behind, sizes, c.source, expression=placed.use.expression)
+
+
+def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Rival]:
+    """Candidates that were not refitted but, being linear in their size, gain what their score says."""
+    assert found.ruler is not None
+    done = {t.pick.candidate for t in (*found.trials, *found.failed)}
+    group = []
+    for p in best_of(found.scores, found.candidates):
+        c = found.candidates[p.candidate]
+        if p.candidate in done or not is_linear(kind_of(c, p.probe)):
+            continue
+        probe = c.probes[p.probe]
+        behind = best - found.ruler.gain(p.score, 0.0, len(probe.free))
+        if behind <= options.set_bic:
+            only = dict(probe.values) if len(probe.free) == 1 else {}
+            sizes = FrozenMap({n: p.factor * v if n in probe.free else v for n, v in only.items()})
+            group.append(Rival(c.effect, c.at, max(behind, 0.0), sizes, c.source, refitted=False))
+    return group
+
+
+def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
+    """Nonlinear effects at a signal that never moves: they act as a gain there and have no signature of their own.
+
+    A limit, a saturation and a deadband take away; levels may add too.
+    """
+    gains = {r.at: r for r in group if r.effect == "gain"}
+    likes: list[Rival] = []
+    for c in found.candidates:
+        entry, gain = effects()[c.effect], gains.get(c.at)
+        bends = c.still and entry.equivalent_delay is None and entry.states == "none" and not entry.needs_source
+        if gain is not None and bends and (entry.needs_grid or gain.parameters.get("k", 0.0) < 1.0):
+            likes.append(Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False, same_as="gain"))
+    return likes
+
+
+def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -> list[Rival]:
+    """The effects that are the same equation as one of the group at its place, under their own names."""
+    known = [
+        (r, other, equality) for r in group for other, equality in effects()[r.effect].equals.items() if tries(other)
+    ]
+    paths = found.answers().values() if known else ()
+    equal = []
+    for r, other, equality in known:
+        brought = [p.signal(s) for p in paths for s in split_sources(r.source, r.at) if s in p.slots] or [np.empty(0)]
+        told = [equality(r.parameters, signal) if r.parameters or not r.refitted else None for signal in brought]
+        if all(t is not None for t in told):
+            values = FrozenMap(told[0] or {})
+            equal.append(Rival(other, r.at, r.delta_bic, values, r.source, refitted=False, same_as=r.effect))
+    return equal
+
+
+def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:
+    """For each set with more than one member what would tell them apart, in words; empty where there is none."""
+    texts = []
+    for group in groups:
+        if len(group) > 1:
+            first = group[0]
+            told = advice(first.effect, [(r.effect, r.at) for r in group[1:]], first.at, recorded)
+            if told:
+                texts.append(told)
+    return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}
+
+
+CERTAIN = 0.95
+"""Probability of an effect class from which it is named."""
+LIKELY = 0.05
+"""Probability, given its class, from which a place is told, and its size counts for the class's interval."""
+TOLD = 20
+"""Hypotheses that are told, the likeliest."""
+SHARED = ("s", "rad/s", "Hz", "")
+"""Units of parameters that mean the same at every place."""
+
+
+@dataclass(frozen=True)
+class EffectClass:
+    """Hypotheses that are one effect. names: the effects that are the same equation, the likeliest first; probability: of all
+    members together; members: the hypotheses, the likeliest first, with their probabilities."""
+
+    names: tuple[str, ...]
+    probability: float
+    members: tuple[tuple[Rival, float], ...]
+
+
+def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
+    """The classes of an ambiguity set, the likeliest first. Evidence is exp(-delta BIC/2), every hypothesis as likely before."""
+    parent = {r.effect: r.effect for r in group} | {r.same_as: r.same_as for r in group if r.same_as}
+
+    def root(name: str) -> str:
+        while parent[name] != name:
+            name = parent[name]
+        return name
+
+    for r in group:
+        if r.same_as:
+            parent[root(r.effect)] = root(r.same_as)
+    # One hypothesis under two names is one hypothesis.
+    weights = [0.0 if r.same_as and not r.refitted else float(np.exp(-0.5 * r.delta_bic)) for r in group]
+    total = sum(weights)
+    found: dict[str, list[tuple[Rival, float]]] = {}
+    for r, w in zip(group, weights, strict=True):
+        found.setdefault(root(r.effect), []).append((r, w / total))
+    each = []
+    for members in found.values():
+        ordered = sorted(members, key=lambda m: (-m[1], m[0].delta_bic))
+        names = tuple(dict.fromkeys(r.effect for r, _ in ordered))
+        each.append(EffectClass(names, sum(p for _, p in members), tuple(ordered)))
+    return tuple(sorted(each, key=lambda c: -c.probability))
+
+
+def likely(each: Sequence[EffectClass]) -> list[EffectClass]:
+    """The likeliest classes, as many as hold 95 % together."""
+    total = np.cumsum([0.0, *(c.probability for c in each)])
+    return [c for c, before in zip(each, total, strict=False) if before < CERTAIN]
+
+
+def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
+    """Every hypothesis that was refitted, the likeliest first, on the scale of the best model's noise."""
+    refits: dict[tuple[str, ...], Refit] = {(): first}
+    for r in outcome.rounds:
+        refits |= {tuple(p.candidate.label for p in t.refit.placed): t.refit for t in r.trials}
+    refits[tuple(p.candidate.label for p in outcome.refit.placed)] = outcome.refit
+    ruler = Ruler.of(min(refits.values(), key=lambda refit: refit.chi2))
+    own = len(first.problem.free)
+    evidence = {
+        k: 0.5 * evidence_between(first, refit, ruler, len(refit.problem.free) - own) for k, refit in refits.items()
+    }
+    most = max(evidence.values())
+    total = sum(np.exp(v - most) for v in evidence.values())
+    order = sorted(evidence, key=lambda k: -evidence[k])[:TOLD]
+    return tuple(
+        Hypothesis(k, evidence[k], unseen(refits[k]), float(np.exp(evidence[k] - most) / total)) for k in order
+    )
+
+
+def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
+    """The class as it is told. sentence: what the likeliest member does."""
+    best = one.members[0][0]
+    refits = {_key_of(t.refit): t.refit for t in found.trials}
+    likely = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
+    parameters = {}
+    for n, q in effects()[best.effect].parameters.items():
+        if n not in best.parameters or (q.optional and best.parameters[n] == q.neutral):
+            continue
+        same = [r for r, _ in likely if r.effect == best.effect and (q.unit in SHARED or r is best)]
+        spans = [s for r in same if (s := _span(refits.get((r.effect, r.at, r.source)), n)) is not None]
+        interval = (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None
+        parameters[n] = EffectSize(best.parameters[n], interval, q.unit)
+    by_place: dict[tuple[tuple[str, ...], str], float] = {}
+    for r, p in likely:
+        by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
+    places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
+    delays = [late for r, _ in likely if (late := r.late) is not None]
+    delay = (min(delays), max(delays)) if delays else None
+    sentence = sentence or f"{best.effect} at {listed(best.at)}"
+    return Finding(
+        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, places),
+        None if best.late is None else EffectSize(best.late, delay, "s"),
+    )  # fmt: skip
+
+
+def _key_of(refit: Refit) -> tuple[str, tuple[str, ...], str]:
+    candidate = refit.placed[-1].candidate
+    return candidate.effect, candidate.at, candidate.source
+
+
+def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
+    """The 95 % interval of a parameter of the refit's last effect; None where it is not known."""
+    if refit is None:
+        return None
+    placed = refit.placed[-1]
+    std, value = refit.std.get(placed.names.get(name, "")), refit.sizes(placed).get(name)
+    if std is None or value is None:
+        return None
+    q = effects()[placed.candidate.effect].parameters[name]
+    return max(value - 1.96 * std, q.min), min(value + 1.96 * std, q.max)
+
+
+def _text(sentence: str, parameters: dict[str, EffectSize], places: Sequence[Place]) -> str:
+    """The sentence with the first parameter's interval, and the other places where it may be."""
+    size = next(iter(parameters.values()), None)
+    if size is not None and size.ci95 is not None and None not in size.ci95:
+        low, high = (quantity(v, size.unit) for v in size.ci95 if v is not None)
+        sentence = f"{sentence} (95 %: {low} to {high})"
+    others = [listed(p.at) for p in places[1:]]
+    if not others:
+        return f"{sentence}."
+    shown = listed(others[:4]) if len(others) <= 4 else f"{', '.join(others[:4])} or one of {len(others) - 4} more"
+    return f"{sentence}; the records do not tell this place from {shown}."

@@ -1,0 +1,260 @@
+"""Refits of candidates compared: the scale of BIC, what each gains, and whether its effect is clearly there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.refit import Refit, held_out, held_out_by_record, unseen
+from hvdc_ident.discrepancy.scores import Scores
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.effects import effects
+
+CLEARLY = 30.0
+"""In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say."""
+CLEAR = 2.0
+"""Standard deviations by which an effect has to be off doing nothing."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A candidate to refit: its best probe, the size asked for in units of the probe's, and its score.
+
+    gains: unknowns of the model before that go with this size, where they are known. fall: by how much chi2 is expected to fall.
+    """
+
+    candidate: int
+    probe: int
+    factor: float
+    score: float
+    gains: tuple[float, ...] = ()
+    fall: float = 0.0
+
+
+@dataclass(frozen=True)
+class CandidateFit:
+    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC).
+
+    evidence: the same with what it brings on the held-out data, where that is known.
+    """
+
+    pick: Pick
+    refit: Refit
+    gain: float
+    evidence: float | None = None
+
+    @property
+    def told(self) -> float:
+        """Evidence of all data for it, as far as that is known, in BIC."""
+        return self.gain if self.evidence is None else self.evidence
+
+
+def behinds(trials: Sequence[CandidateFit]) -> list[float]:
+    """By how much each is behind the best, in BIC: on all data together; or on the fitted ones, where that is less and the
+    held-out ones do not speak clearly against it, for a difference of a few units there is not known better than the noise.
+
+    On the fitted ones the best is the best of those that the held-out ones do not speak clearly against either.
+    """
+    told, gain = max((t.told for t in trials), default=0.0), best_gain(trials)
+    return [min(gain - t.gain, told - t.told) if told - t.told < CLEARLY else told - t.told for t in trials]
+
+
+def best_gain(trials: Sequence[CandidateFit]) -> float:
+    """The largest gain of those that the held-out data do not speak clearly against."""
+    told = max((t.told for t in trials), default=0.0)
+    return max((t.gain for t in trials if told - t.told < CLEARLY), default=0.0)
+
+
+def best_of(scores: Scores, found: Sequence[CandidateEffect]) -> tuple[Pick, ...]:
+    """Each candidate at its best size, by falling score."""
+    t, expected = scores.t, scores.expected
+    best: dict[int, int] = {}
+    for k, column in enumerate(scores.columns):
+        c = column.candidate
+        if t[k] > 0 and (c not in best or t[k] > t[best[c]]):
+            best[c] = k
+    picks = [
+        # The size of an effect that is scanned is met or it is not.
+        Pick(
+            c,
+            scores.columns[k].probe,
+            1.0 if effects()[found[c].effect].needs_grid else float(expected[k]),
+            float(t[k]),
+        )
+        for c, k in best.items()
+    ]
+    # Of equal scores the simpler: fewer places first, as listed.
+    return tuple(sorted(picks, key=lambda p: (-round(p.score, 6), len(found[p.candidate].at), p.candidate)))
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """Scale of BIC. effective: independent residuals; scale: how much larger than noise they are in the best model."""
+
+    rows: int
+    effective: float
+    scale: float
+
+    @classmethod
+    def of(cls, best: Refit) -> Ruler:
+        """From the best model found, whose residuals are nearest to noise."""
+        return cls(best.rows, best.effective, max(best.chi2 / best.rows, 1.0))
+
+    def gain(self, before: float, after: float, more: int) -> float:
+        """The fall of BIC from one chi2 to another with `more` parameters more."""
+        share = self.effective / self.rows
+        return (before - after) * share / self.scale - more * self.price
+
+    @property
+    def price(self) -> float:
+        """Price of one more parameter, in BIC."""
+        return float(np.log(self.effective))
+
+
+def clear(refit: Refit, which: int) -> bool:
+    """Return True where the parameters of an effect together are clearly off neutral."""
+    return refit.apart[which] > CLEAR
+
+
+def at_edge(refit: Refit, which: int) -> bool:
+    """Return True where the effect's size stands on the bound next to neutral: it is not there."""
+    placed = refit.placed[which]
+    entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
+    switches = [n for n, q in entry.parameters.items() if q.neutral is not None and n in placed.bounds]
+    edges = []
+    for n in switches:
+        low, high = placed.bounds[n]
+        neutral = entry.parameters[n].neutral
+        if isinstance(neutral, str):
+            edges.append(sizes[n] == sizes[neutral])
+        else:
+            edges.append(
+                (neutral is not None and neutral <= low and sizes[n] <= low)
+                or (np.isinf(neutral or 0.0) and sizes[n] >= high)
+            )
+    return bool(edges) and all(edges)
+
+
+def material_gap(
+    before: float | None, after: float | None, share: float, bands: Mapping[str, float] | None,
+    tables: tuple[Mapping[str, float], Mapping[str, float]] | None,
+) -> bool:  # fmt: skip
+    """Return True where the fall from before to after (pooled, noise units; or by output where bands are given) is of interest."""
+    if bands and tables:
+        first, second = tables
+        return any(first[o] > band and first[o] - second[o] > share * band for o, band in bands.items() if o in first)
+    return before is not None and after is not None and before - after > share
+
+
+AGREED = 10.0
+"""By how much chi2 of the held-out data has to fall for them to agree, or to rise for them to speak against an effect."""
+SILENT = 30.0
+"""Squared difference of held-out answers, in noise units, below which those data cannot judge an effect."""
+STEP = 0.05
+"""Share of the gap that a second effect has to take away at least."""
+
+
+def objections(
+    before: Refit,
+    trial: CandidateFit,
+    p: float,
+    options: DiagnosisOptions,
+    tolerance: Mapping[str, float],
+    *,
+    first: bool,
+) -> str:
+    """Objection to naming a trial's effect, in words; empty where there is none.
+
+    before: the model without it; p: the chance of its score under noise; tolerance: by output, what error is of interest.
+    """
+    refit = trial.refit
+    last = len(refit.placed) - 1
+    if p > options.significance:
+        return f"its score is what noise gives somewhere (p = {p:.2g})"
+    if not trial.gain > options.named_bic:
+        return f"it gains {trial.gain:.3g} in BIC, {options.named_bic:g} would be needed"
+    if at_edge(refit, last) or not clear(refit, last):
+        return "its size cannot be told from nothing"
+    was, now = unseen(before), unseen(refit)
+    if was is None or now is None:
+        return "nothing can be left out to judge it by"
+    # Records that an effect does not move are better or worse by the noise they hold.
+    if not now < was and ((now**2 - was**2) * unseen_rows(refit) > AGREED or not silent(before, refit)):
+        pooled = f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
+        return speaks_against(before, refit) or pooled
+    tables = (worst(before), worst(refit)) if tolerance else None
+    fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))
+    if not material_gap(was, now, options.holdout_share, tolerance, tables):
+        # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
+        # nothing to say, and the fitted ones show the size. Whitening hides a slow gap in slow noise, so the records as
+        # they are may show it too.
+        then, since = as_recorded(before), as_recorded(refit)
+        gaps = (fitted, *((then.get(role), since.get(role)) for role in ("fit", "holdout")))
+        shown = not tolerance and any(material_gap(*gap, options.holdout_share, None, None) for gap in gaps)
+        if not (shown and ((was**2 - now**2) * unseen_rows(refit) > AGREED or silent(before, refit))):
+            return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
+    if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
+        return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
+    return ""
+
+
+def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> float:
+    """Return the evidence of one model over another in BIC: of the fitted data, and of the held-out ones where they are known.
+
+    more: parameters that the second has more.
+    """
+    fitted = ruler.gain(before.chi2, after.chi2, more)
+    was, now = unseen(before), unseen(after)
+    if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
+        return fitted
+    share = ruler.effective / ruler.rows / ruler.scale
+    return fitted + share * (was**2 - now**2) * unseen_rows(after)
+
+
+def speaks_against(before: Refit, after: Refit) -> str:
+    """Return in words which held-out record an effect makes worse most, with what is left there; empty where none is held out."""
+    was, now = held_out_by_record(before), held_out_by_record(after)
+    worse = {name: value for name, value in now.items() if name in was and value > was[name]}
+    if not worse:
+        return ""
+    name = max(worse, key=lambda n: worse[n] ** 2 - was[n] ** 2)
+    return f"the held-out record '{name}' speaks against it: {now[name]:.3g} times the noise with it, {was[name]:.3g} without"
+
+
+def unseen_rows(refit: Refit) -> int:
+    """Rows of the data that judge: the held-out ones, or all of the fitted ones, each left out in turn."""
+    held = [e for e in refit.problem.experiments if e.role == "holdout" and e.outputs]
+    return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows
+
+
+def silent(before: Refit, after: Refit) -> bool:
+    """Return True where the held-out experiments would look the same with the effect and without."""
+    one, two = (held_out(r.problem, r.theta) for r in (before, after))
+    if not one or not two:
+        return False
+    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < SILENT
+
+
+def as_recorded(refit: Refit) -> dict[str, float]:
+    """By role of the experiments their misfit in standard deviations of the noise, pooled and not whitened."""
+    roles = {e.name: e.role for e in refit.problem.experiments}
+    squares: dict[str, list[float]] = {}
+    for output, row in refit.problem.rmse(refit.theta).items():
+        std = refit.noise[output].std
+        for name, rmse in row.items():
+            if rmse is not None and std:
+                squares.setdefault(roles[name], []).append((rmse / std) ** 2)
+    return {role: float(np.sqrt(np.mean(found))) for role, found in squares.items()}
+
+
+def worst(refit: Refit) -> dict[str, float]:
+    """The largest RMSE of each output over all experiments, in its unit."""
+    found: dict[str, float] = {}
+    for output, row in refit.problem.rmse(refit.theta).items():
+        known = [v for v in row.values() if v is not None]
+        if known:
+            found[output] = max(known)
+    return found

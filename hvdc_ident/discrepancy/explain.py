@@ -1,0 +1,166 @@
+"""Effects in words, with their sizes and intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.placed import Placed
+from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
+from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Table
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit import Problem
+from hvdc_ident.fit.uncertainty import uncertainty
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed, quantity
+
+MOST_PLACES = 4
+"""Signals at most that are asked for."""
+
+
+def found_of(refit: Refit, placed: Placed, chosen_from: int) -> FoundEffect:
+    """An effect of the refitted model with its sizes, their 95 % intervals, and its sentence."""
+    entry = effects()[placed.candidate.effect]
+    sizes = refit.sizes(placed)
+    shown = {}
+    for n, q in entry.parameters.items():
+        if n in sizes and not (q.optional and sizes[n] == q.neutral):
+            std = refit.std.get(placed.names.get(n, ""))
+            interval = None if std is None else _within(sizes[n] - 1.96 * std, sizes[n] + 1.96 * std, q.min, q.max)
+            shown[n] = EffectSize(sizes[n], interval, q.unit)
+    return FoundEffect(
+        placed.candidate.effect, placed.candidate.at, FrozenMap(shown), sentence(placed, sizes), chosen_from,
+        placed.candidate.source,
+    )  # fmt: skip
+
+
+def _within(low: float, high: float, least: float, most: float) -> tuple[float, float]:
+    return max(low, least), min(high, most)
+
+
+def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
+    """The effect's sentence from the catalogue, filled in."""
+    entry = effects()[placed.candidate.effect]
+    units = {n: q.unit for n, q in entry.parameters.items()}
+    words = {n: quantity(v, units.get(n, "")) for n, v in sizes.items()}
+    at = placed.candidate.at
+    own = dict.fromkeys(placed.candidate.sources)
+    brought = f"its own of {listed(tuple(own))}" if len(own) > 1 else placed.candidate.source
+    words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought}
+    if (late := entry.delay_with(sizes)) is not None:
+        words["equivalent_delay"] = quantity(late, "s")
+    text = entry.sentence
+    for name, value in words.items():
+        text = text.replace("{" + name + "}", value)
+    return text[:1].upper() + text[1:] if text and not text.startswith(at[0]) else text
+
+
+def advice(
+    first: str, others: list[tuple[str, tuple[str, ...]]], at: tuple[str, ...], recorded: Collection[str] = ()
+) -> str:
+    """Experiment or record that would tell the members of an ambiguity set apart, in words; nothing already recorded."""
+    entry = effects()[first]
+    parts = []
+    for name in dict.fromkeys(n for n, _ in others if n != first):
+        told = entry.confusable.get(name) or effects()[name].confusable.get(first)
+        parts.append(f"{first} or {name}: {told or f'{entry.excited_by}; {effects()[name].excited_by}'}")
+    wanted = [at[0]]  # a signal of each place that is not of the others
+    for name, place in others:
+        own = [p for p in place if p not in at] or [p for p in at if p not in place]
+        if name == first and own and own[0] not in wanted and len(wanted) < MOST_PLACES:
+            wanted.append(own[0])
+    if len(wanted) > 1:
+        wanted = list(dict.fromkeys(p.removeprefix("outputs.") for p in wanted))
+        missing = [p for p in wanted if p not in recorded]
+        record = f"record {listed(missing)} as well, and " if missing else ""
+        parts.append(f"{record}step what acts on one side of {listed(wanted)} and not on the other")
+    return "; ".join(parts)
+
+
+def gap(given: Refit, refitted: Refit, augmented: Refit) -> Gap:
+    """RMSE by output and experiment of the model with the given gains, refitted, and with the effects."""
+    tables = [_tables(r.problem, r.theta) for r in (given, refitted, augmented)]
+    pooled: dict[str, Mapping[str, float | None]] = {
+        name: {"fit": _pooled(r.problem, r.theta), "holdout": unseen(r) if name != "nominal" else _held(r)}
+        for name, r in (("nominal", given), ("refitted", refitted), ("augmented", augmented))
+    }
+    was, now = unseen(refitted), unseen(augmented)
+    shrink = None if was is None or now is None or not was > 0 or not np.isfinite(was) else 1.0 - now / was
+    floor = {o: n.std for o, n in refitted.noise.items() if n.std is not None}
+    held = "experiments" if refitted.holdout is not None else "parts of the fitted experiments, predicted from the rest"
+    return Gap(tables[0], tables[1], tables[2], FrozenMap(floor), pooled, shrink, held)
+
+
+def _tables(problem: Problem, theta: Array) -> dict[str, Table]:
+    roles = {e.name: e.role for e in problem.experiments}
+    found: dict[str, dict[str, dict[str, float | None]]] = {"fit": {}, "holdout": {}}
+    for output, row in problem.rmse(theta).items():
+        for name, value in row.items():
+            found[roles[name]].setdefault(output, {})[name] = value
+    return dict(found)
+
+
+def _pooled(problem: Problem, theta: Array) -> float | None:
+    try:
+        blocks = problem.blocks(theta, derivatives=False)
+    except SimulationError:
+        return None
+    return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks]))))
+
+
+def _held(refit: Refit) -> float | None:
+    """The held-out residual of the given gains; None without held-out experiments, or where a run fails."""
+    blocks = held_out(refit.problem, refit.theta)
+    return float(np.sqrt(np.mean(np.concatenate([b.squares for b in blocks])))) if blocks else None
+
+
+def at_given(refitted: Refit, given: Mapping[str, float]) -> Refit:
+    """The nominal model at the given values, nuisances as they were found. given: of all candidates, held ones too."""
+    held = refitted.problem.held | {n: v for n, v in given.items() if n in refitted.problem.held}
+    return replace(refitted, problem=replace(refitted.problem, held=held), theta=refitted.theta_at_given)
+
+
+SURE = 4.0
+"""Standard deviations by which a value has to be off the given one."""
+
+
+def off_given(last: Refit, given: Refit) -> Finding | None:
+    """The parameters of a model without effects that explain its gap at the given values; None where it shows none there.
+
+    last: the model, refitted; given: the same at the given values.
+    """
+    try:
+        before = sum(b.chi2 for b in given.problem.blocks(given.theta, derivatives=False))
+    except SimulationError:  # with the values as given it need not run
+        return None
+    if before <= last.chi2 + SURE * np.sqrt(2.0 * last.rows):
+        return None
+    found = moved_parameters(last, [f.name for f in last.problem.free])
+    if found is None:
+        return None
+    share = 1.0 - max(last.chi2 - last.rows, 0.0) / (before - last.rows)
+    text = f"No effect is missing: {found.text[:-1]}. That explains {share:.1%} of the gap."
+    return replace(found, text=text, share=share)
+
+
+def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:
+    """The parameters, of those named, whose values are clearly off the given ones, as one finding; None where none is."""
+    problem = last.problem
+    spans = np.array([u.span for u in problem.unknowns])
+    known = uncertainty(problem.blocks(last.theta), problem.names, spans, dict.fromkeys(problem.outputs, "given"))
+    sizes, told = {}, []
+    for k in last.gains:
+        free, value, std = problem.free[k], float(last.theta[k]), known.std(problem.free[k].name)
+        if free.name not in names or std is None or abs(value - free.given) <= SURE * std:
+            continue
+        unit = last.model.parameters[free.name].unit
+        sizes[free.name] = EffectSize(value, (value - 1.96 * std, value + 1.96 * std), unit)
+        told.append(f"{free.name} is {quantity(value, unit)}, not {quantity(free.given, unit)}")
+    if not sizes:
+        return None
+    places = tuple(Place((n,), 1.0) for n in sizes)
+    return Finding("parameter", ("parameter",), 1.0, FrozenMap(sizes), places, f"{listed(told)}.")

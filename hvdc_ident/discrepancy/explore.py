@@ -1,0 +1,275 @@
+"""One step of the search: refit what promises most, then its neighbours, until nothing comes nearer.
+
+Neighbours of a hypothesis differ from it in one thing: the place, the kind of delay, or the parts of the effect. They begin at the
+size that does the same (a delay as long, a level as high) and with the gains that the refit came to, for these are nearer to
+the truth than those which the misfit has moved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from hvdc_ident.discrepancy.context import Round, SearchContext
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.outside.filtered import filtered, filters
+from hvdc_ident.discrepancy.outside.law import law
+from hvdc_ident.discrepancy.proposals import by_latent, by_score, joined, views_of
+from hvdc_ident.discrepancy.race import Race
+from hvdc_ident.discrepancy.refitted import (
+    all_far,
+    best_each,
+    by_cost,
+    is_noise,
+    once_more,
+    refitted,
+    telling,
+)
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.size_profile import has_to_be_met, resized, sized
+from hvdc_ident.effects import Probe, effects
+
+RACE = Race(sprint=6, reach=0.4, second=12)
+FIELD = 40
+"""Proposals refitted at a time."""
+OF_EFFECT = 8
+"""Of one effect among these at most: places that cannot be told apart are neighbours, and come later."""
+AT_PLACE = 2
+"""Sizes of one effect at one place among them."""
+BATCHES = 1
+"""Further times that so many are refitted where nothing comes near the noise, unless a thorough search is asked for."""
+NEIGHBOURS = 60
+"""Neighbours refitted at a time."""
+LEADERS = 2
+"""Effects, the best, whose neighbours are refitted."""
+TURNS = 3
+"""Times that the neighbours of what is then best are refitted."""
+LEVEL = 0.9
+"""Share of the best fall of chi2 from which a refit's neighbours are worth a refit, and of what could be explained at its place."""
+
+
+def explored(
+    search: SearchContext, opened: Round, nominal: Nominal, number: int
+) -> tuple[Round, tuple[CandidateFit, ...]]:
+    """The round and its refits. A first round goes on until a refit comes near the noise or nothing is left to try."""
+    views = views_of(opened, nominal)
+    field = by_score(opened)
+    opened, more = by_latent(search, opened, views, number, lambda c: not has_to_be_met(c))
+    field = sorted([*field, *more], key=lambda p: -p.fall)
+    trials: list[CandidateFit] = []
+    chance = opened.scores.threshold(0.5)
+    field = [p for p in field if p.score > chance or p.fall > chance]
+    taken = _entrants(opened, field)
+    trials += refitted(search, opened, taken, f"round {number}", trials, RACE)
+    opened, trials = _with_neighbours(search, opened, trials, field, number)
+    if number > 1:
+        return opened, tuple(trials)
+    # Sizes that have to be met: where nothing explains the records, or what does is a kind of delay.
+    far = all_far(opened.before, trials, near=0.01)
+    late = {opened.candidates[t.pick.candidate].at for t in by_cost(trials)[:LEADERS] if _late(t) is not None}
+    opened, more = by_latent(search, opened, views, number, lambda c: has_to_be_met(c) and (far or c.at in late))
+    if more:
+        trials = best_each(
+            [
+                *trials,
+                *refitted(search, opened, _entrants(opened, more), f"round {number}: sizes to be met", trials, RACE),
+            ]
+        )
+        trials = once_more(search, opened, trials, f"round {number}: sizes to be met")
+        opened, trials = _with_neighbours(search, opened, trials, [*field, *more], number)
+    if not _tells(opened, trials):
+        return opened, tuple(trials)
+    if search.options.fallback and not _noise(search, trials):
+        opened = _outside(search, opened, nominal, trials)
+    done = {id(p) for p in taken}
+    batches = math.inf if search.options.thorough else BATCHES
+    while all_far(opened.before, trials) and not opened.law:
+        rest = [p for p in field if id(p) not in done]
+        taken = _entrants(opened, rest)
+        if not taken or not batches or search.spent:
+            return replace(opened, untried=len(rest)), tuple(trials)
+        batches -= 1
+        done |= {id(p) for p in taken}
+        trials = best_each([*trials, *refitted(search, opened, taken, f"round {number}: the others", trials, RACE)])
+        opened, trials = _with_neighbours(search, opened, trials, field, number)
+    return opened, tuple(trials)
+
+
+def _noise(search: SearchContext, trials: Sequence[CandidateFit]) -> bool:
+    best = next(iter(by_cost(trials)), None)
+    return best is None or is_noise(best.refit, search.seed)
+
+
+def _outside(search: SearchContext, opened: Round, nominal: Nominal, trials: Sequence[CandidateFit]) -> Round:
+    """The round with a filter, or where nothing comes near the noise a formula, from outside the catalogue, if one does."""
+    best = by_cost(trials)[0].refit
+    tried = filters(search, opened, nominal)
+    opened = replace(opened, filters=tried)
+    found = filtered(search, opened, tried, best)
+    if found is None and all_far(opened.before, trials):
+        found = law(search, opened, best)
+        return replace(opened, laws=() if found is None else (found,))
+    return opened if found is None else replace(opened, laws=(found,))
+
+
+def _tells(opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where a refit takes away a share of what is beyond noise: where none does, the noise is louder than stated."""
+    least = opened.before.chi2 - telling(opened.before)
+    return any(not t.refit.failure and t.refit.chi2 < least for t in trials)
+
+
+def _entrants(opened: Round, field: Sequence[Pick]) -> list[Pick]:
+    """The proposals that are refitted first: those that promise most, not all of them one effect."""
+    effect_count: dict[str, int] = {}
+    place_count: dict[tuple, int] = {}
+    taken: list[Pick] = []
+    for p in field:
+        c = opened.candidates[p.candidate]
+        place = c.effect, c.at, c.source
+        if len(taken) == FIELD:
+            break
+        if effect_count.get(c.effect, 0) >= OF_EFFECT or place_count.get(place, 0) >= AT_PLACE:
+            continue
+        effect_count[c.effect] = effect_count.get(c.effect, 0) + 1
+        place_count[place] = place_count.get(place, 0) + 1
+        taken.append(p)
+    return taken
+
+
+def _with_neighbours(
+    search: SearchContext, opened: Round, trials: Sequence[CandidateFit], field: Sequence[Pick], number: int
+) -> tuple[Round, list[CandidateFit]]:
+    """The trials with the neighbours of the best, again while one of these is better."""
+    trials = best_each(trials)
+    asked: set[tuple[int, Hashable]] = set()
+    for _ in range(TURNS):
+        leaders = _leaders(opened, trials)
+        if not leaders:
+            break
+        opened, picks = _neighbours(opened, leaders, trials, field, asked)
+        if not picks:
+            break
+        before = by_cost(trials)[0]
+        more = refitted(search, opened, picks, f"round {number}: neighbours", trials, RACE)
+        trials = best_each([*trials, *more])
+        if by_cost(trials)[0] is before:
+            break
+    return opened, trials
+
+
+def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:
+    """The best refit of each of the best effects."""
+    sound = by_cost(trials)
+    if not sound:
+        return []
+    least = LEVEL * (opened.before.chi2 - sound[0].refit.chi2)
+    each: dict[str, CandidateFit] = {}
+    for t in sound:
+        if opened.before.chi2 - t.refit.chi2 >= least:
+            each.setdefault(opened.candidates[t.pick.candidate].effect, t)
+    return list(each.values())[:LEADERS]
+
+
+@dataclass(frozen=True)
+class _Lead:
+    """A hypothesis whose neighbours are asked for.
+
+    number: of its candidate. gains: the unknowns of the model before at its end. sizes: of its effect. late: by how long that
+    delays a slow signal, s; None for what is no kind of delay.
+    """
+
+    number: int
+    candidate: CandidateEffect
+    gains: tuple[float, ...]
+    sizes: Mapping[str, float]
+    late: float | None
+
+    @classmethod
+    def of(cls, opened: Round, trial: CandidateFit) -> _Lead:
+        refit, k = trial.refit, len(opened.before.problem.free)
+        gains = (*refit.theta[:k].tolist(), *refit.theta[len(refit.problem.free) :].tolist())
+        number = trial.pick.candidate
+        return cls(number, opened.candidates[number], gains, refit.sizes(refit.placed[-1]), _late(trial))
+
+    def is_elsewhere(self, other: CandidateEffect) -> bool:
+        """Return True for the same effect at another place."""
+        return other.effect == self.candidate.effect and other.at != self.candidate.at
+
+    def is_other_delay(self, other: CandidateEffect) -> bool:
+        """Return True for another kind of delay at the same place."""
+        delays = (self.late or 0.0) > 0 and effects()[other.effect].equivalent_delay is not None
+        return delays and other.at == self.candidate.at and other.effect != self.candidate.effect
+
+
+def _neighbours(
+    opened: Round,
+    leaders: Sequence[CandidateFit],
+    trials: Sequence[CandidateFit],
+    field: Sequence[Pick],
+    asked: set[tuple[int, Hashable]],
+) -> tuple[Round, list[Pick]]:
+    """The round with the sizes that the neighbours of the leaders begin at, and these, those that were asked for left out."""
+    found = opened.candidates
+    own: dict[int, Pick] = {}
+    for p in field:
+        own.setdefault(p.candidate, p)
+    tried = {t.pick.candidate for t in trials}
+    extra: dict[int, list[Probe]] = {}
+    picks: list[Pick] = []
+    for lead in (_Lead.of(opened, t) for t in leaders):
+        for n, c in enumerate(found):
+            elsewhere = lead.is_elsewhere(c) and n not in tried
+            if not (elsewhere or lead.is_other_delay(c)) or (lead.number, n) in asked:
+                continue
+            if c.still or not opened.reaches(c) or opened.bound(c) < LEVEL * opened.bound(lead.candidate):
+                continue
+            asked.add((lead.number, n))
+            score = opened.score_p(n)[0]
+            if elsewhere and has_to_be_met(c):  # the size that was met, to the last digit
+                met = extra.setdefault(n, [])
+                picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains))
+                met.append(resized(c.probes[0], sized(c), lead.sizes[sized(c)]))
+            elif (start := _as_late(c, lead.late)) is not None:
+                picks.append(Pick(n, *start, score, lead.gains))
+            if n in own:
+                picks.append(own[n] if own[n].gains else replace(own[n], gains=lead.gains))
+            elif score > opened.scores.threshold(0.5):
+                picks.append(Pick(n, opened.scores.columns[opened.score_p(n)[2]].probe, 1.0, score, lead.gains))
+        picks += _other_forms(opened, lead.number, trials, asked)
+    more = [replace(found[n], probes=tuple(probes)) for n, probes in extra.items()]
+    return replace(opened, candidates=joined(found, more)), sorted(picks, key=lambda p: -p.score)[:NEIGHBOURS]
+
+
+def _as_late(candidate: CandidateEffect, late: float | None) -> tuple[int, float] | None:
+    """The probe of a kind of delay, and the factor on its size, that delay as long as another; None where there is none."""
+    entry = effects()[candidate.effect]
+    if entry.equivalent_delay is None or late is None or not late > 0:
+        return None
+    delays = {k: entry.delay_with(p.values) or 0.0 for k, p in enumerate(candidate.probes)}
+    near = min((k for k, d in delays.items() if d > 0), key=lambda k: abs(math.log(delays[k] / late)), default=None)
+    return None if near is None else (near, late / delays[near])
+
+
+def _other_forms(
+    opened: Round, number: int, trials: Sequence[CandidateFit], asked: set[tuple[int, Hashable]]
+) -> list[Pick]:
+    """The same effect at the same place with other optional parts, each at its best score."""
+    c = opened.candidates[number]
+    done = {frozenset(c.probes[t.pick.probe].free) for t in trials if t.pick.candidate == number}
+    best: dict[frozenset[str], tuple[float, int]] = {}
+    for column, score in zip(opened.scores.columns, opened.scores.t, strict=True):
+        if column.candidate != number:
+            continue
+        form = frozenset(c.probes[column.probe].free)
+        if form not in done and (number, form) not in asked and score > best.get(form, (0.0, 0))[0]:
+            best[form] = (float(score), column.probe)
+    asked |= {(number, form) for form in best}
+    return [Pick(number, probe, 1.0, score) for score, probe in best.values()]
+
+
+def _late(trial: CandidateFit) -> float | None:
+    """By how long the effect that a trial added delays a slow signal, s; None for what is no kind of delay."""
+    placed = trial.refit.placed[-1]
+    return effects()[placed.candidate.effect].delay_with(trial.refit.sizes(placed))

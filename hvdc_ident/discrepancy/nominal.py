@@ -1,0 +1,193 @@
+"""The nominal model at its own best: refitted over what the data can tell, for a gap before that is the calibration's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment
+from hvdc_ident.discrepancy.record_noise import OutputNoise, noise_of
+from hvdc_ident.errors import StudyError
+from hvdc_ident.executor import Executor
+from hvdc_ident.fit import FitParameter, Problem, Simulator
+from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.identifiability.gate import gate, gated
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.sensitivity import independent, null_directions
+
+NEAR = 0.05
+"""Share of the rows' interval: a row this near to a jump of an input lies on it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """A model at its optimum, and what a test of it needs.
+
+    problem: with its weights and AR coefficients; theta: (p,) the optimum. noise: by output. extra: (N, q) further
+    nuisance directions, whitened (start states, where they are not known).
+    """
+
+    problem: Problem
+    theta: Array
+    noise: FrozenMap[OutputNoise]
+    extra: Array | None = None
+
+    @cached_property
+    def blocks(self) -> tuple[ResidualBlock, ...]:
+        """Residuals and derivatives at the optimum."""
+        return self.problem.blocks(self.theta)
+
+    @cached_property
+    def residual(self) -> Array:
+        """(N,) whitened residuals of all blocks."""
+        return np.concatenate([b.residual for b in self.blocks])
+
+    @property
+    def chi2(self) -> float:
+        """The sum of squared residuals, as `ResidualBlock.chi2`."""
+        return float(self.residual @ self.residual) + sum(b.spare * b.residual.size for b in self.blocks)
+
+    @cached_property
+    def basis(self) -> Array:
+        """(N, k) orthonormal: what fitted and nuisance parameters can make of the residual."""
+        columns = np.vstack([b.jacobian for b in self.blocks])
+        if self.extra is not None:
+            columns = np.hstack([columns, self.extra])
+        if self.problem.free_initial_states:
+            columns = np.hstack([columns, self.problem.initial_state_jacobian(self.theta)])
+        return orthonormal(columns)
+
+    @cached_property
+    def starts(self) -> Array:
+        """(N, k) orthonormal, and to the basis: what unknown starts of the states can make of the residual besides."""
+        if self.problem.free_initial_states:
+            return np.zeros((self.residual.size, 0))
+        left = self.projected(unit_columns(self.problem.initial_state_jacobian(self.theta)))
+        return orthonormal(left[:, np.linalg.norm(left, axis=0) > 1e-6])
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters at the optimum, those held included."""
+        return self.problem.values(self.theta)
+
+    def projected(self, columns: Array) -> Array:
+        """M columns: what the parameters cannot make good."""
+        return columns - self.basis @ (self.basis.T @ columns)
+
+    def fitted(self) -> list[Array]:
+        """The model's output at each block's rows, in its unit."""
+        by_name = {e.name: e for e in self.problem.fitted_experiments}
+        found = []
+        for b in self.blocks:
+            measured = by_name[b.experiment].measured
+            assert measured is not None
+            found.append(measured[b.output][b.rows] - b.misfit)
+        return found
+
+
+def unit_columns(columns: Array) -> Array:
+    """The columns that are not 0, of length 1."""
+    norms = np.linalg.norm(columns, axis=0)
+    return np.asarray(columns[:, norms > 0] / norms[norms > 0])
+
+
+def orthonormal(columns: Array) -> Array:
+    """(N, k) an orthonormal basis of what the columns, each as long as the others, span beyond rounding."""
+    unit = unit_columns(columns)
+    if not unit.shape[1]:
+        return unit
+    u, s, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(u[:, s > 1e-7 * s[0]])
+
+
+def nominal(
+    simulator: Simulator,
+    experiments: Sequence[Experiment],
+    parameters: Sequence[FitParameter],
+    held: Mapping[str, float],
+    report: Mapping[str, Any] | None,
+    *,
+    starts: int,
+    seed: int,
+    executor: Executor | None,
+) -> tuple[Nominal, tuple[str, ...]]:
+    """The refitted nominal model, and remarks on what was held and on the noise.
+
+    Raises StudyError where there is nothing to compare, SimulationError where no start can be run.
+    """
+    fitted = [e for e in experiments if e.role == "fit" and e.outputs]
+    if not fitted:
+        raise StudyError("nothing to diagnose", expected='an experiment of role "fit" with measured outputs')
+    noise = noise_of([e for e in experiments if e.outputs])
+    problem = Problem(simulator, tuple(experiments), tuple(parameters), held=FrozenMap(held))
+    if report is not None:
+        problem = gated(problem, gate(report, diagnosis=True))
+    # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
+    told = tuple(
+        off_jumps(e).with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))
+        for e in problem.experiments
+    )
+    models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
+    quantised = {o: q for o, n in noise.items() if (q := n.quantised) is not None}
+    problem = replace(problem, experiments=told, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
+    optimum, result = pilot_fit(problem, starts=starts, seed=seed, executor=executor)
+    notes = (
+        [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
+    )
+    if report is None:
+        optimum, held_now = _told_apart(optimum)
+        notes += [f"Held at {v:g}, for these data do not tell it apart: {n}." for n, v in held_now.items()]
+    open_outputs = [o for o, n in noise.items() if n.std is None]
+    if open_outputs:
+        notes.append(f"{', '.join(open_outputs)}: no noise in the record; the misfit stands in for it.")
+    stated = {
+        o: replace(n, std=optimum.problem.weights.get(o)) if n.std is None and o in optimum.problem.weights else n
+        for o, n in noise.items()
+    }
+    return Nominal(optimum.problem, optimum.theta, FrozenMap(stated)), tuple(notes)
+
+
+def off_jumps(experiment: Experiment) -> Experiment:
+    """The experiment without the measured rows that lie on a jump of an input.
+
+    Whether such a row shows the value before or after, or where a quick part of the plant then is, no recorder tells: one
+    row can weigh as much as all that a missing effect does to the others.
+    """
+    if experiment.measured is None:
+        return experiment
+    time = experiment.time
+    steps = np.diff(time)
+    near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    jumps = [t for s in experiment.inputs.values() for t in s.jumps.tolist()]
+    on = np.zeros(time.size, dtype=bool)
+    for t in jumps:
+        on |= np.abs(time - t) <= near
+    if not on.any() or on.all():
+        return experiment
+    values = np.array(experiment.measured.values)
+    values[on] = np.nan
+    return experiment.with_(measured=replace(experiment.measured, values=values))
+
+
+def _stated(experiment: Experiment, output: str, noise: OutputNoise) -> float | None:
+    """The standard deviation of a record: its own where that was given and holds, else what was found of its noise."""
+    return experiment.noise.get(output) if noise.source == "given" else noise.std
+
+
+def _told_apart(optimum: LocalAnalysis) -> tuple[LocalAnalysis, dict[str, float]]:
+    """The optimum without the parameters that these data do not tell apart from the others, held at their given values where it runs."""
+    k = len(optimum.names)
+    dead = [n for n, c in zip(optimum.names, optimum.columns.T, strict=False) if not np.any(c)]
+    null = null_directions(optimum.columns)[:, :k]
+    kept = {optimum.names[i] for i in independent(optimum.information.matrix)}
+    lost = [n for n in optimum.names if n in dead or (n not in kept and np.any(null[:, optimum.names.index(n)]))]
+    if not lost or len(lost) == k:
+        return optimum, {}
+    given = {f.name: f.given for f in optimum.problem.free if f.name in lost}
+    fewer = optimum.with_held(dict.fromkeys(lost, "not told apart"), given)
+    return fewer, {n: fewer.problem.held[n] for n in lost}

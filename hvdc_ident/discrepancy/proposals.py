@@ -1,0 +1,227 @@
+"""Proposals: effects worth a refit, each with a size and the parameters that go with it.
+
+Two sources. The scores tell, of every candidate at a few finite sizes, how far chi2 would fall. And what would have to be
+added at an insertion point, as the records tell it (`inversion`), gives the signal that is truly there: put on that, an effect
+of the right size explains what is missing though the gains are still biased by it, and many sizes are tried at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.evidence import Pick
+from hvdc_ident.discrepancy.latent import Inversion
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.record_noise import draws
+from hvdc_ident.discrepancy.refit_jobs import as_given
+from hvdc_ident.discrepancy.scores import runs
+from hvdc_ident.discrepancy.signatures.block import block, parameter
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
+from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.discrepancy.size_profile import Dense, every_size, has_to_be_met, sized, widened
+from hvdc_ident.effects import SignalScales
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.executor import mapped
+from hvdc_ident.model import Model
+
+SIZES = 3
+"""Sizes of one effect at one place that are proposed at most: a cost over sizes may have several minima."""
+COARSE = 2
+"""Parts of an interval that an effect with corners is stepped in: what is looked at are means over many."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The model with some gains, and its runs with their answers, by experiment."""
+
+    nominal: Nominal
+    paths: Mapping[str, Along]
+
+
+@dataclass(frozen=True, eq=False)
+class _PlaceJob:
+    """One insertion point's share of the work: the candidates there, and (N, B) noise. own: whether the effects are put on the
+    model's own signal too, not only on the one that the records tell."""
+
+    view: View
+    found: tuple[Dense, ...]
+    noise: Array
+    own: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Spot:
+    """A size of a candidate: its score, by how much chi2 falls with it, and (p,) the unknowns that go with it."""
+
+    candidate: CandidateEffect
+    score: float
+    fall: float
+    theta: Array
+
+
+def by_score(opened: Round) -> list[Pick]:
+    """Every candidate within reach at its best size, once for each form it is scored in (optional parts of an effect)."""
+    scores = opened.scores
+    best: dict[tuple[int, frozenset[str]], int] = {}
+    for k, column in enumerate(scores.columns):
+        c = opened.candidates[column.candidate]
+        form = column.candidate, frozenset(c.probes[column.probe].free)
+        if scores.t[k] > 0 and opened.reaches(c) and (form not in best or scores.t[k] > scores.t[best[form]]):
+            best[form] = k
+    picks = []
+    for k in best.values():
+        column, t = scores.columns[k], float(scores.t[k])
+        met = has_to_be_met(opened.candidates[column.candidate])
+        picks.append(Pick(column.candidate, column.probe, 1.0 if met else float(scores.expected[k]), t, fall=t))
+    # Of equal scores the simpler: fewer places first, as listed.
+    return sorted(picks, key=lambda p: (-round(p.score, 6), len(opened.candidates[p.candidate].at), p.candidate))
+
+
+def views_of(opened: Round, nominal: Nominal) -> Callable[[], list[View]]:
+    """The model at its optimum, and with the gains as they were given where one has moved so far that it may stand for what is
+    missing: a loop with such gains answers otherwise. Worked out when first asked for; none of a model closed inside."""
+    return cache(lambda: _views(opened, nominal))
+
+
+def _views(opened: Round, nominal: Nominal) -> list[View]:
+    before, given = opened.before, as_given(opened.before)
+    views = []
+    with suppress(SimulationError):  # with the gains as given it need not run
+        for n in [nominal] if given is None else [nominal, replace(nominal, theta=given)]:
+            paths = opened.answers() if n is nominal else runs(before.model, n)
+            inner = {name: p for name, p in paths.items() if isinstance(p, Along)}
+            if len(inner) == len(paths):
+                views.append(View(n, inner))
+    return views
+
+
+def by_latent(
+    search: SearchContext,
+    opened: Round,
+    views: Callable[[], Sequence[View]],
+    number: int,
+    wanted: Callable[[CandidateEffect], bool],
+) -> tuple[Round, list[Pick]]:
+    """The round with the sizes found, and the proposals, the most promising first; the round's scores then know of the largest
+    score that noise gives over all these sizes. wanted: the candidates looked at, of those at one place with one free size."""
+    signals = slot_signals(opened.before.model, opened.paths, opened.before.placed)
+    times = [p.time for p in opened.paths.values()]
+    chosen = [c for c in opened.candidates if _has_one_size(c) and opened.reaches(c) and wanted(c)]
+    dense = [
+        every_size(c, SignalScales.of(times, signals[c.at[0]])) if has_to_be_met(c) else widened(c) for c in chosen
+    ]
+    if not dense or not isinstance(opened.before.model, Model) or not (seen := views()):
+        return opened, []
+    nominal = seen[0].nominal
+    drawn = draws(
+        nominal.problem,
+        nominal.blocks,
+        nominal.noise,
+        nominal.fitted(),
+        search.options.bootstraps,
+        search.seed + number,
+    )
+    noise = nominal.projected(np.vstack(drawn))
+    places: dict[str, list[Dense]] = {}
+    for d in dense:
+        places.setdefault(d.candidate.at[0], []).append(d)
+    # With other gains than those that fit, the model's own signal is the one that is known to be wrong.
+    jobs = [
+        _PlaceJob(View(v.nominal, {n: a.only(p) for n, a in v.paths.items()}), tuple(group), noise, own=v is seen[0])
+        for v in seen
+        for p, group in places.items()
+    ]
+    spots: list[_Spot] = []
+    largest = np.zeros(noise.shape[1])
+    for k, (more, under) in enumerate(mapped(search.executor, _at_place, jobs), start=1):
+        spots += more
+        largest = np.maximum(largest, under)
+        search.tell(k, len(jobs), f"round {number}: many sizes of {len(dense)} candidates")
+    beside = opened.scores.beside
+    scores = replace(opened.scores, beside=largest if beside is None else np.maximum(beside, largest))
+    found = joined(opened.candidates, [s.candidate for s in spots])
+    at = {_key(c): k for k, c in enumerate(found)}
+    count = {_key(c): len(c.probes) for c in opened.candidates}
+    picks = []
+    for s in spots:
+        key = _key(s.candidate)
+        picks.append(Pick(at[key], count[key], 1.0, s.score, tuple(s.theta.tolist()), s.fall))
+        count[key] += 1
+    return replace(opened, candidates=found, scores=scores), sorted(picks, key=lambda p: -p.fall)
+
+
+def _has_one_size(candidate: CandidateEffect) -> bool:
+    """Return True for a candidate at one place that moves, of which one size is looked for and is not met by proportion."""
+    if candidate.still or len(candidate.at) > 1 or candidate.source or not candidate.probes:
+        return False
+    single = all(len(p.free) == 1 for p in candidate.probes) and not is_linear(kind_of(candidate, 0))
+    return has_to_be_met(candidate) or single
+
+
+def joined(found: Sequence[CandidateEffect], more: Iterable[CandidateEffect]) -> tuple[CandidateEffect, ...]:
+    """The candidates, with the probes of others of the same effect and place after their own."""
+    extra: dict[Hashable, list] = {}
+    for c in more:
+        extra.setdefault(_key(c), []).extend(c.probes)
+    return tuple(replace(c, probes=(*c.probes, *extra.get(_key(c), ()))) for c in found)
+
+
+def _key(candidate: CandidateEffect) -> Hashable:
+    return candidate.effect, candidate.at, candidate.source, candidate.named
+
+
+def _at_place(job: _PlaceJob) -> tuple[list[_Spot], Array]:
+    """The best sizes of the candidates at one insertion point, and (B,) the largest score of any in each record of noise."""
+    nominal = job.view.nominal
+    latent = Inversion.of(nominal, job.view.paths, job.found[0].candidate.at[0])
+    noise = latent.against(job.noise)
+    spots, largest = [], np.zeros(noise.shape[1])
+    for dense in job.found:
+        for signals in (latent.own, latent.told) if job.own else (latent.told,):
+            parts = [_at_knots(latent, part, signals) for part in dense.parts()]
+            tables = [latent.falls(part, noise) for part in parts]
+            falls, scores = (np.concatenate([t[k] for t in tables]) for k in range(2))
+            largest = np.max([largest, *(t[2] for t in tables)], axis=0)
+            at_knots = np.hstack(parts)
+            best = _minima(falls, scores)
+            for k, theta in zip(best, latent.answers(nominal, at_knots[:, best]), strict=True):
+                spots.append(_Spot(dense.alone(k), float(scores[k]), float(falls[k]), theta))
+    return spots, largest
+
+
+def _at_knots(latent: Inversion, dense: Dense, signals: Sequence[Array]) -> Array:
+    """(k n, C) at the knots: what each size of a candidate makes of a signal, less the signal."""
+    kind, count = kind_of(dense.candidate, 0), dense.sizes.size
+    changes: list[NDArray[np.floating]] = []
+    whole, values = block(kind.effect, kind.present, kind.brings), dense.candidate.probes[0].values
+    # Thousands are compared, and the best run again: half the digits take a third of the time.
+    digits = np.float32 if whole.quick else np.float64
+    own = {parameter(n): np.full(count, values[n]) for n in kind.present} | {
+        parameter(sized(dense.candidate)): dense.sizes
+    }
+    for time, u in zip(latent.time, signals, strict=True):
+        wide = np.broadcast_to(u.astype(digits)[:, None], (u.size, count))
+        y = whole.run({n: v.astype(digits) for n, v in own.items()}, time, wide, None, COARSE)
+        changes.append((y - wide).astype(np.float32, copy=False))
+    return np.nan_to_num(latent.knots(changes))
+
+
+def _minima(falls: Array, scores: Array) -> list[int]:
+    """The best sizes, by the fall as they are and where none brings any by their score; neighbours of better ones left out."""
+    worth = falls if falls.max(initial=0.0) > 0 else scores
+    kept: list[int] = []
+    for k in np.argsort(-worth, kind="stable"):
+        if len(kept) == SIZES or not worth[k] > 0:
+            break
+        if all(abs(int(k) - j) > 1 for j in kept):
+            kept.append(int(k))
+    return kept

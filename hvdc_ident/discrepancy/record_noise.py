@@ -1,0 +1,347 @@
+"""The noise of the records: how large, how correlated from row to row, how coarse, told by what lies before the event.
+
+A fit's own residuals would tell it wrong where an effect is missing: they hold the effect. So the records before the
+event decide; given standard deviations stand unless those records are plainly noisier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment, event_time, noise_floor
+from hvdc_ident.discrepancy.noise_colour import TANH, Colour, Likelihood, likelihood, together, without_common
+from hvdc_ident.errors import StudyError
+from hvdc_ident.fit.likelihood import QuantisedNoise
+from hvdc_ident.fit.noise_model import AR, autoregression, scatter_of, segments
+from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.immutable import FrozenMap
+
+FEWEST = 8
+"""Rows before an event from which anything is told of the noise."""
+SURE = 3.3
+"""Standard errors by which the records before the event must exceed a given noise to replace it."""
+GIVEN = "given"
+"""The source of a standard deviation that stands as it was given."""
+SOFT = 1e-6
+LONG = 120
+"""Rows of a record from which more than one AR coefficient is told."""
+COMMON = 0.95
+"""Share of what sines of free phase explain that one of common phase must."""
+STANDS_OUT = 12.0
+"""Its power over that of the rest, as an F value."""
+COARSE = 1.0
+"""Noise of less than so many steps does not hide the rounding; above, that is white noise of step/sqrt(12) beside it."""
+FINEST = 0.1
+"""The least noise below a quantiser, in steps, for a model is not exact to less."""
+FLICKER = 1.0 / 3.0
+"""Standard error of the logarithm of the noise that flicker tells: records stand on few levels (over 103 of 3 x 300 rows)."""
+SLOW = 0.5
+"""Lag-1 coefficient from which the noise of a rounded record is coloured, and not white noise that flickers."""
+
+
+@dataclass(frozen=True)
+class OutputNoise:
+    """The noise of one output. std: in its unit, None where the data are deterministic (the misfit stands in).
+
+    model: its AR coefficients from row to row, () where it is white; error: the standard error of artanh of a single
+    one. step: what values are rounded to, 0 for nothing. source: where it comes from, in words. rows: how many before an
+    event.
+    """
+
+    std: float | None
+    model: AR
+    error: float
+    step: float
+    source: str
+    rows: int
+
+    @property
+    def below(self) -> float:
+        """The standard deviation of the noise before rounding, in the output's unit; 0 where rounding is all there is."""
+        return float(max((self.std or 0.0) ** 2 - self.step**2 / 12.0, 0.0) ** 0.5)
+
+    @property
+    def quantised(self) -> QuantisedNoise | None:
+        """Quantised noise of the record where its white noise does not hide the steps; else None."""
+        coarse = self.step > 0 and self.std is not None and not self.model and self.below < COARSE * self.step
+        return QuantisedNoise(self.step, max(self.below, FINEST * self.step)) if coarse else None
+
+
+def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[OutputNoise]:
+    """The noise of every measured output, from all its records together; AR coefficients from all outputs together."""
+    outputs = dict.fromkeys(o for e in experiments for o in e.outputs)
+    quiet = {o: _quiet(o, [e for e in experiments if o in e.outputs]) for o in outputs}
+    short = {o: likelihood(q.records) for o, q in quiet.items() if q.moves and q.even and not q.longer and not q.coarse}
+    colours = _colours(quiet, short)
+    return FrozenMap({o: _noise(q, colours.get(o, Colour()), short.get(o)) for o, q in quiet.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Quiet:
+    """The records of one output before the events, less line and what they have in common, and what is told of them.
+
+    std: their standard deviation if they were white; moves: whether there is noise in them at all. given: the standard
+    deviation told; step: what the whole records are rounded to; rounded: their noise when below that. floor: the least a
+    record can hold. scatter: the white noise that all rows show from one to the next. longer: an AR model of several
+    coefficients, where there are rows enough. even: evenly spaced rows.
+    """
+
+    records: tuple[Array, ...]
+    std: float
+    moves: bool
+    given: float | None
+    step: float
+    rounded: float
+    floor: float
+    scatter: float | None
+    longer: AR
+    even: bool
+
+    @property
+    def rows(self) -> int:
+        """All of them."""
+        return sum(r.size for r in self.records)
+
+    @property
+    def coarse(self) -> bool:
+        """True where the noise is white and too small to hide the rounding."""
+        power = sum(float(r @ r) for r in self.records)
+        slow = sum(float(r[1:] @ r[:-1]) for r in self.records) > SLOW * power
+        return self.step > 0.0 and self.std < COARSE * self.step and not (self.moves and slow)
+
+
+def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
+    before = [(t, r) for e in experiments for t, r in [_before(e, output)] if r.size >= FEWEST]
+    quiet = without_tone([t for t, _ in before], [r for _, r in before])
+    whole = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
+    step, given, even = _step(whole), _given(output, experiments), _even(experiments)
+    rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(whole, step) ** 2)) if step > 0.0 else 0.0
+    floor = max((noise_floor(r) for r in whole), default=0.0)
+    records = tuple(without_common(quiet) if even else quiet)
+    rows, power = sum(r.size for r in records), sum(float(r @ r) for r in records)
+    scale = max((float(np.abs(r).max()) for r in whole if r.size), default=1.0)
+    std = float(np.sqrt(power / max(rows - 2 * len(records), 1))) if rows else 0.0
+    moves = std > 1e-12 * scale and (given is None or std >= 1e-3 * given) and (given is not None or std > floor)
+    scatter = scatter_of(experiments, output)
+    longer = autoregression(records) if moves and even and rows >= LONG * len(records) else ()
+    return Quiet(
+        records,
+        std,
+        moves,
+        given,
+        step,
+        rounded,
+        floor,
+        scatter[0] if scatter else None,
+        longer if len(longer) > 1 else (),
+        even,
+    )
+
+
+def _colours(quiet: Mapping[str, Quiet], short: Mapping[str, Likelihood]) -> dict[str, Colour]:
+    """The AR(1) coefficient of each output: told by the records alone first, then with the standard deviations given."""
+    if not short:
+        return {}
+    alone = dict(zip(short, together(np.array([s.profile for s in short.values()])), strict=True))
+    known = {o: quiet[o].given for o in short if alone[o].tanh and _agrees(short[o], quiet[o].given)}
+    rows = [s.profile if (g := known.get(o)) is None else s.at(g) for o, s in short.items()]
+    sharper = dict(zip(short, together(np.array(rows)), strict=True))
+    return {o: sharper[o] if alone[o].tanh and sharper[o].tanh else alone[o] for o in short}
+
+
+def _agrees(found: Likelihood, given: float | None) -> bool:
+    """Return True where a given standard deviation is compatible with the records."""
+    return given is not None and _lack(found, given)[0] < SURE**2
+
+
+def _lack(found: Likelihood, given: float) -> tuple[float, bool]:
+    """By how much twice the log-likelihood falls with the standard deviation given, and whether the records are above it."""
+    best = np.unravel_index(np.argmax(found.values), found.values.shape)
+    return 2.0 * float(found.values.max() - found.at(given).max()), bool(found.std[best[1]] > given)
+
+
+def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNoise:
+    given, rows, step = quiet.given, quiet.rows, quiet.step
+    std = quiet.std if quiet.moves else 0.0
+    if quiet.coarse and (given is None or given < quiet.rounded):
+        # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked.
+        return OutputNoise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+    if quiet.coarse:
+        return OutputNoise(given, (), 0.0, step, GIVEN, rows)
+    if given is None and std <= quiet.floor:
+        if step > 0.0:
+            return OutputNoise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
+        if rows == 0 and quiet.scatter is not None:
+            return OutputNoise(
+                quiet.scatter, (), 0.0, step, "the scatter from row to row, for no rows lie before an event", 0
+            )
+        return OutputNoise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
+    model = (colour.rho,) if colour.tanh else quiet.longer
+    if colour.tanh and found is not None:
+        std = found.best_std(colour.tanh)
+    if given is None:
+        return OutputNoise(std, model, colour.error, step, "the records before the event", rows)
+    if colour.tanh and found is not None:
+        lack, above = _lack(found, given)
+        noisier = above and lack > SURE**2
+    else:
+        rho = sum(model)
+        independent = max(rows * (1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0)
+        noisier = std > given * (1.0 + SURE / np.sqrt(2.0 * independent))
+    if noisier:
+        return OutputNoise(
+            std, model, colour.error, step, "the records before the event, noisier than what was given", rows
+        )
+    return OutputNoise(given, model, colour.error, step, GIVEN, rows)
+
+
+def _even(experiments: Sequence[Experiment]) -> bool:
+    """Return True where the rows are evenly spaced, as an AR model needs."""
+    try:
+        for e in experiments:
+            segments(e.time, e.name)
+    except StudyError:
+        return False
+    return True
+
+
+def _given(output: str, experiments: Sequence[Experiment]) -> float | None:
+    """The root mean square of the standard deviations given; None where one is missing or all are next to nothing."""
+    found = [e.noise.get(output) for e in experiments]
+    if any(n is None or n <= 0 for n in found):
+        return None
+    whole = [e.measured[output] for e in experiments if e.measured is not None]
+    ranges = [float(np.nanmax(v) - np.nanmin(v)) for v in whole if np.isfinite(v).any()]
+    value = float(np.sqrt(np.mean([n**2 for n in found if n is not None])))
+    return value if value > 1.001 * SOFT * max([*ranges, 0.0]) else None
+
+
+def without_tone(times: Sequence[Array], records: Sequence[Array]) -> list[Array]:
+    """The records less the sine that all of them share at the same times, where there is one: that is no noise.
+
+    times: (n,) s each. A sine of common phase has to hold nearly all that sines of free phase would, and to stand out of
+    the rest; noise has no phase in common. A single record is left as it is.
+    """
+    if len(records) < 2 or min(t.size for t in times) < 3 * FEWEST:
+        return list(records)
+    span = max(float(np.ptp(t)) for t in times)
+    step = min(float(np.median(np.diff(t))) for t in times)
+    power = sum(float(r @ r) for r in records)
+    rows = sum(r.size for r in records)
+    best = (0.0, list(records))
+    for f in np.arange(1.5 / span, 0.4 / step, 0.2 / span):
+        waves = [np.column_stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t)]) for t in times]
+        free = sum(
+            float(r @ r - np.linalg.lstsq(w, r, rcond=None)[1].sum()) for w, r in zip(waves, records, strict=True)
+        )
+        whole = np.vstack(waves)
+        c = np.linalg.lstsq(whole, np.concatenate(records), rcond=None)[0]
+        left = [r - w @ c for w, r in zip(waves, records, strict=True)]
+        shared = power - sum(float(r @ r) for r in left)
+        if shared > COMMON * free and shared / 2.0 > STANDS_OUT * (power - shared) / rows and shared > best[0]:
+            best = (shared, left)
+    return best[1]
+
+
+def _before(experiment: Experiment, output: str) -> tuple[Array, Array]:
+    """The times and rows before the event, less their straight line."""
+    assert experiment.measured is not None
+    event = experiment.event if experiment.event is not None else event_time(experiment.inputs)
+    if event is None:
+        return np.empty(0), np.empty(0)
+    keep = (experiment.time < event - 1e-12) & np.isfinite(experiment.measured[output])
+    t, v = experiment.time[keep], experiment.measured[output][keep]
+    if v.size < FEWEST:
+        return np.empty(0), np.empty(0)
+    x = t - t.mean()
+    power = float(x @ x)
+    rest = v - v.mean()
+    return t, np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
+
+
+def _step(records: Sequence[Array]) -> float:
+    """Resolution to which the records are rounded; 0 where they are not."""
+    steps = []
+    for r in records:
+        floor = noise_floor(r) if r.size else 0.0
+        if r.size and floor > 1.001 * SOFT * float(np.ptp(r)):
+            steps.append(float(floor * np.sqrt(12.0)))
+    return max(steps, default=0.0)
+
+
+def _dither(records: Sequence[Array], step: float) -> float:
+    """The standard deviation of white noise below a quantiser, in its steps, from how much the records flicker.
+
+    Noise of sigma steps makes rounded values scatter by sigma/sqrt(pi) (variance, averaged over where the level lies
+    between two steps) while it is below a third of a step, and by sigma^2 + 1/12 above.
+    """
+    bends = np.concatenate([(r[2:] - 2.0 * r[1:-1] + r[:-2]) / step for r in records if r.size > 2] or [np.zeros(1)])
+    power = np.sort(bends**2)
+    scatter = float(power[: max(1, int(0.98 * power.size))].mean()) / 6.0  # the largest are the events
+    low = scatter * float(np.sqrt(np.pi))
+    return low if low < 1.0 / 3.0 else float(np.sqrt(max(scatter - 1.0 / 12.0, 0.0)))
+
+
+def draws(
+    problem: Problem,
+    blocks: Sequence[ResidualBlock],
+    noise: FrozenMap[OutputNoise],
+    fitted: Sequence[Array],
+    count: int,
+    seed: int,
+) -> list[Array]:
+    """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
+
+    fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
+    drawn too, within its error, and so is the size of the noise below a quantiser: what is not known of the noise widens
+    what noise can do. Where the standard deviation is not given it goes with the coefficient, for the steps from row to
+    row are what is sure.
+    """
+    times = {e.name: e.time for e in problem.fitted_experiments}
+    outputs = list(dict.fromkeys(b.output for b in blocks))
+    found: list[Array] = []
+    for k, (b, y) in enumerate(zip(blocks, fitted, strict=True)):
+        n = noise[b.output]
+        random = np.random.default_rng([seed, 1, k])
+        model = np.repeat(np.array(n.model)[:, None], count, axis=1)
+        if len(n.model) == 1:  # one draw an output: its records share the noise
+            spread = np.random.default_rng([seed, 2, outputs.index(b.output)]).standard_normal(count)
+            model = np.tanh(np.clip(np.arctanh(model) + n.error * spread, TANH[0], TANH[-1]))
+        e = _coloured(random.standard_normal((y.size, count)), model)
+        if len(n.model) == 1 and n.source != GIVEN:
+            e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
+        if n.step:
+            size = n.below * np.ones(count)
+            if n.quantised is not None:
+                spread = np.random.default_rng([seed, 3, outputs.index(b.output)]).standard_normal(count)
+                size = size * np.exp(FLICKER * spread)
+            placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
+            e = np.round((placed + size * e) / n.step) * n.step - placed
+            quantised = problem.treatment.quantised(b.output)
+            if quantised is not None and b.profile is None:
+                found.append(quantised.residual(e)[0])
+                continue
+            e = b.scaled(e)
+        found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
+    return found
+
+
+def _coloured(white: Array, model: Array) -> Array:
+    """(m, count) stationary AR noise of variance 1; model: (p, count) coefficients."""
+    p = model.shape[0]
+    if not p:
+        return white
+    settle = 200
+    lead = np.random.default_rng(0).standard_normal((settle, white.shape[1]))
+    e = np.vstack([lead, white])
+    for k in range(p, e.shape[0]):
+        for lag in range(p):
+            e[k] += model[lag] * e[k - 1 - lag]
+    kept = e[settle:]
+    if p == 1:
+        return np.asarray(kept * np.sqrt(1.0 - model[0] ** 2))
+    return np.asarray(kept / np.sqrt(np.mean(kept**2)))

@@ -1,0 +1,356 @@
+"""Refits: gains and effect together, with exact sensitivities, from where the score put them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment
+from hvdc_ident.discrepancy.nominal import Nominal, orthonormal
+from hvdc_ident.discrepancy.placed import Placed
+from hvdc_ident.discrepancy.record_noise import OutputNoise
+from hvdc_ident.effects import distance_from_neutral, effects
+from hvdc_ident.errors import HvdcIdentError, SimulationError
+from hvdc_ident.fit import Problem
+from hvdc_ident.fit.optimiser import OptimiserResult
+from hvdc_ident.fit.optimisers.trust_region import TrustRegion
+from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.simulate import simulate
+
+METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
+"""A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
+GLANCE = 6
+"""Evaluations of a further start, which goes on only where it is better by then than the first at its end."""
+SCANNED = 15
+"""Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class RefitJob:
+    """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
+
+    evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
+    """
+
+    model: AnyModel
+    placed: tuple[Placed, ...]
+    problem: Problem
+    begins: tuple[Array, ...]
+    noise: FrozenMap[OutputNoise]
+    evaluations: int = METHOD.max_evaluations
+    spare: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """Result of a refit. failure: why it has no result, empty where it has one.
+
+    chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
+    holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
+    the same for parts of the fitted ones predicted from the rest. std: standard deviation of each effect parameter, by its
+    name in the model. apart: of each effect, by how many standard deviations its parameters together are off doing
+    nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
+    """
+
+    model: AnyModel
+    placed: tuple[Placed, ...]
+    problem: Problem
+    noise: FrozenMap[OutputNoise]
+    theta: Array
+    chi2: float = np.inf
+    rows: int = 0
+    correlation: float = 0.0
+    holdout: float | None = None
+    press: float | None = None
+    std: FrozenMap[float | None] = field(default_factory=FrozenMap)
+    apart: tuple[float, ...] = ()
+    failure: str = ""
+    ended: bool = True
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All estimated and held parameters."""
+        return self.problem.values(self.theta)
+
+    @property
+    def count(self) -> int:
+        """Number of parameters that the effects added."""
+        return sum(len(p.bounds) for p in self.placed)
+
+    @property
+    def effective(self) -> float:
+        """Number of independent residuals: fewer than rows where neighbours are alike."""
+        rho = min(max(self.correlation, 0.0), 0.999)
+        return max(self.rows * (1.0 - rho) / (1.0 + rho), 4.0)
+
+    @property
+    def gains(self) -> list[int]:
+        """The places in theta of the nominal model's own free parameters."""
+        added = {n for p in self.placed for n in p.names.values()}
+        return [k for k, f in enumerate(self.problem.free) if f.name not in added]
+
+    @property
+    def theta_at_given(self) -> Array:
+        """(p,) theta with the gains at their given values, which may lie outside their bounds; the rest as it is."""
+        theta = self.theta.copy()
+        theta[self.gains] = [self.problem.free[k].given for k in self.gains]
+        return theta
+
+    def sizes(self, placed: Placed) -> dict[str, float]:
+        """The effect's own parameters at the optimum."""
+        at = self.values
+        own = dict(placed.start)
+        return own | {n: at[name] for n, name in placed.names.items() if name in at}
+
+    def nominal(self) -> Nominal:
+        """The refitted model as something to test further."""
+        return Nominal(self.problem, self.theta, self.noise)
+
+
+@dataclass(frozen=True, eq=False)
+class RefitResult:
+    """Result of a refit without its job: small enough to be sent and stored. Fields as in `Refit`."""
+
+    theta: Array
+    chi2: float
+    rows: int
+    correlation: float
+    holdout: float | None
+    press: float | None
+    std: FrozenMap[float | None]
+    apart: tuple[float, ...]
+    failure: str
+    ended: bool
+
+    def refit(self, job: RefitJob) -> Refit:
+        """The refit of the job that found this."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Refit(job.model, job.placed, job.problem, job.noise, **own)
+
+
+def find(job: RefitJob) -> RefitResult:
+    """Result of `run` without its job."""
+    return found_by(run(job))
+
+
+def found_by(refit: Refit) -> RefitResult:
+    """Result of a refit without its job."""
+    return RefitResult(**{f.name: getattr(refit, f.name) for f in fields(RefitResult)})
+
+
+def run(job: RefitJob) -> Refit:
+    """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
+    best: Refit | None = None
+    why = ""
+    scanned = any(effects()[p.candidate.effect].needs_grid for p in job.placed)
+    most = min(job.evaluations, SCANNED) if scanned else job.evaluations
+    begins = _apart(job.begins)
+    for k, begin in enumerate([*begins, *job.spare]):
+        if best is not None and k >= len(begins):
+            break
+        try:
+            end = _walked(job.problem, begin, most, None if best is None else best.chi2)
+            # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
+            if end.cost is None:
+                why = end.message
+                continue
+            if best is None or 2.0 * end.cost < best.chi2:
+                best = Refit(
+                    job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost,
+                    ended=scanned or end.status != "max-evaluations",
+                )  # fmt: skip
+        except HvdcIdentError as error:
+            why = str(error)
+    if best is None:
+        return Refit(job.model, job.placed, job.problem, job.noise, job.begins[0], failure=why or "no start succeeded")
+    try:
+        return judged(best)
+    except HvdcIdentError as error:
+        return replace(best, failure=str(error))
+
+
+def _apart(begins: Sequence[Array]) -> list[Array]:
+    """The starts, each once."""
+    return [b for k, b in enumerate(begins) if not any(np.array_equal(b, a) for a in begins[:k])]
+
+
+def _walked(problem: Problem, begin: Array, most: int, beat: float | None) -> OptimiserResult:
+    """The end of a walk of so many evaluations; with a chi2 to beat, that of a glance unless it is beaten by then."""
+    if beat is None or most <= GLANCE:
+        return replace(METHOD, max_evaluations=most).run(problem, begin)
+    end = replace(METHOD, max_evaluations=GLANCE).run(problem, begin)
+    if end.status != "max-evaluations" or end.cost is None or not 2.0 * end.cost < beat:
+        return end
+    return replace(METHOD, max_evaluations=most - GLANCE).run(problem, end.theta)
+
+
+def judged(refit: Refit) -> Refit:
+    """The refit with its intervals, and what it predicts of data it has not seen."""
+    blocks = refit.problem.blocks(refit.theta)
+    names = refit.problem.names
+    spans = np.array([u.span for u in refit.problem.unknowns])
+    known = uncertainty(blocks, names, spans, dict.fromkeys(refit.problem.outputs, "given"))
+    # What unknown starts took is what chance would have left there: refits with and without them are then compared fairly.
+    chi2 = sum(b.chi2 + b.taken for b in blocks)
+    rows = sum(b.residual.size for b in blocks)
+    wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
+    own = [n for p in refit.placed for n in p.names.values() if n in names]
+    std = {n: None if (s := known.std(n)) is None else wider * s for n in own}
+    apart = tuple(_apart_from_nothing(refit, p, known, blocks) / wider for p in refit.placed)
+    return replace(
+        refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
+        press=press(blocks), std=FrozenMap(std), apart=apart,
+    )  # fmt: skip
+
+
+def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks: Sequence[ResidualBlock]) -> float:
+    """Distance of an effect's parameters from neutral, in standard deviations; 0 where that is not known."""
+    entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
+    fitted = [n for n, name in placed.names.items() if name in known.names]
+    here = distance_from_neutral(entry, sizes)
+    if not fitted or not here:
+        return 0.0
+    slopes: Array = np.zeros((len(here), len(fitted)))
+    for k, n in enumerate(fitted):
+        h = 1e-6 * abs(sizes[n]) or 1e-9
+        there = distance_from_neutral(entry, {**sizes, n: sizes[n] + h})
+        slopes[:, k] = np.array([there.get(m, v) - v for m, v in here.items()]) / h
+    at = [known.names.index(placed.names[n]) for n in fitted]
+    spread = slopes @ _covariance(known, at, blocks) @ slopes.T
+    distance = np.array(list(here.values()))
+    scale = np.sqrt(np.diag(spread))
+    seen = scale > 0
+    if not seen.any():
+        return 0.0
+    d, unit = distance[seen] / scale[seen], spread[np.ix_(seen, seen)] / np.outer(scale[seen], scale[seen])
+    square = float(d @ np.linalg.pinv(unit, rcond=1e-9, hermitian=True) @ d)
+    return math.sqrt(max(square, 0.0))
+
+
+def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[ResidualBlock]) -> Array:
+    """The covariance of some unknowns; where only combinations of them are told, of those, and 0 along the others.
+
+    The constant and the linear part of a loss are one where a signal has two levels, and are there all the same.
+    """
+    if not any(known.names[k] in known.reasons for k in at):
+        return known.corrected[np.ix_(at, at)]
+    jacobian = np.vstack([b.jacobian for b in blocks])
+    scale = np.linalg.norm(jacobian[:, at], axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    own, others = jacobian[:, at] / scale, orthonormal(np.delete(jacobian, at, axis=1))
+    _, s, directions = np.linalg.svd(own - others @ (others.T @ own), full_matrices=False)
+    told = directions[s > SINGULAR] / s[s > SINGULAR, None]
+    return np.asarray(told.T @ told / np.outer(scale, scale))
+
+
+def _correlation(blocks: Sequence[ResidualBlock]) -> float:
+    """The lag-1 autocorrelation of all residuals, 0 where it is negative or what chance gives."""
+    power = sum(float(b.score @ b.score) for b in blocks)
+    rows = sum(b.residual.size for b in blocks)
+    records = [b.score[part] for b in blocks for part in b.stretches]
+    found = sum(float(r[1:] @ r[:-1]) for r in records) / power if power else 0.0
+    return found if found > 2.0 / np.sqrt(rows) else 0.0
+
+
+def holdout(problem: Problem, theta: Array) -> float | None:
+    """Root mean square of the held-out residuals in noise units, whitened; infinite where a held-out run fails."""
+    blocks = held_out(problem, theta)
+    if blocks is None:
+        return None
+    if not blocks:
+        return float("inf")
+    power = sum(b.chi2 + b.taken for b in blocks)
+    return float(np.sqrt(power / sum(b.residual.size for b in blocks)))
+
+
+def held_out_by_record(refit: Refit) -> dict[str, float]:
+    """Root mean square of each held-out record's residuals, in noise units; empty where there are none, or one cannot be run."""
+    squares: dict[str, list[tuple[float, int]]] = {}
+    for b in held_out(refit.problem, refit.theta) or ():
+        squares.setdefault(b.experiment, []).append((b.chi2 + b.taken, b.residual.size))
+    return {name: float(np.sqrt(sum(s for s, _ in own) / sum(n for _, n in own))) for name, own in squares.items()}
+
+
+def held_out(problem: Problem, theta: Array) -> tuple[ResidualBlock, ...] | None:
+    """The residuals of the held-out experiments; None where there are none, () where one cannot be run."""
+    others = of_held_out(problem)
+    if others is None:
+        return None
+    # An output that was never fitted has no weight of its own; its records then judge nothing. The derivatives are not
+    # needed, but with them the machine code is that of the fit: compiling another takes longer than running these.
+    try:
+        blocks = others.blocks(theta[: len(problem.free)])
+    except SimulationError:
+        return ()
+    return tuple(b for b in blocks if b.output in problem.outputs)
+
+
+def of_held_out(problem: Problem) -> Problem | None:
+    """The problem on the held-out experiments, without nuisances; None where there are none."""
+    others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
+    others = [e for e in others if set(e.outputs) & set(problem.outputs)]
+    return replace(problem, experiments=tuple(others)) if others else None
+
+
+def press(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
+    """Root mean square of each part's residuals predicted from the others, to first order (Allen's PRESS, by blocks).
+
+    Parts: experiments; of a single one, stretches of its rows. None where nothing can be left out.
+    """
+    names = list(dict.fromkeys(b.experiment for b in blocks))
+    pieces: list[tuple[Array, Array]] = []
+    if len(names) > 1:
+        for n in names:
+            own = [b for b in blocks if b.experiment == n]
+            pieces.append((np.concatenate([b.residual for b in own]), np.vstack([b.jacobian for b in own])))
+    else:
+        for k in range(parts):
+            cut = [slice(k * b.residual.size // parts, (k + 1) * b.residual.size // parts) for b in blocks]
+            pieces.append(
+                (
+                    np.concatenate([b.residual[c] for b, c in zip(blocks, cut, strict=True)]),
+                    np.vstack([b.jacobian[c] for b, c in zip(blocks, cut, strict=True)]),
+                )
+            )
+    matrix = sum(j.T @ j for _, j in pieces)
+    d = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
+    total, rows = 0.0, 0
+    for r, j in pieces:
+        rest = (matrix - j.T @ j) / np.outer(d, d)
+        shift = np.linalg.lstsq(rest, (j.T @ r) / d, rcond=1e-9)[0] / d
+        predicted = r + j @ shift
+        total, rows = total + float(predicted @ predicted), rows + r.size
+    spare = sum(b.spare * b.residual.size for b in blocks)
+    return float(np.sqrt((total + spare) / rows)) if rows else None
+
+
+def signal(refit: Refit, place: str) -> dict[str, Array]:
+    """The signal at a place of the model as refitted, by fitted experiment. Raises SimulationError where it cannot be run.
+
+    A model that is closed inside, as an FMU, gives only its outputs: what enters it is the experiment's own input.
+    """
+    name = place.removeprefix("outputs.")
+    model, experiments = refit.model, refit.problem.fitted_experiments
+    if not isinstance(model, Model) and name == place and name in model.inputs:
+        at_rest = {**{n: i.value for n, i in model.inputs.items()}, **refit.values}
+        return {e.name: _input(e, name, e.values.get(name, at_rest[name])) for e in experiments}
+    runs = {e.name: e.with_(measured=None) for e in experiments}
+    return {n: np.asarray(simulate(model, e, refit.values, outputs=[name])[name]) for n, e in runs.items()}
+
+
+def _input(experiment: Experiment, name: str, at_rest: float) -> Array:
+    """An input at the experiment's rows, (n,); at_rest: what it is where the experiment does not move it."""
+    moved = experiment.inputs.get(name)
+    course = np.full(experiment.time.size, at_rest) if moved is None else moved(experiment.time)
+    return np.asarray(course + experiment.offsets.get(name, 0.0))
+
+
+def unseen(refit: Refit) -> float | None:
+    """The held-out residual in noise units; without held-out experiments that of parts left out."""
+    return refit.holdout if refit.holdout is not None else refit.press

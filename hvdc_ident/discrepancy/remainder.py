@@ -1,0 +1,140 @@
+"""What a hypothesis leaves: how much of the gap, and whether anything more could explain it.
+
+The test puts a latent input at every insertion point, beside the effects: any course over time, with a prior that is as
+large as the records ask for. Its marginal likelihood is 1 where nothing is missing; how large it becomes by chance, with
+the noise and with what is not known of the noise, is had from records of noise alone.
+
+Source: Alvarez, Luengo and Lawrence, Latent force models, AISTATS 2009 (a latent input with a Gaussian prior); Westfall and
+Young, 1993 (the largest of several statistics under noise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.context import SearchContext, slot_signals
+from hvdc_ident.discrepancy.evidence import unseen_rows
+from hvdc_ident.discrepancy.latent import Inversion
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.record_noise import draws
+from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
+from hvdc_ident.discrepancy.scores import runs
+from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.executor import mapped
+
+PLACES = 8
+"""Insertion points, those where most of the remainder could be made good, at which the latent input is tried."""
+TOLERANCE = 0.01
+"""Share of the squared gap, a tenth of its amplitude, that nobody asks about: no model leaves noise alone of real records."""
+DRAWS = 100
+"""Records of noise: a p of 1 % is the least that is asked for."""
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What is left of the gap.
+
+    share: of the squared misfit beyond noise, fitted data; held_out: the same of the others, None where they showed no gap.
+    noise_units: root mean square of the fitted residual, in standard deviations of the noise. held_out_p: the chance that noise
+    is as loud as the held-out residual. record: the held-out experiment of which most is left, record_units: so much, in noise
+    units. p: the chance that noise alone makes a latent input as likely anywhere; at: where it is likeliest, empty where it was
+    not looked for. log_evidence: of the latent input there, in nats.
+    """
+
+    share: float
+    held_out: float | None
+    noise_units: float
+    held_out_p: float = 1.0
+    p: float = 1.0
+    at: str = ""
+    log_evidence: float = 0.0
+    record: str = ""
+    record_units: float = 0.0
+
+    @property
+    def largest(self) -> float:
+        """The larger of the two shares."""
+        return max(self.share, self.held_out or 0.0)
+
+    @property
+    def below_tolerance(self) -> bool:
+        """True where nobody need ask what is left."""
+        return self.largest <= TOLERANCE
+
+
+@dataclass(frozen=True, eq=False)
+class _LatentJob:
+    """One insertion point's share of the work; noise: (N, B) records of noise, projected, or None."""
+
+    nominal: Nominal
+    paths: Mapping[str, Along]
+    place: str
+    noise: Array | None
+
+
+def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float) -> Remainder:
+    """The remainder of the hypothesis `last`, as a share of the gap of the nominal model `first`.
+
+    floor: mean square of what noise alone leaves.
+    """
+    was, now = unseen(first), unseen(last)
+    gap = first.chi2 - floor * first.rows
+    share = float(np.clip((last.chi2 - floor * last.rows) / gap, 0.0, 1.0)) if gap > 0 else 0.0
+    held, held_p = None, 1.0
+    if was is not None and now is not None and np.isfinite(was) and was**2 > floor:
+        held = float(np.clip((now**2 - floor) / (was**2 - floor), 0.0, 1.0)) if np.isfinite(now) else 1.0
+        rows = unseen_rows(last) * last.effective / last.rows
+        held_p = float(chi2.sf(now**2 / floor * rows, rows)) if np.isfinite(now) else 0.0
+    records = held_out_by_record(last)
+    most = max(records, key=lambda n: records[n], default="")
+    units = float(np.sqrt(last.chi2 / last.rows))
+    found = Remainder(share, held, units, held_p, record=most, record_units=records.get(most, 0.0))
+    return _tested(search, last, found)
+
+
+def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
+    """The remainder with the test for a latent input; as it is for a model that is closed inside, or cannot be linearised."""
+    nominal = last.nominal()
+    try:
+        paths = runs(last.model, nominal)
+    except SimulationError:
+        return found
+    inner = {n: p for n, p in paths.items() if isinstance(p, Along)}
+    if len(inner) < len(paths):
+        return found
+    places = list(slot_signals(last.model, inner, last.placed))
+    search.tell(0, 1, "anything else that is missing")
+    jobs = [_LatentJob(nominal, {n: p.only(s) for n, p in inner.items()}, s, None) for s in places]
+    falls = list(mapped(search.executor, _fall, jobs))
+    best = sorted(range(len(places)), key=lambda k: -falls[k])[:PLACES]
+    drawn = draws(nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), DRAWS, search.seed + 5)
+    noise = nominal.projected(np.vstack(drawn))
+    jobs = [_LatentJob(nominal, {n: p.only(places[k]) for n, p in inner.items()}, places[k], noise) for k in best]
+    table = np.array(list(mapped(search.executor, _log_evidence, jobs))).reshape(len(jobs), -1)
+    if not table.size:
+        return found
+    largest = table.max(axis=0)
+    k = int(np.argmax(table[:, 0]))
+    p = float((1 + np.count_nonzero(largest[1:] >= largest[0])) / largest.size)
+    return replace(found, p=p, at=jobs[k].place, log_evidence=float(largest[0]))
+
+
+def _fall(job: _LatentJob) -> float:
+    """By how much more chi2 falls with a latent input at the place than noise would."""
+    fall, count = Inversion.of(job.nominal, job.paths, job.place).reach
+    return fall - count
+
+
+def _log_evidence(job: _LatentJob) -> Array:
+    """(1 + B,) log marginal likelihood of a latent input at the place, in nats: of the residual, then of records of noise."""
+    latent = Inversion.of(job.nominal, job.paths, job.place)
+    assert job.noise is not None
+    if not latent.strength.size:
+        return np.zeros(1 + job.noise.shape[1])
+    return latent.log_evidence(np.column_stack([latent.wanted, latent.against(job.noise)]))

@@ -1,0 +1,171 @@
+"""Tests of the residual against noise: sums over bins of time and of the signals, compared with the same sums of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtrc
+
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
+from hvdc_ident.discrepancy.placed import Placed
+from hvdc_ident.discrepancy.record_noise import draws
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.effects import effects
+
+BINS = 8
+AFTER = 10
+"""Rows after a break of an input in which a quick answer to it is looked for."""
+LOUDER = 4.0
+"""Standard deviations by which they have to be louder than the others."""
+
+
+@dataclass(frozen=True)
+class Binned:
+    """One binning of the residuals. statistic: sum of squared bin sums; expected: of noise; p: chance under noise.
+
+    excess: statistic - expected, in units of chi2.
+    """
+
+    name: str
+    statistic: float
+    expected: float
+    p: float
+
+    @property
+    def excess(self) -> float:
+        """Statistic beyond its expectation under noise, at least 0."""
+        return max(self.statistic - self.expected, 0.0)
+
+
+def residual_tests(
+    nominal: Nominal, signals: Mapping[str, Mapping[str, Array]], *, bootstraps: int, seed: int
+) -> tuple[Binned, ...]:
+    """The residuals over stretches of time, and over levels and slopes of each signal given (by name and experiment, at its rows)."""
+    blocks = nominal.blocks
+    noise = nominal.projected(
+        np.vstack(draws(nominal.problem, blocks, nominal.noise, nominal.fitted(), bootstraps, seed))
+    )
+    groups = {"time": _time_bins(nominal)}
+    for name, by_experiment in signals.items():
+        groups[f"level of {name}"] = _level_bins(nominal, by_experiment)
+    return tuple(_binned(n, g, nominal.residual, noise) for n, g in groups.items() if g.max(initial=-1) >= 0)
+
+
+def loud_after_breaks(nominal: Nominal) -> bool:
+    """Return True where the residual is louder in the first rows after a break of an input than elsewhere, by more than chance.
+
+    However loud the noise is, it knows nothing of the inputs; what answers within a few rows hardly shows in sums over more.
+    """
+    experiments = {e.name: e for e in nominal.problem.fitted_experiments}
+    near, squares = [], []
+    for b in nominal.blocks:
+        e = experiments[b.experiment]
+        breaks = [t for signal in e.inputs.values() for t in signal.breaks.tolist() if t > e.time[0]]
+        first = np.searchsorted(e.time[b.rows], breaks)
+        near.append(np.isin(np.arange(b.rows.size), np.add.outer(first, np.arange(AFTER))))
+        squares.append(b.squares)
+    at, power = np.concatenate(near), np.concatenate(squares)
+    if not at.any() or at.all():
+        return False
+    limit = 1.0 + LOUDER * float(np.sqrt(2.0 / np.count_nonzero(at)))
+    return bool(np.mean(power[at]) > limit * np.mean(power[~at]))
+
+
+def _binned(name: str, group: NDArray[np.intp], residual: Array, noise: Array) -> Binned:
+    count = int(group.max()) + 1
+    keep = group >= 0
+    sizes = np.maximum(np.bincount(group[keep], minlength=count), 1)
+
+    def statistic(r: Array) -> float:
+        sums = np.bincount(group[keep], weights=r[keep], minlength=count)
+        return float(np.sum(sums**2 / sizes))
+
+    under = np.array([statistic(noise[:, b]) for b in range(noise.shape[1])])
+    own = statistic(residual)
+    p = float((1 + np.count_nonzero(under >= own)) / (under.size + 1))
+    return Binned(name, own, float(under.mean()) if under.size else float(count), p)
+
+
+def _time_bins(nominal: Nominal) -> NDArray[np.intp]:
+    """Stretches after the event that double in length, and one before, for each output of each experiment."""
+    experiments = {e.name: e for e in nominal.problem.fitted_experiments}
+    found, first = [], 0
+    for b in nominal.blocks:
+        e = experiments[b.experiment]
+        t = e.time[b.rows]
+        event = e.event if e.event is not None else float(t[0])
+        span = max(float(t[-1]) - event, 1e-12)
+        edges = event + span * np.concatenate([[0.0], np.geomspace(2.0 ** -(BINS - 1), 1.0, BINS)])
+        found.append(first + np.clip(np.searchsorted(edges[:-1], t, "right"), 0, BINS))
+        first += BINS + 1
+    return np.concatenate(found)
+
+
+def _level_bins(nominal: Nominal, by_experiment: Mapping[str, Array]) -> NDArray[np.intp]:
+    """Levels of a signal, as many rows in each, rising and falling apart, for each output over all experiments."""
+    moving = {n: v for n, v in by_experiment.items() if np.ptp(v) > 0}
+    whole = np.concatenate(list(by_experiment.values())) if by_experiment else np.zeros(1)
+    size = float(np.ptp(whole))
+    outputs = list(nominal.problem.outputs)
+    if size == 0.0 or not moving:
+        return np.full(nominal.residual.size, -1, dtype=np.intp)
+    # Most rows of a record stand still: levels are even in value, then halved where there are many rows.
+    edges = np.unique(np.quantile(np.unique(np.round(whole / size, 4)) * size, np.linspace(0, 1, BINS + 1)[1:-1]))
+    found = []
+    for b in nominal.blocks:
+        v = by_experiment[b.experiment][b.rows]
+        slope = np.gradient(v) if v.size > 1 else np.zeros(v.size)
+        rising = (slope > 1e-4 * size).astype(int) - (slope < -1e-4 * size).astype(int) + 1
+        level = np.searchsorted(edges, v)
+        found.append((outputs.index(b.output) * 3 + rising) * (edges.size + 1) + level)
+    return np.concatenate(found).astype(np.intp)
+
+
+TOLD = 1e-4
+"""Share of a slope that has to be left by all the parameters for the data to tell of a size in one experiment alone."""
+
+
+@dataclass(frozen=True)
+class Constancy:
+    """Gain of one size per experiment. told: the fall of chi2; p: the chance of such a fall under noise."""
+
+    told: float
+    p: float
+
+
+NOTHING = Constancy(0.0, 1.0)
+
+
+def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
+    """F test, to first order, that the experiments ask for different sizes of an effect.
+
+    p = 1 where only one experiment tells of it, and for effects whose answer has steps in their size: those have
+    no slopes. left: the refit's residuals.
+
+    Source: Chow, Econometrica 28 (1960), as a score test.
+    """
+    names = left.problem.names
+    own = [names.index(n) for n in placed.names.values() if n in names]
+    if effects()[placed.candidate.effect].needs_grid or not own:
+        return NOTHING
+    more = _by_experiment(left, own)
+    spare = refit.effective - left.basis.shape[1] - more.shape[1]
+    if not more.shape[1] or spare < 1.0:
+        return NOTHING
+    remains = left.projected(left.residual)
+    told = float(np.sum((more.T @ remains) ** 2))
+    share = told / max(float(remains @ remains) - told, np.finfo(float).tiny)
+    return Constancy(told, float(fdtrc(more.shape[1], spare, share * spare / more.shape[1])))
+
+
+def _by_experiment(left: Nominal, own: list[int]) -> Array:
+    """(N, k) orthonormal, and to the basis: what other sizes in single experiments can make of the residual."""
+    slopes = np.vstack([b.jacobian for b in left.blocks])[:, own]
+    experiment = np.concatenate([np.full(b.residual.size, b.experiment) for b in left.blocks])
+    each = np.hstack([np.where((experiment == e)[:, None], slopes, 0.0) for e in dict.fromkeys(experiment.tolist())])
+    u, s, _ = np.linalg.svd(left.projected(unit_columns(each)), full_matrices=False)
+    return np.asarray(u[:, s > TOLD])

@@ -1,0 +1,341 @@
+"""The result of a diagnosis and its JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from hvdc_ident.display import Shown, data_frame
+from hvdc_ident.display import Table as TextTable
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import SteadyStateError
+from hvdc_ident.files import plain
+from hvdc_ident.immutable import FrozenMap
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from hvdc_ident.model import AnyModel
+
+
+Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
+AUGMENTED = "augmented-model.toml"
+SHOWN = 10
+"""Candidates in the figure, the best by BIC."""
+Table = Mapping[str, Mapping[str, float | None]]
+"""By output and experiment, in the output's unit; None where the run fails."""
+
+
+@dataclass(frozen=True)
+class EffectSize:
+    """A parameter of an effect, in `unit`. ci95: its 95 % interval; an end that is None is not known."""
+
+    value: float
+    ci95: tuple[float | None, float | None] | None = None
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect that was put into the model.
+
+    at: its slots. parameters: by the effect's own parameter names. text: one sentence. chosen_from: how many candidates
+    it was refitted against. source: the signal it brings in, for those that do.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    parameters: FrozenMap[EffectSize]
+    text: str
+    chosen_from: int
+    source: str = ""
+
+    @property
+    def late(self) -> float | None:
+        """By how long it delays a slow signal, s; None for what is no delay of any kind."""
+        return effects()[self.effect].delay_with({n: size.value for n, size in self.parameters.items()})
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A member of an ambiguity set. delta_bic: how far it is behind the best, 0 for the best itself.
+
+    refitted: whether that comes from a refit. expression: of a formula outside the catalogue, with its coefficients' names.
+    same_as: the member of the set that is the same equation at the same place; empty where none is.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    delta_bic: float
+    parameters: FrozenMap[float] = field(default_factory=FrozenMap)
+    source: str = ""
+    refitted: bool = True
+    expression: str = ""
+    same_as: str = ""
+
+    @property
+    def late(self) -> float | None:
+        """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
+        return effects()[self.effect].delay_with(self.parameters) if self.parameters else None
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an effect may be: its insertion points, the probability given the effect, and the signal that it brings in."""
+
+    at: tuple[str, ...]
+    probability: float
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is missing: an effect, wherever it is.
+
+    same_as: all names of it, its own first: effects that are the same equation there. probability: of the effect, summed over
+    its places. parameters: at the likeliest place; their intervals hold over the likely places. places: the likely ones, the
+    likeliest first. equivalent_delay: by how long it delays a slow signal, s, with its span over the places; None for what is no
+    delay. share: of the gap that it explains with the other findings.
+    """
+
+    effect: str
+    same_as: tuple[str, ...]
+    probability: float
+    parameters: FrozenMap[EffectSize]
+    places: tuple[Place, ...]
+    text: str
+    equivalent_delay: EffectSize | None = None
+    share: float | None = None
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A compared hypothesis: the effects in the model, by name and place; none for the nominal model.
+
+    log_evidence: in nats over the nominal model, of fitted and held-out data. held_out: root mean square of the held-out
+    residual in noise units. probability: among the hypotheses compared.
+    """
+
+    effects: tuple[str, ...]
+    log_evidence: float
+    held_out: float | None
+    probability: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """Score, p, size and status of one candidate effect.
+
+    score: T = (s'Mr)^2/(s'Ms) at its best size. p: chance of such a score anywhere, under the noise. delta_bic: gain over
+    the refitted nominal, None where not refitted. holdout_rmse: pooled in noise units. absorbed: share of its signature
+    that the fitted parameters take up. status: refitted, scored, not-excited, absorbed or failed: REASON.
+    detectable: the smallest size that would have been seen, None where none would.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    score: float
+    p: float
+    status: str
+    size: FrozenMap[float] = field(default_factory=FrozenMap)
+    delta_bic: float | None = None
+    holdout_rmse: float | None = None
+    absorbed: float | None = None
+    detectable: FrozenMap[float] | None = None
+    source: str = ""
+    round: int = 1
+
+
+@dataclass(frozen=True)
+class Gap:
+    """RMSE of three models against the data.
+
+    nominal: with the given gains; refitted: the same model, fitted; augmented: with the effects, fitted. Each by "fit"
+    and "holdout". noise_floor: standard deviation of the noise by output, in its unit. pooled: the same three by "fit"
+    and "holdout" in noise units. shrink_holdout: 1 - augmented/refitted on the held-out experiments, pooled.
+    held_out: what "holdout" is: experiments, or (with none of that role) parts of the fitted ones, predicted from the rest.
+    """
+
+    nominal: Mapping[str, Table]
+    refitted: Mapping[str, Table]
+    augmented: Mapping[str, Table]
+    noise_floor: FrozenMap[float]
+    pooled: Mapping[str, Mapping[str, float | None]]
+    shrink_holdout: float | None
+    held_out: str = "experiments"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Shown):
+    """The outcome of a diagnosis; `to_dict` is the JSON.
+
+    verdict: named, no-evidence, not-excited, ambiguous or unnameable; text: why, in one or two sentences.
+    effects: those put into the model. ambiguity: for each of them the candidates that are as good, the best first, where
+    there is more than one, or where that one is in doubt. doubt: what tells that something else stands behind the effects,
+    though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would tell them
+    apart, or show what was not excited or is in doubt.
+    candidates: every candidate's line, the best first. location: where model and data differ. detectable: smallest size
+    by candidate. gap: before and after. remaining: what is left. parameters_*: by name; `parameters_refitted` are the
+    nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.
+    fallback: the form found outside the catalogue, if one was looked for. bode: responses of nominal and augmented
+    models with the data's. noise: standard deviation and AR coefficient by output, and where they come from.
+    findings: what is missing, each effect with its probability and its likely places, the likeliest first. remainder: {share of
+    the gap, held_out, noise_units, p, at, below_tolerance}. hypotheses: those compared, the likeliest first. latent: by insertion
+    point {bound, curve}: the share of the gap that any effect there could explain, and by experiment {time, value} of what would
+    have to be added there (at the three best points; empty at the others).
+    """
+
+    verdict: Verdict
+    text: str
+    effects: tuple[FoundEffect, ...]
+    ambiguity: tuple[tuple[Rival, ...], ...]
+    separating_experiment: Mapping[str, Any]
+    candidates: tuple[Line, ...]
+    location: Mapping[str, Any]
+    detectable: Mapping[str, Any]
+    gap: Gap
+    remaining: Mapping[str, Any]
+    parameters_before: FrozenMap[float]
+    parameters_refitted: FrozenMap[float]
+    parameters_after: FrozenMap[float]
+    augmented: AnyModel | None = None
+    fallback: Mapping[str, Any] | None = None
+    bode: tuple[Mapping[str, Any], ...] = ()
+    noise: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    doubt: str = ""
+    findings: tuple[Finding, ...] = ()
+    remainder: Mapping[str, Any] = field(default_factory=dict)
+    hypotheses: tuple[Hypothesis, ...] = ()
+    latent: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The diagnosis as JSON takes it; `augmented_model` is the name of the card that `files` holds."""
+        out = {
+            name: plain(getattr(self, name))
+            for name in self.__dataclass_fields__
+            if name not in ("augmented", "candidates", "effects", "ambiguity", "findings")
+        }
+        out["effects"] = [_member(e) for e in self.effects]
+        out["ambiguity"] = [[_member(r) for r in group] for group in self.ambiguity]
+        out["findings"] = [plain(f) | {"places": [_named(p) for p in f.places]} for f in self.findings]
+        out["candidates"] = [_named(line) for line in self.candidates]
+        out["augmented_model"] = next(iter(self.files), None)
+        return out
+
+    @property
+    def files(self) -> dict[str, str]:
+        """The augmented model's card by its file name; empty where nothing was put in, or the model has no card (an FMU).
+
+        Its description says that the values are the fitted ones, and which were given.
+        """
+        from hvdc_ident.model import Model, write_card
+        from hvdc_ident.simulate import with_guesses
+
+        if not isinstance(self.augmented, Model):
+            return {}
+        try:
+            card = with_guesses(self.augmented)
+        except SteadyStateError:  # at inputs that only its experiments give it
+            card = self.augmented
+        given = ", ".join(f"{n} {v:.6g}" for n, v in self.parameters_before.items())
+        about = (self.augmented.description or self.augmented.name).rstrip(". ")
+        about += f"; fitted values, with what was added to the model; given were {given}"
+        return {AUGMENTED: write_card(replace(card, description=about))}
+
+    def _screen(self) -> Iterator[str | TextTable]:
+        yield f"Diagnosis: {self.verdict}. {self.text}"
+        rows = [
+            (e.effect, ", ".join(e.at), n, size.value, size.unit, _span(size.ci95))
+            for e in self.effects
+            for n, size in e.parameters.items()
+        ]
+        header = ("effect", "at", "parameter", "value", "unit", "95 % interval")
+        yield TextTable(header, tuple(rows)) if rows else ""
+        gaps = [
+            (words, self.gap.pooled[n]["fit"], self.gap.pooled[n]["holdout"])
+            for n, words in (("nominal", "given values"), ("refitted", "refitted"), ("augmented", "with effects"))
+        ]
+        yield TextTable(("residual in noise units", "fitted data", "held out"), tuple(gaps))
+        if self.gap.shrink_holdout is not None and self.effects:
+            yield f"The held-out gap shrinks by {100 * self.gap.shrink_holdout:.1f} %."
+        found = [
+            (f.effect, f.probability, "; ".join(", ".join(p.at) for p in f.places[:4]), len(f.places))
+            for f in self.findings
+        ]
+        yield TextTable(("missing", "probability", "likely at", "places"), tuple(found)) if found else ""
+        changed = [
+            (n, self.parameters_before[n], self.parameters_refitted[n], v) for n, v in self.parameters_after.items()
+        ]
+        yield TextTable(("parameter", "given", "refitted", "with effects"), tuple(changed)) if changed else ""
+        advice = (self.separating_experiment or {}).get("text")
+        yield f"Measure next: {advice}" if advice else ""
+        yield "\n".join(self.notes)
+
+    def to_dataframe(self) -> Any:
+        """Return the candidate effects as a pandas DataFrame, the best first. Raises InputError where pandas is missing."""
+        columns: dict[str, Any] = {
+            "effect": [c.effect for c in self.candidates],
+            "at": [", ".join(c.at) for c in self.candidates],
+            "score": [c.score for c in self.candidates],
+            "p": [c.p for c in self.candidates],
+            "delta_bic": [c.delta_bic for c in self.candidates],
+            "holdout_rmse": [c.holdout_rmse for c in self.candidates],
+            "status": [c.status for c in self.candidates],
+        }
+        return data_frame(columns)
+
+    def plot(self) -> Figure:
+        """Bar charts: the pooled gap of the three models on fitted and held-out data, and the BIC of the best candidates."""
+        import numpy as np
+        from matplotlib.figure import Figure
+
+        fig = Figure(figsize=(10.0, 4.2), layout="constrained")
+        left, right = fig.subplots(1, 2, width_ratios=[1.0, 1.4])
+        names = ["nominal", "refitted", "augmented"]
+        width = 0.38
+        for k, (part, label) in enumerate((("fit", "fitted"), ("holdout", "held out"))):
+            values = [self.gap.pooled[n][part] for n in names]
+            at = np.arange(3) + (k - 0.5) * width
+            left.bar(
+                at, [np.nan if v is None else v for v in values], width, label=label, color=("#1f5fa8", "#d08020")[k]
+            )
+        left.axhline(1.0, color="#222222", linewidth=1.0, linestyle=":", label="noise")
+        left.set_yscale("log")
+        left.set_xticks(range(3), ["given gains", "refitted", "with effect"])
+        left.set_ylabel("residual in noise units")
+        left.legend(fontsize="small")
+        refitted = [c for c in self.candidates if c.delta_bic is not None and c.round == 1]
+        best = sorted(refitted, key=lambda c: -(c.delta_bic or 0.0))[:SHOWN][::-1]
+        if best:
+            right.barh(range(len(best)), [c.delta_bic or 0.0 for c in best], color="#1f5fa8")
+            labels = [f"{c.effect} at {', '.join(c.at)}" + (f" from {c.source}" if c.source else "") for c in best]
+            right.set_yticks(range(len(best)), labels, fontsize="small")
+            right.set_xlabel("gain in BIC over the refitted model")
+        else:
+            right.set_axis_off()
+            right.text(0.5, 0.5, "no candidate was refitted", ha="center", va="center", transform=right.transAxes)
+        fig.suptitle(
+            f"{self.verdict}: {', '.join(e.text for e in self.effects) or self.text}",
+            fontsize="medium",
+            wrap=True,
+        )
+        return fig
+
+
+def _span(ci95: tuple[float | None, float | None] | None) -> str:
+    low, high = ci95 or (None, None)
+    return "" if low is None or high is None else f"{low:.4g} to {high:.4g}"
+
+
+def _named(value: FoundEffect | Rival | Line | Place) -> dict[str, Any]:
+    """A line with `from` only where a signal is brought in."""
+    out = {k: plain(getattr(value, k)) for k in value.__dataclass_fields__ if k != "source"}
+    return out | ({"from": value.source} if value.source else {})
+
+
+def _member(value: FoundEffect | Rival) -> dict[str, Any]:
+    """Return the line of `_named`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
+    out = {k: v for k, v in _named(value).items() if k not in ("expression", "same_as") or v}
+    return out | ({} if value.late is None else {"late": value.late})

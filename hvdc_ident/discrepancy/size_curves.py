@@ -1,0 +1,114 @@
+"""Responses of the augmented model over a range of sizes of the named effect, for the report's slider."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from hvdc_ident.data import Experiment
+from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
+from hvdc_ident.effects import EffectUse, apply_effects, effects
+from hvdc_ident.errors import ComputationError, SteadyStateError
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import Model
+from hvdc_ident.simulate import simulate
+from hvdc_ident.text import quantity
+
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+"""Of the way from the neutral size to the one that was found; 0 is the model without the effect, gains as found with it."""
+
+
+def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosis) -> dict[str, Any] | None:
+    """The output the effect matters most for, recorded and simulated at several sizes; None without an effect.
+
+    Keys: effect, at, parameter, unit, experiment, output, time (n) in s, measured (n), sizes [value or None for
+    absent], shares, labels, chosen (which of them was found), curves [(n)]. The other effects and the parameters stay
+    as found. A size at which the model cannot be run is left out.
+    """
+    if not found.effects or found.augmented is None:
+        return None
+    place = _where_it_matters(found)
+    chosen = next((e for e in experiments if place and e.name == place[1] and e.measured is not None), None)
+    if place is None or chosen is None:
+        return None
+    first = found.effects[0]
+    name = next(iter(first.parameters))
+    size = first.parameters[name]
+    neutral = _neutral(first, effects()[first.effect].parameters[name].neutral)
+    rows = chosen.compared
+    shown: dict[str, list[Any]] = {"sizes": [], "shares": [], "labels": [], "curves": []}
+    for share in SHARES:
+        value = _size(size.value, neutral, share)
+        try:
+            run = simulate(_with(model, found, value), chosen, found.parameters_after, outputs=[place[0]])
+        except (ComputationError, SteadyStateError):  # as where a smaller limit leaves no rest to begin at
+            continue
+        shown["sizes"].append(value)
+        shown["shares"].append(share)
+        shown["labels"].append("without it" if value is None else f"{name} = {quantity(value, size.unit)}")
+        shown["curves"].append(run[place[0]][rows].tolist())
+    assert chosen.measured is not None
+    return {
+        "effect": first.effect,
+        "at": list(first.at),
+        "parameter": name,
+        "unit": size.unit,
+        "experiment": chosen.name,
+        "output": place[0],
+        "output_unit": model.outputs[place[0]].unit if place[0] in model.outputs else "",
+        "time": chosen.time[rows].tolist(),
+        "measured": chosen.measured[place[0]][rows].tolist(),
+        "chosen": shown["shares"].index(1.0) if 1.0 in shown["shares"] else None,
+        **shown,
+    }
+
+
+def _where_it_matters(found: Diagnosis) -> tuple[str, str] | None:
+    """Output and experiment, held out where there are any, whose error in noise units falls most."""
+    best: tuple[float, tuple[str, str]] | None = None
+    for role in ("holdout", "fit"):
+        before, after = found.gap.refitted.get(role) or {}, found.gap.augmented.get(role) or {}
+        for output, line in before.items():
+            unit = found.gap.noise_floor.get(output) or 1.0
+            for experiment, was in line.items():
+                now = (after.get(output) or {}).get(experiment)
+                if was is None or now is None:
+                    continue
+                gain = (was - now) / unit
+                if best is None or gain > best[0]:
+                    best = gain, (output, experiment)
+        if best is not None:
+            return best[1]
+    return None
+
+
+def _neutral(effect: FoundEffect, neutral: float | str | None) -> float:
+    """The size at which the effect is not there; for some that is the value of another of its parameters."""
+    if isinstance(neutral, str):
+        other = effect.parameters.get(neutral)
+        return other.value if other is not None else 0.0
+    return neutral if neutral is not None else 0.0
+
+
+def _size(value: float, neutral: float, share: float) -> float | None:
+    """The size at a share of the way from neutral; None at neutral itself."""
+    if share == 0.0:
+        return None
+    return value / share if math.isinf(neutral) else neutral + share * (value - neutral)
+
+
+def _with(model: Model, found: Diagnosis, value: float | None) -> Model:
+    """The model with the effects as found, the first one at another size, or without it."""
+    first = found.effects[0]
+    for effect in found.effects:
+        if effect is not first:
+            model = apply_effects(model, [_use(effect, {}).within(model)])
+        elif value is not None:
+            model = apply_effects(model, [_use(first, {next(iter(first.parameters)): value})])
+    return model
+
+
+def _use(effect: FoundEffect, other: Mapping[str, float]) -> EffectUse:
+    sizes: dict[str, float | str] = {n: s.value for n, s in effect.parameters.items()}
+    return EffectUse(effect.effect, effect.at, FrozenMap(sizes | dict(other)), source=effect.source)

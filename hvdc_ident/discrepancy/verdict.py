@@ -1,0 +1,350 @@
+"""The verdict: named, ambiguous, unnameable, no evidence, or not excited."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.data import Array, event_time
+from hvdc_ident.discrepancy.alternatives import beyond
+from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, finding, formula_rivals, likely, rivals
+from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.evidence import material_gap, worst
+from hvdc_ident.discrepancy.explain import moved_parameters
+from hvdc_ident.discrepancy.formula import Law
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.record_noise import FEWEST
+from hvdc_ident.discrepancy.refit import Refit, signal, unseen
+from hvdc_ident.discrepancy.remainder import TOLERANCE, Remainder, remainder_of
+from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
+from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, Verdict
+from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.effects import effects
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.text import listed
+
+DOMINANT = 0.5
+"""Share of the gap that what is named has to explain."""
+REFUTED = 0.1
+"""The same from which the effect's form is refuted, where what is left is no noise."""
+OUTSIDE = ("term", "filter")
+"""Forms that no name of the catalogue stands for."""
+REFUTED_P = 0.01
+STRONG = 0.1
+"""Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
+that has no name: less is what a wrong idea of the noise makes."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict, why, and the tests of what is left.
+
+    sets: by effect that was put in, it and what cannot be told from it. experiment: what would show more where nothing was
+    excited, or what the doubt is about. instead: the refit of a formula outside the catalogue that explains more than what
+    would have been named. doubt: what tells that something else stands behind what was put in, though nothing else that
+    was tried explains as much.
+    """
+
+    verdict: Verdict
+    text: str
+    tests: tuple[Binned, ...]
+    sets: tuple[tuple[Rival, ...], ...] = ()
+    experiment: Mapping[str, Any] = field(default_factory=dict)
+    instead: Law | None = None
+    doubt: str = ""
+    remainder: Remainder | None = None
+
+
+def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgement:
+    """The verdict on a search that has ended."""
+    options, last = search.options, outcome.refit
+    left = last.nominal()
+    tests = tests_of(search, last)
+    if not outcome.kept:
+        return _nothing(search, last, outcome, tests)
+    floor = noise_left(left)
+    # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
+    if all(b.p > REFUTED_P for b in tests):
+        floor = max(floor, last.chi2 / last.rows)
+    remainder = remainder_of(search, first, last, floor)
+    labels = ", ".join(p.candidate.label for p in last.placed)
+    if remainder.share > 1.0 - DOMINANT:
+        text = f"Something is missing; the best of the catalogue ({labels}) explains only {1 - remainder.share:.0%} of the gap."
+        return Judgement("unnameable", text, tests, remainder=remainder)
+    sets = tuple(rivals(r, options, search.tries) for r in outcome.kept)
+    sets, better = _with_formulas(search, outcome, sets)
+    if better is not None:
+        text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
+        return Judgement("unnameable", text, tests, instead=better, remainder=remainder)
+    explained = first.chi2 - last.chi2
+    return _weighed(outcome, left, explained, Judgement("named", "", tests, sets, remainder=remainder), labels)
+
+
+def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str) -> Judgement:
+    """The judgement: named, ambiguous where several classes are likely or something else may be behind one, or unnameable where
+    too much is left that a latent input would explain."""
+    assert found.remainder is not None
+    remainder, each = found.remainder, [classes(g) for g in found.sets]
+    sure = all(c[0].probability >= CERTAIN for c in each)
+    names = ", ".join(_class_text(c) for c in each)
+    rest = _rest(remainder)
+    if rest and remainder.largest > REFUTED:
+        if all(c[0].probability >= CERTAIN for c in each) or _all_of_one_kind(found.sets):
+            text = f"Missing: something like {names}. It is not all of it: {rest}."
+            return replace(
+                found,
+                verdict="ambiguous",
+                text=text,
+                doubt=rest,
+                experiment={"text": remains(_names(found), rest).advice},
+            )
+        text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {rest}."
+        return replace(found, verdict="unnameable", text=text, sets=())
+    against = doubt(outcome.refit, left, explained)
+    if against is None and rest and remainder.largest > TOLERANCE:
+        against = remains(_names(found), rest)
+    if against is not None and sure:
+        return _in_doubt(found, labels, against)
+    return replace(found, verdict="named" if sure else "ambiguous", text=f"Missing: {names}.")
+
+
+def findings_of(
+    search: SearchContext, outcome: SearchOutcome, judgement: Judgement, placed: Sequence[FoundEffect]
+) -> tuple[Finding, ...]:
+    """What is missing, as far as it is told: of each effect that was put in the likely classes; and the values of parameters
+    that were held and are off.
+
+    placed: the effects that were put in, with their sentences.
+    """
+    share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
+    found: list[Finding] = []
+    for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
+        for one in likely(classes(group)):
+            best = one.members[0][0]
+            sentence = own.text if (best.effect, best.at, best.source) == (own.effect, own.at, own.source) else ""
+            found.append(replace(finding(of, one, sentence), share=share))
+    freed = {f.name for f in search.held} & set(outcome.refit.problem.names)
+    if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
+        found.append(replace(moved, share=share))
+    return tuple(found)
+
+
+def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
+    """The verdict in one or two sentences."""
+    left = judgement.remainder
+    if judgement.verdict != "named" or left is None:
+        return judgement.text
+    explains = "Together they explain" if len(findings) > 1 else "It explains"
+    rest = f"what remains is {left.noise_units:.3g} times the noise" + (
+        ", which changes nothing" if left.below_tolerance else ""
+    )
+    return f"{' '.join(f.text for f in findings)} {explains} {1.0 - left.share:.1%} of the gap; {rest}."
+
+
+def _rest(remainder: Remainder) -> str:
+    """What is left, in words; empty where that may be noise."""
+    parts = []
+    if remainder.p <= REFUTED_P and remainder.share > TOLERANCE:
+        parts.append(
+            f"{remainder.share:.1%} of the gap is left and is no noise; an unknown input at {remainder.at} would explain it"
+        )
+    if (remainder.held_out or 0.0) > TOLERANCE and remainder.held_out_p <= REFUTED_P:
+        record = f", most of it in '{remainder.record}' ({remainder.record_units:.3g} times the noise)"
+        parts.append(f"{remainder.held_out:.1%} of the held-out gap is left{record if remainder.record else ''}")
+    return " and ".join(parts)
+
+
+def _names(found: Judgement) -> list[str]:
+    return [g[0].effect for g in found.sets]
+
+
+def _class_text(each: Sequence[EffectClass]) -> str:
+    """The classes of one effect in words, those that hold 95 % together."""
+    told = []
+    for c in likely(each):
+        places = len({(r.at, r.source) for r, _ in c.members})
+        where = f"{listed(c.members[0][0].at)}" + (f" or one of {places - 1} other places" if places > 1 else "")
+        told.append(f"{c.names[0]} at {where} ({c.probability:.0%})")
+    return ", or ".join(told)
+
+
+def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
+    """Tests of the residual against noise, over time and over the signals at the slots of the effects."""
+    return residual_tests(last.nominal(), _signals(last), bootstraps=search.options.bootstraps, seed=search.seed)
+
+
+def _with_formulas(
+    search: SearchContext, outcome: SearchOutcome, sets: tuple[tuple[Rival, ...], ...]
+) -> tuple[tuple[tuple[Rival, ...], ...], Law | None]:
+    """The sets with formulas from outside the catalogue that explain as much, and a formula that explains more than an effect does.
+
+    They are tried in the stead of an effect that would be named by the catalogue alone, unless no form outside it is asked for.
+    """
+    wider: list[tuple[Rival, ...]] = []
+    for found, group in zip(outcome.kept, sets, strict=True):
+        if not search.options.fallback or classes(group)[0].probability < CERTAIN:
+            wider.append(group)
+            continue
+        formulas = beyond(search, found)
+        behind, near = formula_rivals(found, formulas, search.options)
+        if np.isinf(behind):
+            best = max(formulas, key=lambda t: t.told)
+            return (), Law(best.refit, best.gain)
+        wide = (*(replace(r, delta_bic=r.delta_bic + behind) for r in group), *near)
+        if classes(wide)[0].names[0] in OUTSIDE and classes(wide)[0].probability >= CERTAIN:
+            best = max(formulas, key=lambda t: t.told)
+            return (), Law(best.refit, best.gain)
+        wider.append(wide)
+    return tuple(wider), None
+
+
+def _in_doubt(found: Judgement, labels: str, against: Doubt) -> Judgement:
+    """Ambiguous, though nothing else that was tried explains as much."""
+    they = "they" if len(found.sets) > 1 else "it"
+    text = f"Missing: something like {labels}; {against.why}, so {they} may stand for something that is none of those tried."
+    return replace(found, verdict="ambiguous", text=text, experiment={"text": against.advice}, doubt=against.why)
+
+
+def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
+    """Return True where all that explain most of a gap are of one kind: it is told then, though none of them is to be believed."""
+    return max(len(g) for g in sets) > 1 and all(_one_kind(g) for g in sets)
+
+
+def _one_kind(group: Sequence[Rival]) -> bool:
+    """Return True where the members of a set are one effect at several places, or delays of one kind or another."""
+    return len({r.effect for r in group}) == 1 or all(effects()[r.effect].equivalent_delay is not None for r in group)
+
+
+def noise_left(left: Nominal) -> float:
+    """The mean square that noise alone leaves in whitened residuals, from the rows before the events; at least 1.
+
+    It is 1 where the noise is as supposed. AR coefficients from few rows are not: with a standard deviation that is
+    given, a coefficient that is wrong by a tenth makes of whitened noise half or three times its size.
+    """
+    experiments = {e.name: e for e in left.problem.fitted_experiments}
+    rows: dict[str, int] = {}
+    quiet: dict[str, list[Array]] = {}
+    for b in left.blocks:
+        e = experiments[b.experiment]
+        event = e.event if e.event is not None else event_time(e.inputs)
+        rows[b.output] = rows.get(b.output, 0) + b.residual.size
+        if event is not None and b.slope is None:  # one level between two steps is no measure of the others
+            quiet.setdefault(b.output, []).append(b.residual[e.time[b.rows] < event - 1e-12])
+    total = 0.0
+    for output, count in rows.items():
+        own = np.concatenate(quiet.get(output) or [np.zeros(0)])
+        total += count * (float(np.mean(own**2)) if own.size >= FEWEST else 1.0)
+    return max(total / max(sum(rows.values()), 1), 1.0)
+
+
+def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Judgement:
+    found = outcome.rounds[-1]
+    options = search.options
+    if found.law is not None:
+        text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
+        return Judgement("unnameable", text, tests, instead=found.law)
+    was = unseen(last)
+    gap_there = material_gap(
+        was, 1.0, options.holdout_share, search.tolerance, (worst(last), dict.fromkeys(search.tolerance, 0.0))
+    )
+    refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
+    fitted = float(np.sqrt(last.chi2 / last.rows)) > 1.0 + options.holdout_share
+    strong = found.significant and float(found.scores.t.max(initial=0.0)) > STRONG * last.rows
+    if (gap_there or (fitted and not search.tolerance)) and (strong or refused):
+        why = found.why or "the residuals are not noise"
+        return Judgement(
+            "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
+        )
+    usable = found.scores.usable
+    if not usable.any():
+        still = list(dict.fromkeys(c.effect for c in found.candidates))
+        text = "None of the effects looked for is excited by these experiments."
+        advice = {"text": ". ".join(f"{e}: {effects()[e].excited_by}" for e in still)}
+        return Judgement("not-excited", text, tests, experiment=advice)
+    if found.significant:
+        return Judgement("no-evidence", f"No gap that matters: {found.why}.", tests)
+    return Judgement("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)
+
+
+def _signals(last: Refit) -> dict[str, dict[str, Array]]:
+    """The signal at the slots of each effect that was put in, at the rows of every fitted experiment."""
+    found: dict[str, dict[str, Array]] = {}
+    for place in dict.fromkeys(p for placed in last.placed for p in placed.candidate.at):
+        with suppress(SimulationError):  # a place whose signal cannot be had bounds no region
+            found[place] = signal(last, place)
+    return found
+
+
+TRIFLE = 0.005
+"""Share of what is explained of which nothing is made: of real records no model leaves noise alone."""
+VARYING_P = 1e-4
+"""Chance under noise of experiments that agree on a size: the test is of first order, and a name is not to be lost by that."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why something else may stand behind what was put in, as a sentence goes on; advice: the experiment that would show it."""
+
+    why: str
+    advice: str
+
+
+def doubt(last: Refit, left: Nominal, explained: float) -> Doubt | None:
+    """An objection to the form of the effects in the refit `last`; None where there is none.
+
+    left: its residuals; explained: by how much chi2 fell, beside which a disagreement is nothing.
+    """
+    return _one_way(last) or _varying(last, left, explained)
+
+
+def remains(names: Sequence[str], left: str) -> Doubt:
+    """Doubt because more than noise is left: the true effect leaves nothing, one in its place does.
+
+    A relay looks like a coupling with a backlash, or like a quantiser. names: the effects that were put in; left: where the
+    rest is, as a sentence.
+    """
+    each = list(dict.fromkeys(names))
+    apart = "Each of them by itself. " if len(names) > 1 else ""
+    return Doubt(left, apart + ". ".join(f"{n}: {effects()[n].excited_by}" for n in each))
+
+
+def _one_way(last: Refit) -> Doubt | None:
+    """Doubt because a play was passed in one direction only: whatever shifts a signal once it has moved does the same."""
+    for placed in last.placed:
+        width = last.sizes(placed).get(effects()[placed.candidate.effect].reversal)
+        if width is None:
+            continue
+        try:
+            seen = [u for place in placed.candidate.at for u in signal(last, place).values()]
+        except SimulationError:  # of a place whose signal cannot be had nothing is known
+            continue
+        if not any(_turned(u, width) for u in seen):
+            return Doubt(
+                f"in no record does the signal at {placed.candidate.at[0]} turn by more than {width:.3g}",
+                f"{placed.candidate.effect}: {effects()[placed.candidate.effect].excited_by}.",
+            )
+    return None
+
+
+def _turned(u: Array, width: float) -> bool:
+    """Return True where a signal that has moved turns and goes back by more than a width."""
+    risen, fallen = u - np.minimum.accumulate(u), np.maximum.accumulate(u) - u
+    # After a turn both are large at once: how far it rose before its highest value yet, and how far it fell from there.
+    return bool(
+        np.any(np.minimum(np.maximum.accumulate(risen), fallen) > width)
+        or np.any(np.minimum(np.maximum.accumulate(fallen), risen) > width)
+    )
+
+
+def _varying(last: Refit, left: Nominal, explained: float) -> Doubt | None:
+    """Doubt because the experiments ask for different sizes of an effect."""
+    for placed in last.placed:
+        found, label = constancy(last, left, placed), placed.candidate.label
+        if found.p < VARYING_P and found.told > TRIFLE * explained:
+            why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
+            return Doubt(why, f"The same input in several sizes, in which {label} answers.")
+    return None

@@ -1,0 +1,81 @@
+"""What is told of a diagnosis: parameters as findings, places apart from effects, and what is left."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from cases import FREE, SIGMA, TRUE, experiments, model
+from refits import beside, plain
+
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.refit import run
+from hvdc_ident.discrepancy.remainder import remainder_of
+from hvdc_ident.immutable import FrozenMap
+
+GIVEN = {"Kp": 2.6, "Ki": 9.0}
+SEARCH = SearchContext("all", None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+
+
+@pytest.fixture(scope="module")
+def lagged() -> Diagnosis:
+    return diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "gain", "offset"], seed=1)
+
+
+def test_a_parameter_that_explains_the_gap_is_the_finding() -> None:
+    free = [replace(f, given=GIVEN[f.name]) for f in FREE]
+    found = diagnose(model(), experiments(), free, effects=["lag", "gain"], seed=1)
+    assert found.verdict == "no-evidence" and not found.effects
+    (told,) = found.findings
+    assert told.effect == "parameter" and set(told.parameters) == {"Kp", "Ki"}
+    for name, size in told.parameters.items():
+        assert size.ci95 is not None and size.ci95[0] is not None and size.ci95[1] is not None
+        assert size.ci95[0] < TRUE[name] < size.ci95[1]
+    assert found.text.startswith("No effect is missing: Kp is 2") and "not 2.6" in found.text
+
+
+def test_where_no_value_is_off_there_is_no_finding() -> None:
+    free = [replace(f, given=TRUE[f.name]) for f in FREE]
+    found = diagnose(model(), experiments(), free, effects=["lag", "gain"], seed=1)
+    assert found.verdict == "no-evidence" and not found.findings
+
+
+def test_a_finding_has_its_probability_and_places(lagged: Diagnosis) -> None:
+    assert lagged.verdict == "named"
+    (told,) = lagged.findings
+    assert told.effect == "lag" and told.probability > 0.95
+    assert sum(p.probability for p in told.places) == pytest.approx(1.0, abs=0.06)
+    assert told.equivalent_delay is not None and told.equivalent_delay.value == pytest.approx(0.03, rel=0.05)
+    assert told.share is not None and told.share > 0.95
+    assert "It explains" in lagged.text and "times the noise" in lagged.text
+
+
+def test_the_json_of_findings(lagged: Diagnosis) -> None:
+    told = json.loads(json.dumps(lagged.to_dict(), allow_nan=False))
+    (found,) = told["findings"]
+    assert {"effect", "same_as", "probability", "parameters", "equivalent_delay", "places", "text"} <= set(found)
+    assert {"at", "probability"} <= set(found["places"][0])
+    assert {"share", "held_out", "noise_units", "p", "below_tolerance"} <= set(told["remainder"])
+    best = told["hypotheses"][0]
+    assert best["effects"] and best["log_evidence"] > 100.0 and 0.0 <= best["probability"] <= 1.0
+    assert all(entry["bound"] >= 0.0 for entry in told["latent"].values())
+
+
+def test_what_is_left_of_the_right_effect_is_noise_and_of_a_wrong_one_is_not() -> None:
+    first = plain(experiments(lag=0.03))
+    right = remainder_of(SEARCH, first, run(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-3, 0.3)})), 1.0)
+    wrong = remainder_of(SEARCH, first, run(beside(first, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})), 1.0)
+    assert right.p > 0.01 and right.share < 0.02
+    assert wrong.p <= 0.01 and wrong.share > 0.1 and wrong.log_evidence > 20.0
+
+
+def test_of_noise_alone_a_latent_input_is_as_likely_as_chance_has_it() -> None:
+    chances = []
+    for seed in range(4):
+        records = plain(experiments(seed=seed))
+        loud = replace(records, chi2=records.chi2 + 100.0)
+        chances.append(remainder_of(SEARCH, loud, records, 1.0).p)
+    assert min(chances) > 0.01 and max(chances) > 0.2
+    assert set(SIGMA) == set(model().outputs)

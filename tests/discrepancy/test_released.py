@@ -1,0 +1,50 @@
+"""A parameter that the report held, and whose value is wrong, is a hypothesis beside the effects. Records: scipy, in `cases`."""
+
+from __future__ import annotations
+
+import pytest
+from cases import FREE, experiments, model
+
+from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.fit import FitParameter
+
+FRICTION = 0.45
+CANDIDATES = (*FREE, FitParameter("b", 0.3, 0.01, 2.0))
+VERDICTS = {"Kp": "identifiable", "Ki": "identifiable", "b": "weak"}
+REPORT = {
+    "identifiable": ["Kp", "Ki"],
+    "not_judged": [],
+    "parameters": {n: {"verdict": v, "unit": "", "conditional_on": ()} for n, v in VERDICTS.items()},
+    "held": {"b": {"value": 0.3, "reason": "the model does not fit"}},
+}
+"""A report that a misfit has kept from telling the friction, which is held at a wrong value."""
+TRIED = ["lag", "coupling", "gain", "loss", "conductance"]
+"""Among them those that put a wrong friction into words as an effect."""
+
+
+def test_a_wrong_value_of_a_held_parameter_is_the_finding_and_no_effect() -> None:
+    found = diagnose(model(), experiments(drag=lambda w: FRICTION * w), CANDIDATES, effects=TRIED, report=REPORT)
+    assert found.verdict == "no-evidence" and not found.effects
+    assert found.findings[0].effect == "parameter"
+    assert "No effect is missing" in found.text and "b is 0.4" in found.text and "not 0.3" in found.text
+    assert found.parameters_after["b"] == pytest.approx(FRICTION, rel=0.01)
+    assert found.gap.pooled["augmented"]["holdout"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_beside_a_missing_effect_the_held_parameter_is_set_free_and_told() -> None:
+    data = experiments(lag=0.03, drag=lambda w: FRICTION * w)
+    found = diagnose(model(), data, CANDIDATES, effects=TRIED, report=REPORT)
+    assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))]
+    assert found.verdict == "named"
+    assert found.effects[0].parameters["T"].value == pytest.approx(0.03, rel=0.02)
+    assert found.parameters_after["b"] == pytest.approx(FRICTION, rel=0.01)
+    (friction,) = [f for f in found.findings if f.effect == "parameter"]
+    low, high = friction.parameters["b"].ci95 or (None, None)
+    assert low is not None and high is not None and low < FRICTION < high
+
+
+def test_a_held_parameter_whose_value_is_right_stays_held() -> None:
+    found = diagnose(model(), experiments(lag=0.03), CANDIDATES, effects=TRIED, report=REPORT)
+    assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))]
+    assert found.parameters_after["b"] == 0.3
+    assert not [f for f in found.findings if f.effect == "parameter"]
