@@ -6,7 +6,7 @@ has three phases with instantaneous voltages and currents, and the control turns
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,24 +14,23 @@ from hidden.plant import Array, Plant, See
 
 SPEED = 2.0 * np.pi * 50.0
 """rad/s, nominal."""
-THIRDS = tuple(2.0 * np.pi / 3.0 * k for k in range(3))
+_BEHIND = 2.0 * np.pi / 3.0 * np.arange(3)[:, None]
+COSINES, SINES = np.cos(_BEHIND), np.sin(_BEHIND)
+"""Of the angles by which the phases are behind the first one, (3, 1)."""
 
 
-def _turns(angle: Array) -> tuple[list[Array], list[Array]]:
-    """Return cosines and sines of an angle as the three phases see it."""
+def _turns(angle: Array) -> tuple[Array, Array]:
+    """Return cosine and sine of an angle (runs,) as the three phases see it, each (3, runs)."""
     cos, sin = np.cos(angle), np.sin(angle)
-    return (
-        [cos * np.cos(third) + sin * np.sin(third) for third in THIRDS],
-        [sin * np.cos(third) - cos * np.sin(third) for third in THIRDS],
-    )
+    return cos * COSINES + sin * SINES, sin * COSINES - cos * SINES
 
 
-def _sum(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    """Return the sum over the phases of the products."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _sum(a: Array, b: Array) -> Array:
+    """Return (runs,), the sum over the phases of the products."""
+    return np.asarray(np.add.reduce(a * b))
 
 
-def _park(phases: Sequence[Array], turns: tuple[list[Array], list[Array]]) -> tuple[Array, Array]:
+def _park(phases: Array, turns: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return the components along an angle and a quarter of a turn ahead of it, of three phases that sum to zero."""
     cos, sin = turns
     return 2.0 / 3.0 * _sum(phases, cos), -2.0 / 3.0 * _sum(phases, sin)
@@ -40,7 +39,7 @@ def _park(phases: Sequence[Array], turns: tuple[list[Array], list[Array]]) -> tu
 def _converter(x: list[Array], u: Mapping[str, Array], p: Mapping[str, Array], see: See) -> list[Array]:
     active_order, reactive_order, grid, shift = (see(n, u[n]) for n in ("Pref", "Qref", "Vg", "phi"))
     turned = SPEED * u["time"]
-    amps = x[:3]
+    amps = np.array(x[:3])
     theta, x_loop, x_d, x_q, x_p, x_r, seen_d, seen_q, p_seen, q_seen = (
         see(n, x[3 + k]) for k, n in enumerate(list(CONVERTER.states)[3:])
     )
@@ -54,16 +53,15 @@ def _converter(x: list[Array], u: Mapping[str, Array], p: Mapping[str, Array], s
     d_error, q_error_i = see("erd", d_order - i_d), see("erq", q_order - i_q)
     v_d = see("vcd", seen_d + p["KPC"] * d_error + x_d - p["Lf"] * i_q)
     v_q = see("vcq", seen_q + p["KPC"] * q_error_i + x_q + p["Lf"] * i_d)
-    bridge = [v_d * cos - v_q * sin for cos, sin in zip(*turns, strict=True)]
-    source = [grid * cos for cos in _turns(turned + shift)[0]]
+    bridge = v_d * turns[0] - v_q * turns[1]
+    source = grid * _turns(turned + shift)[0]
     # Both inductances carry the same current, so that the voltage between them is a divider's.
-    whole = p["Lf"] + p["Lg"]
-    rise = [(b - s - (p["Rf"] + p["Rg"]) * i) / whole for b, s, i in zip(bridge, source, amps, strict=True)]
-    volts = [s + p["Rg"] * i + p["Lg"] * r for s, i, r in zip(source, amps, rise, strict=True)]
+    rise = (bridge - source - (p["Rf"] + p["Rg"]) * amps) / (p["Lf"] + p["Lg"])
+    volts = source + p["Rg"] * amps + p["Lg"] * rise
     m_d, m_q = _park(volts, turns)
     m_d, m_q = see("vd", m_d), see("vq", m_q)
     active = see("P", 2.0 / 3.0 * _sum(volts, amps))
-    across = [volts[k - 1] - volts[k - 2] for k in range(3)]  # c - b, a - c, b - a: a quarter of a turn ahead
+    across = volts[[2, 0, 1]] - volts[[1, 2, 0]]  # c - b, a - c, b - a: a quarter of a turn ahead
     reactive = see("Q", -2.0 / (3.0 * np.sqrt(3.0)) * _sum(across, amps))
     see("outputs.V", see("V", np.sqrt(2.0 / 3.0 * _sum(volts, volts))))
     faster = see("wl", p["KPL"] * m_q + x_loop)
@@ -71,7 +69,7 @@ def _converter(x: list[Array], u: Mapping[str, Array], p: Mapping[str, Array], s
     see("outputs.P", active)
     see("outputs.Q", reactive)
     return [
-        *(SPEED * r for r in rise),
+        *(SPEED * rise),
         faster,
         p["KIL"] * m_q,
         p["KIC"] * d_error,
