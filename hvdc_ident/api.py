@@ -397,6 +397,7 @@ def fit(
     from hvdc_ident.study import fitting
     from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.stages.identify import judged
+    from hvdc_ident.text import in_python
 
     with _open(executor) as pool, _told(progress) as told:
         if isinstance(model, Problem):
@@ -407,7 +408,7 @@ def fit(
         result = fitting.estimated(
             study, found.to_dict(), force=names_of(force, "parameter") or (), seed=seed, executor=pool, progress=told
         )
-        return replace(result, message=_in_python(result.message))
+        return replace(result, message=in_python(result.message))
 
 
 def diagnose(
@@ -507,17 +508,6 @@ def export(
 
         found = linear_model(found)
     return write(found, path, linear, fmu, values, folder)
-
-
-def _in_python(message: str) -> str:
-    """Return a message of the command line with what to try in Python's words."""
-    for command, call in (
-        ("`hvdc-ident identify STUDY`", "`hi.identify(...)`"),
-        ("`hvdc-ident diagnose STUDY`", "`hi.diagnose(...)`"),
-        ("--force NAME", 'force=["NAME"]'),
-    ):
-        message = message.replace(command, call)
-    return message
 
 
 def _are_times(data: Any) -> bool:

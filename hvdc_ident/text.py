@@ -46,6 +46,12 @@ def with_study(text: str, study: str, *options: str) -> str:
     return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda found: f"{found[1]} {typed}", text)
 
 
+def in_python(text: str) -> str:
+    """Return the text with the commands in it as Python calls, and the option --force as an argument."""
+    text = re.sub(r"`hvdc-ident ([a-z]+) STUDY`", r"`hi.\1(...)`", text)
+    return text.replace("--force NAME", 'force=["NAME"]')
+
+
 def form_of(effect: Mapping[str, Any]) -> str:
     """Return the name of an effect in the results, with its formula where it is outside the catalogue."""
     return f"{effect['effect']} {effect.get('expression', '')}".rstrip()

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
+    FEWEST_QUIET,
+    FLOOR_SHARE,
+    GAP,
+    MAD_TO_STD,
     event_time,
     noise_estimate,
     noise_floor,
@@ -15,6 +19,10 @@ from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.data.units import PREFIXED, PREFIXES, UNITS, conversion, is_unit, same_unit, scaled, seconds_of
 
 __all__ = [
+    "FEWEST_QUIET",
+    "FLOOR_SHARE",
+    "GAP",
+    "MAD_TO_STD",
     "PREFIXED",
     "PREFIXES",
     "UNITS",

@@ -12,13 +12,16 @@ from hvdc_ident.data.trajectory import Array
 
 FLOOR_SHARE = 1e-6
 """Smallest noise that is assumed, as a share of the range."""
+FEWEST_QUIET = 8
+"""Rows before an event from which the noise of a record is estimated."""
+GAP = 1.5
+"""A step over so many median steps is a gap: a new record begins."""
+MAD_TO_STD = 1.482602218505602
+"""Standard deviation over median absolute deviation, of a normal distribution."""
 
 _SMOOTH = 0.35  # row-to-row curvature over change, medians: white noise 0.87, any first-order noise over 0.7
-_FEW_ROWS = 8  # too few for a standard deviation before the event
 _ROWS_OF_SCATTER = 32  # see row_scatter
-_MAD_TO_STD = 1.482602218505602  # of a normal distribution
 _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
-_GAP = 1.5  # times the median stride between recorded rows, the same share as `fit.noise_model.GAP`
 _DEPARTURE = 6.0  # standard deviations
 _OUTLIER = 5.0  # standard deviations
 
@@ -45,13 +48,13 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> f
     single = np.append(np.diff(t) > 0, True)  # of two rows at one time the second
     there = single & ~np.isnan(v)
     before = there & (t < event) if event is not None else np.zeros(t.size, dtype=bool)
-    settled = int(before.sum()) >= _FEW_ROWS
+    settled = int(before.sum()) >= FEWEST_QUIET
     rows = before if settled else there
     t, v, number = t[rows], v[rows], np.cumsum(single)[rows]
-    if t.size < _FEW_ROWS or (v == v[0]).all():
+    if t.size < FEWEST_QUIET or (v == v[0]).all():
         return 0.0
     stride = np.diff(number)
-    apart = stride > _GAP * np.median(stride)  # rows on two sides of a gap are no neighbours
+    apart = stride > GAP * np.median(stride)  # rows on two sides of a gap are no neighbours
     bend, change = _bend(t, v)
     near = ~(apart[1:] | apart[:-1])
     if _scatter(bend[near]) < _SMOOTH * _scatter(np.diff(v)[~apart]):
@@ -115,7 +118,7 @@ def pre_event_ar(values: ArrayLike) -> float:
     values: (n,) the rows before the event, evenly sampled. Corrected for the bias the trend makes in short records.
     """
     v = np.asarray(values, dtype=float)
-    if v.size < _FEW_ROWS or np.ptp(v) == 0.0:
+    if v.size < FEWEST_QUIET or np.ptp(v) == 0.0:
         return 0.0
     x = _detrended(np.arange(v.size, dtype=float), v)
     power = float(x @ x)
@@ -173,7 +176,7 @@ def _scatter(x: Array) -> float:
     if x.size == 0:
         return 0.0
     middle = float(np.median(x))
-    by_median = _MAD_TO_STD * float(np.median(np.abs(x - middle)))
+    by_median = MAD_TO_STD * float(np.median(np.abs(x - middle)))
     return by_median if by_median > 0 else float(np.std(x))
 
 

@@ -16,8 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, fdtri
 
-from hvdc_ident.data import Array, Experiment
-from hvdc_ident.fit.noise_model import ESTIMATED, FLOOR, GIVEN, MAD, MISFIT, from_misfit, scatter_of
+from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
+from hvdc_ident.fit.noise_model import ESTIMATED, GIVEN, MISFIT, from_misfit, scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap
@@ -114,7 +114,7 @@ def _power(problem: Problem, residual: Array) -> float:
     """Return the mean squared residual; under a robust loss by the median, for outliers are not noise."""
     if problem.loss.linear:
         return float(np.mean(residual**2))
-    return (MAD * float(np.median(np.abs(residual)))) ** 2
+    return (MAD_TO_STD * float(np.median(np.abs(residual)))) ** 2
 
 
 def _size(
@@ -194,7 +194,7 @@ def _sentence(sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapp
 def _line(output: str, size: ResidualSize, source: str) -> str:
     """Return the sentence on one output."""
     if size.verdict == "fits" and size.ratio is None:
-        return f"{output} is met to {FLOOR:g} of its range, and the intervals are of what is left below that"
+        return f"{output} is met to {FLOOR_SHARE:g} of its range, and the intervals are of what is left below that"
     if size.verdict == "not-judged" or size.times is None or size.ratio is None:
         return (
             f"the noise of {output} is taken from the fit's own residual, which then cannot tell whether the model fits"

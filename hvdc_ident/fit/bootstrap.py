@@ -18,6 +18,7 @@ from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.sensitivity import normalised
 
 FEWEST = 3
 """Fewer experiments have no scatter worth the name."""
@@ -119,9 +120,8 @@ def cluster_sandwich(blocks: Sequence[ResidualBlock]) -> tuple[Array, int]:
     for b in blocks:
         scores[names.index(b.experiment)] += b.jacobian.T @ b.residual
         matrix += b.jacobian.T @ b.jacobian
-    d = np.sqrt(np.diag(matrix))
-    d = np.where(d > 0, d, 1.0)
-    inverse = np.linalg.pinv(matrix / np.outer(d, d), hermitian=True) / np.outer(d, d)
+    scaled, d = normalised(matrix)
+    inverse = np.linalg.pinv(scaled, hermitian=True) / np.outer(d, d)
     return inverse @ (scores.T @ scores) @ inverse * (n / (n - 1.0)), n - 1
 
 

@@ -12,13 +12,13 @@ from functools import partial
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment
+from hvdc_ident.data import MAD_TO_STD, Array, Experiment
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import MAD, MISFIT, autoregression, before_event, floor_of
+from hvdc_ident.fit.noise_model import MISFIT, autoregression, before_event, floor_of
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
-from hvdc_ident.fit.optimisers import catalogue
+from hvdc_ident.fit.optimisers import is_global
 from hvdc_ident.fit.optimisers import optimiser as named
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
@@ -90,8 +90,7 @@ def multistart(
     """
     method = named(optimiser, seed) if isinstance(optimiser, str) else optimiser or TrustRegion()
     if starts is None:
-        whole = any(isinstance(method, m.OPTIMISER) and getattr(m, "GLOBAL", False) for m in catalogue().values())
-        starts = 1 if whole else STARTS
+        starts = 1 if is_global(method) else STARTS
     if not isinstance(method, TrustRegion):
         method = Refined(method)
     nuisances = problem.unknowns[len(problem.free) :]
@@ -333,6 +332,6 @@ def misfit_weights(problem: Problem, theta: Array, outputs: Sequence[str]) -> di
     for output in outputs:
         misfit = np.concatenate([b.residual * b.sigma for b in blocks if b.output == output])
         floor = floor_of(problem.fitted_experiments, output)
-        size = np.sqrt(np.mean(misfit**2)) if problem.loss.linear else MAD * np.median(np.abs(misfit))
+        size = np.sqrt(np.mean(misfit**2)) if problem.loss.linear else MAD_TO_STD * np.median(np.abs(misfit))
         weights[output] = max(float(size * np.sqrt(share)), floor)
     return weights

@@ -11,26 +11,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, noise_estimate, noise_floor, row_scatter
+from hvdc_ident.data import FEWEST_QUIET, FLOOR_SHARE, GAP, Array, Experiment, noise_estimate, noise_floor, row_scatter
 from hvdc_ident.errors import StudyError
 
 AR = tuple[float, ...]
 
-FLOOR = 1e-6
-"""No standard deviation is below this share of an output's range."""
 GIVEN = "given"
 ESTIMATED = "estimated before the event"
 MISFIT = "misfit"
-FEWEST_QUIET = 8
-"""Rows before an event from which the noise of a record is estimated."""
-MAD = 1.482602218505602
-"""Standard deviation over median absolute deviation, of a normal distribution."""
 MOST = 8
 """The highest AR order that is tried."""
 FEWEST = 20
 """From fewer rows no AR model of the noise is made."""
-GAP = 1.5
-"""A step over so many median steps is a gap: a new record begins."""
 UNEVEN = 0.02
 """Steps may differ from the median by this share."""
 
@@ -125,7 +117,7 @@ def range_of(experiments: Sequence[Experiment], output: str) -> float:
 
 def floor_of(experiments: Sequence[Experiment], output: str) -> float:
     """Return the smallest standard deviation an output may have, in its unit."""
-    return FLOOR * range_of(experiments, output)
+    return FLOOR_SHARE * range_of(experiments, output)
 
 
 def source_of(experiments: Sequence[Experiment], output: str) -> str:

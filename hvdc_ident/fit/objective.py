@@ -19,6 +19,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
 from hvdc_ident.fit.problem import Problem
+from hvdc_ident.sensitivity import normalised
 
 LONGEST = 10.0
 """A step changes a logarithm by at most this: no parabola holds over four decades, and on a plateau its minimum lies anywhere."""
@@ -129,16 +130,15 @@ def bounded_step(g: Array, h: Array, damping: float, low: Array, high: Array) ->
 
     Least squares at each stage: directions whose curvature is rounding do not move it.
     """
-    d = np.diag(h)
-    scale = np.sqrt(np.where(d > 0, d, 1.0))
-    matrix = h / np.outer(scale, scale) + damping * np.eye(g.size)
+    matrix, scale = normalised(h)
+    matrix += damping * np.eye(g.size)
     target = -g / scale
 
     def solve(free: NDArray[np.bool_], p: Array) -> Array:
         rhs = target[free] - matrix[np.ix_(free, ~free)] @ (p * scale)[~free]
         return np.asarray(np.linalg.lstsq(matrix[np.ix_(free, free)], rhs, rcond=1e-12)[0]) / scale[free]
 
-    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (d > 0)
+    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (np.diag(h) > 0)
     return active_set(solve, free, low, high)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
-from hvdc_ident.fit.assessment import assessed, deviations_from_misfit
+from hvdc_ident.fit.assessment import assessed, in_final_weights
 from hvdc_ident.fit.estimate import fit
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.optimiser import Optimiser
@@ -122,12 +122,8 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     nuisance: FrozenMap = FrozenMap()
     for r in results:
         nuisance = nuisance | r.nuisance
-    weights = {o: w for r in results for o, w in deviations_from_misfit(r).items()}
-    models = {o: m for r in results for o, m in r.whitening.items()}
     whole = replace(
-        problem,
-        weights=problem.weights | weights,
-        rho=problem.rho | models,
+        reduce(in_final_weights, results, problem),
         experiments=tuple(
             e if e.role != "fit" else e.with_(nuisance=tuple(n for n in e.nuisance if n in nuisance.get(e.name, {})))
             for e in problem.experiments
@@ -155,7 +151,7 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
         correlation={k: v for r in results for k, v in r.correlation.items()},
         starts=tuple(replace(s, group=i) for i, r in enumerate(results) for s in r.starts),
         loss=problem.loss.name,
-        whitening=models,
+        whitening={o: m for r in results for o, m in r.whitening.items()},
         dof=min((r.dof for r in results if r.dof is not None), default=None),
         covariance=_joint(results),
     )

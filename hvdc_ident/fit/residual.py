@@ -14,10 +14,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Experiment, Trajectory
+from hvdc_ident.data import GAP, Array, Experiment, Trajectory
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
-from hvdc_ident.fit.noise_model import AR, GAP, segments, whitened
+from hvdc_ident.fit.noise_model import AR, segments, whitened
 from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, observe, states_of
 from hvdc_ident.immutable import FrozenMap
 

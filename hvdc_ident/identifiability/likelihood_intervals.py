@@ -24,7 +24,7 @@ from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import rise_over_range
+from hvdc_ident.sensitivity import normalised, rise_over_range
 
 DRAWS = 999
 SCATTER = 0.1
@@ -126,10 +126,7 @@ def bounded(p: Profile) -> bool:
 
 def partner(optimum: LocalAnalysis, i: int) -> str:
     """The parameter whose column is most like the i-th."""
-    matrix = optimum.information.matrix
-    size = np.sqrt(np.diag(matrix))
-    size = np.where(size > 0, size, 1.0)  # a parameter without information is like no other
-    cosines = np.abs(matrix[i]) / (size * size[i])
+    cosines = np.abs(normalised(optimum.information.matrix)[0][i])  # a parameter without information is like no other
     cosines[i] = -1.0
     return optimum.names[int(np.argmax(cosines))] if len(optimum.names) > 1 else ""
 
@@ -280,9 +277,7 @@ def _ended(best: LocalAnalysis, ends: Sequence[tuple[Mapping[str, float], float]
 def _exchanged(best: LocalAnalysis) -> Iterator[Array]:
     """The best point with two values exchanged, or a sign turned, where the bounds admit it."""
     free, parameters = best.problem.free, best.problem.simulator.parameters
-    matrix = best.information.matrix
-    d = np.sqrt(np.clip(np.diag(matrix), 1e-300, None))
-    alike = np.abs(matrix / np.outer(d, d))
+    alike = np.abs(normalised(best.information.matrix)[0])
     places: list[tuple[float, Array]] = []
     for i, j in combinations(range(len(free)), 2):
         a, b = best.theta[i], best.theta[j]

@@ -18,7 +18,7 @@ from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import independent, pivoted_order, standard_deviations
+from hvdc_ident.sensitivity import independent, normalised, pivoted_order, standard_deviations
 
 LEVEL = 0.01
 """Level of the test of all parameters together (Bonferroni)."""
@@ -62,8 +62,8 @@ def heterogeneity(optimum: LocalAnalysis) -> FrozenMap[Heterogeneity]:
             continue
         rows = informative * scores.shape[1] + i
         score, variance = scores[informative, i], covariance[np.ix_(rows, rows)]
-        scale = np.sqrt(np.clip(np.diag(variance), 1e-300, None))
-        values, vectors = np.linalg.eigh(variance / np.outer(scale, scale))
+        scaled, scale = normalised(variance)
+        values, vectors = np.linalg.eigh(scaled)
         good = values > 1e-6 * values[-1]
         q = float(np.sum((vectors[:, good].T @ (score / scale)) ** 2 / values[good]))
         dof = int(good.sum())

@@ -52,7 +52,7 @@ from hvdc_ident.identifiability.verdicts import (
     structural_verdict,
 )
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import independent, pivoted_order, rise_over_range
+from hvdc_ident.sensitivity import independent, normalised, pivoted_order, rise_over_range
 from hvdc_ident.sensitivity.information import inflation_index
 
 WORTH = 0.02
@@ -281,10 +281,10 @@ def _open_combination(assessment: Assessment, optimum: LocalAnalysis, opened: Se
     if len(opened) < 2:
         return None
     matrix = optimum.information.select(opened).matrix
-    d = np.sqrt(np.diag(matrix))
-    if not (d > 0).all():
+    scaled, d = normalised(matrix)
+    if not (np.diag(scaled) > 0).all():
         return None
-    values, vectors = np.linalg.eigh(matrix / np.outer(d, d))
+    values, vectors = np.linalg.eigh(scaled)
     if values[0] > (2.0 / COLLINEAR) ** 2:
         return None
     logs = [assessment.free[n].min > 0 for n in opened]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         collinear_subsets,
         independent,
         marginal,
+        normalised,
         null_directions,
         pivoted_order,
         rise_over_range,
@@ -44,7 +45,7 @@ else:
             "local_sensitivities": "LinearSensitivities LocalSensitivities Ranges Sensitivities SteadySensitivities "
             "linear_sensitivities sensitivities steady_sensitivities trajectory_sensitivities",
             "information": "SENSITIVITY_ERROR Collinear Information collinear_subsets independent marginal "
-            "null_directions pivoted_order rise_over_range standard_deviations",
+            "normalised null_directions pivoted_order rise_over_range standard_deviations",
             "global_screening": "ScreeningResult morris sobol",
             "structural": "StructuralCombination StructuralResult identifiable_subset structural_identifiability",
             "sweep_points": "Points Quantities Samples grid latin_hypercube listed log_grid",
@@ -78,6 +79,7 @@ __all__ = [
     "log_grid",
     "marginal",
     "morris",
+    "normalised",
     "null_directions",
     "pivoted_order",
     "rise_over_range",

@@ -5,13 +5,12 @@ Collinear subsets, null directions, inflation and the order in which parameters 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.immutable import FrozenMap
@@ -29,8 +28,6 @@ def leading(direction: Array) -> int:
     return int(np.argmax(size >= (1.0 - EQUAL) * size.max()))
 
 
-THRESHOLD = 1.92
-"""Half the 95 % quantile of chi-square with one degree of freedom."""
 SENSITIVITY_ERROR = 1e-6
 """Singular values of normalised columns below this share of the largest are the sensitivities' own error."""
 ENUMERATED = 10
@@ -83,14 +80,6 @@ class Information:
         return Information(tuple(names), FrozenMap({e: f[rows] for e, f in self.by_experiment.items()}))
 
 
-def information(names: Sequence[str], jacobians: Mapping[str, Array], slope: Array) -> Information:
-    """The information matrix of each experiment, nothing marginalised.
-
-    jacobians: (n_e, p) by experiment, whitened, per unit of the parameter. slope: (p,) d theta/d coordinate.
-    """
-    return Information(tuple(names), FrozenMap({e: (j * slope).T @ (j * slope) for e, j in jacobians.items()}))
-
-
 def marginal(matrix: Array, kept: Sequence[int]) -> Array:
     """The information on the kept unknowns when the others have to be estimated too: the Schur complement."""
     kept = list(kept)
@@ -104,8 +93,8 @@ def marginal(matrix: Array, kept: Sequence[int]) -> Array:
 
 def standard_deviations(matrix: Array) -> Array:
     """Return the standard deviations, (p,), that a regular information matrix bounds from below (Cramer and Rao)."""
-    lengths = np.sqrt(np.diag(matrix))
-    return np.sqrt(np.diag(np.linalg.inv(matrix / np.outer(lengths, lengths)))) / lengths
+    scaled, lengths = normalised(matrix)
+    return np.sqrt(np.diag(np.linalg.inv(scaled))) / lengths
 
 
 def rise_over_range(information_of_one: float, width: float) -> float:
@@ -116,12 +105,14 @@ def rise_over_range(information_of_one: float, width: float) -> float:
     return 0.5 * information_of_one * width**2
 
 
-def _normalised(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The matrix scaled to a diagonal of ones, and which parameters have a column at all."""
-    d = np.sqrt(np.clip(np.diag(matrix), 0.0, None))
-    seen = d > 0
-    safe = np.where(seen, d, 1.0)
-    return matrix / np.outer(safe, safe), seen
+def normalised(matrix: Array) -> tuple[Array, Array]:
+    """Return a symmetric (p, p) matrix scaled to a diagonal of ones, and the scales, (p,): the roots of its diagonal.
+
+    Where an entry of the diagonal is not above 0 the scale is 1, and the entry stays.
+    """
+    d = np.diag(matrix)
+    scales = np.sqrt(np.where(d > 0, d, 1.0))
+    return matrix / np.outer(scales, scales), scales
 
 
 def collinearity_index(matrix: Array) -> float:
@@ -129,8 +120,8 @@ def collinearity_index(matrix: Array) -> float:
 
     10 is a warning, 20 is bad: a change of one parameter can be made good by the others up to 1/gamma of its effect.
     """
-    scaled, seen = _normalised(matrix)
-    if not seen.all():
+    scaled, _ = normalised(matrix)
+    if not (np.diag(scaled) > 0).all():
         return float("inf")
     smallest = float(np.linalg.eigvalsh(scaled)[0])
     return 1.0 / np.sqrt(smallest) if smallest > SENSITIVITY_ERROR**2 else float("inf")
@@ -138,9 +129,9 @@ def collinearity_index(matrix: Array) -> float:
 
 def inflation_index(matrix: Array) -> Array:
     """(p,): by how much each parameter's standard deviation grows because the others are unknown; inf where singular."""
-    scaled, seen = _normalised(matrix)
-    result = np.full(seen.size, np.inf)
-    rows = np.flatnonzero(seen)
+    scaled, _ = normalised(matrix)
+    result = np.full(len(scaled), np.inf)
+    rows = np.flatnonzero(np.diag(scaled) > 0)
     if rows.size:
         values, vectors = np.linalg.eigh(scaled[np.ix_(rows, rows)])
         good = values > SENSITIVITY_ERROR**2 * values[-1]
@@ -202,12 +193,12 @@ def pivoted_order(matrix: Array) -> tuple[int, ...]:
 
 def independent(matrix: Array, error: float = SENSITIVITY_ERROR) -> tuple[int, ...]:
     """The most parameters that are determined together, earlier listed ones first where there is a choice."""
-    scaled, seen = _normalised(matrix)
+    scaled, _ = normalised(matrix)
     selected: list[int] = []
     for i in pivoted_order(scaled):
         proposal = sorted([*selected, i])
         part = np.linalg.eigvalsh(scaled[np.ix_(proposal, proposal)])
-        if seen[i] and part[0] > (error**2) * max(part[-1], 1.0):
+        if scaled[i, i] > 0 and part[0] > (error**2) * max(part[-1], 1.0):
             selected = proposal
     return tuple(selected)
 

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.data import (
+    FEWEST_QUIET,
     Array,
     Experiment,
     InputSignal,
@@ -34,7 +35,6 @@ from hvdc_ident.data.three_phase import (
 )
 from hvdc_ident.errors import InputError, StudyError, located, require_known
 from hvdc_ident.files import digest
-from hvdc_ident.fit.noise_model import FEWEST_QUIET
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import (
+    Information,
     collinear_subsets,
     independent,
     marginal,
@@ -13,12 +15,13 @@ from hvdc_ident.sensitivity import (
     pivoted_order,
     rise_over_range,
 )
-from hvdc_ident.sensitivity.information import collinearity_index, inflation_index, information
+from hvdc_ident.sensitivity.information import collinearity_index, inflation_index
 
 
 def test_information_adds_up_and_tells_who_gives_it() -> None:
     a, b = np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 3.0]])
-    found = information(["p", "q"], {"one": a, "two": b}, np.array([10.0, 1.0]))
+    a, b = (j * np.array([10.0, 1.0]) for j in (a, b))
+    found = Information(("p", "q"), FrozenMap({"one": a.T @ a, "two": b.T @ b}))
     assert np.allclose(found.matrix, [[200, 0], [0, 9]])
     assert found.norms["q"] == 3.0
     assert found.shares()["one"]["p"] == 1.0 and found.shares()["one"]["q"] == 0.0

@@ -47,6 +47,6 @@ def need(name: str) -> None:
         raise missing(package, name)
 
 
-def is_global(name: str) -> bool:
-    """Return whether the named optimiser searches the whole range by itself. Raises UnknownNameError."""
-    return bool(getattr(_module(name), "GLOBAL", False))
+def is_global(method: Optimiser) -> bool:
+    """Return whether the optimiser searches the whole range by itself."""
+    return any(isinstance(method, m.OPTIMISER) and getattr(m, "GLOBAL", False) for m in catalogue().values())
