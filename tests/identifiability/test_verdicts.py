@@ -143,7 +143,7 @@ def test_the_link_at_its_bound_and_with_a_flat_gain() -> None:
     assert report.parameters["KPP"].value == 0.0 and report.held["KIQ2"][0] == 20.0
     assert report.recommended is not None and "Qref2" in report.recommended.best.design.inputs
     assert report.recommended.half_widths_now["KIQ2"] is None and report.recommended.half_widths["KIQ2"] < 1.0
-    assert "KIQ2 would be known" in report.recommended.text
+    assert "KIQ2 would get a 95 % confidence interval" in report.recommended.text
 
 
 def test_to_dict_is_the_json() -> None:
