@@ -19,7 +19,7 @@ from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))
 
-from hidden import campaigns, cases, judging, mess, sizes
+from hidden import campaigns, cases, judging, mess, outcomes, probabilities, sizes
 from hidden.diagnosing import experiments_of, free_of, model_of
 from hidden.plants import FIRST, PLANTS
 from hidden.reporting import report
@@ -324,14 +324,14 @@ def finding(effect="lag", probability=0.97, places=("Vm",), same_as=()):
     ],
 )
 def test_outcomes_with_findings(line, expected, is_named):
-    assert judging.outcome(line) == expected
-    assert judging.named(line) == is_named
+    assert outcomes.outcome(line) == expected
+    assert outcomes.named(line) == is_named
 
 
 def test_two_sided_limits_of_a_proportion():
-    assert judging.limits(5, 10) == pytest.approx((0.1871, 0.8129), abs=1e-4)  # Clopper and Pearson's table
-    assert judging.limits(0, 10) == pytest.approx((0.0, 0.3085), abs=1e-4)
-    assert judging.limits(10, 10) == pytest.approx((0.6915, 1.0), abs=1e-4)
+    assert probabilities.limits(5, 10) == pytest.approx((0.1871, 0.8129), abs=1e-4)  # Clopper and Pearson's table
+    assert probabilities.limits(0, 10) == pytest.approx((0.0, 0.3085), abs=1e-4)
+    assert probabilities.limits(10, 10) == pytest.approx((0.6915, 1.0), abs=1e-4)
 
 
 def test_calibration_counts_findings_by_their_probability():
@@ -340,7 +340,7 @@ def test_calibration_counts_findings_by_their_probability():
     unsure = [told("ambiguous", findings=[finding("delay", 0.6), finding("lag", 0.4)], messy=True) for _ in range(4)]
     nothing = told(part="clean", effects=[], truth=("limit", "VR"), findings=[finding("limit", 0.96)], messy=True)
     of_parameter = told("no-evidence", findings=[finding("parameter", 1.0, ("KA",))])
-    found = judging.calibration([*sure, *unsure, nothing, of_parameter, told(failed="x", findings=[finding()])])
+    found = probabilities.calibration([*sure, *unsure, nothing, of_parameter, told(failed="x", findings=[finding()])])
     assert found["sure"]["findings"] == 21 and found["sure"]["right"] == pytest.approx(19 / 21)
     assert found["sure"]["placed"] == pytest.approx(18 / 21)
     assert found["sure_by_plant"]["machine, tidy"]["right"] == pytest.approx(0.95)

@@ -3,28 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
-Line = Mapping[str, Any]
-SAME_NAME = ({"coupling", "droop"}, {"lag", "inductance"})
-"""Effects that are one equation: a droop is a coupling with the other sign, an inductance over R a lag of L/R."""
-SUMS: Mapping[str, Sequence[set[str]]] = {
-    "station": ({"Pref", "Pm", "err"}, {"E", "V"}),
-    "drive": ({"wref", "wm", "err"}, {"torque", "friction", "load"}, {"v", "emf"}),
-    "machine": ({"Vref", "Vm", "err"}, {"Pref", "order"}),
-    "converter": (
-        {"Pref", "erp"}, {"Qref", "err"}, {"idref", "erd"}, {"iqref", "erq"}, {"xd", "vcd"}, {"xq", "vcq"}, {"xl", "wl"},
-    ),
-}  # fmt: skip
-"""Slots that only enter one sum together: what is added at one might as well be added at another."""
-ONLY_RECORDED: Mapping[str, Sequence[str]] = {"machine": ("Qe",), "converter": ("V", "df")}
-"""Signals that nothing reads but the output of the same name: every effect at one is the same at the other."""
-ADDED = ("offset", "disturbance", "coupling", "droop", "conductance", "loss")
+from hidden.outcomes import Line, effects_found, is_truth, members, named, outcome, same_effect
+from hidden.probabilities import calibration, limit_above
+
 MAIN = {
     "lag": "T", "delay": "T", "window-mean": "T", "sample-hold": "Ts", "second-order": "wn", "inner-loop": "wn",
     "lead-lag": "T1", "limit": "level", "saturation": "level", "rate-limit": "rate", "deadband": "width",
@@ -34,105 +20,6 @@ MAIN = {
 """The parameter that measures the effect."""
 OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")
 PARTS = ("single", "pair", "clean", "outside", "left-out", "triple")
-BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
-"""Edges of the bins of stated probabilities."""
-SURE = 0.95
-"""The probability from which an effect is named."""
-
-
-# --- one case ---
-
-
-def same_effect(a: str, b: str) -> bool:
-    """Return True if two names stand for one equation."""
-    return a == b or any({a, b} <= group for group in SAME_NAME)
-
-
-def same_place(plant: str, effect: str, a: str, b: str) -> bool:
-    """Return True if an effect is the same at both insertion points."""
-    if any({a, b} == {signal, f"outputs.{signal}"} for signal in ONLY_RECORDED.get(plant, ())):
-        return True
-    return a == b or (effect in ADDED and any({a, b} <= group for group in SUMS[plant]))
-
-
-def _is(line: Line, truth: Line, told: Line, place: bool = True) -> bool:
-    """Return True if the reported effect (effect, at, from) is the hidden one."""
-    if not same_effect(truth["effect"], told["effect"]):
-        return False
-    if not place:
-        return True
-    sources = {truth.get("source") or "", told.get("from") or ""}
-    one_slot = len(told["at"]) == 1 and same_place(line["plant"], truth["effect"], truth["at"], told["at"][0])
-    return one_slot and len(sources) == 1
-
-
-def outcome(line: Line) -> str:
-    """Return the outcome of one case with an effect.
-
-    right: named, effect and place. covered: the truth is in the ambiguity set. place: the effect is right, its place is
-    not (and not in the set). wrong: another effect is named, or one beside the right ones. ambiguous: a set without the
-    truth. abstained: nothing is named. failed: no diagnosis. A pair is right if both are.
-    """
-    if "failed" in line:
-        return "failed"
-    truths, found = line["truth"], line["found"]
-    sets = [r for group in line["ambiguity"] for r in group] + [m for f in effects_found(line) for m in members(f)]
-    if line["verdict"] not in ("named", "ambiguous"):
-        return "abstained"
-    if (
-        line["verdict"] == "named"
-        and len(found) == len(truths)
-        and all(any(_is(line, t, f) for f in found) for t in truths)
-    ):
-        return "right"
-    if all(any(_is(line, t, told) for told in (*found, *sets)) for t in truths) and len(found) <= len(truths):
-        return "covered"
-    if line["verdict"] == "ambiguous":
-        return "ambiguous"
-    if all(any(_is(line, t, f, place=False) for t in truths) for f in found):
-        return "place"
-    return "wrong"
-
-
-def effects_found(line: Line) -> list[Line]:
-    """Return the findings that are effects; none from a room without findings, or where a parameter explains the gap."""
-    return [f for f in line.get("findings", []) if f["effect"] != "parameter"]
-
-
-def members(finding: Line) -> list[Line]:
-    """Return what a finding stands for: each of its names at each of its likely places."""
-    names = list(dict.fromkeys((finding["effect"], *finding["same_as"])))
-    return [{"effect": n, "at": p["at"], "from": p.get("from", "")} for n in names for p in finding["places"]]
-
-
-def named(line: Line) -> bool:
-    """Return True if every hidden effect is named and no other, each at any insertion point."""
-    if "failed" in line or line["verdict"] != "named":
-        return False
-    told = effects_found(line)
-    groups = [{f["effect"], *f["same_as"]} for f in told] or [{f["effect"]} for f in line["found"]]
-    truths = [t["effect"] for t in line["truth"]]
-
-    def meets(group: set[str], effect: str) -> bool:
-        return any(same_effect(name, effect) for name in group)
-
-    all_found = all(any(meets(g, t) for g in groups) for t in truths)
-    return all_found and all(any(meets(g, t) for t in truths) for g in groups) and len(groups) == len(truths)
-
-
-def limit_above(count: int, of: int, level: float = 0.95) -> float:
-    """Return the upper Clopper-Pearson limit of a proportion."""
-    return 1.0 if count >= of else float(stats.beta.ppf(level, count + 1, of - count))
-
-
-def limits(count: int, of: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the two-sided Clopper-Pearson limits of a proportion."""
-    tail = 0.5 * (1.0 - level)
-    low = 0.0 if count == 0 else float(stats.beta.ppf(tail, count, of - count + 1))
-    return low, limit_above(count, of, 1.0 - tail)
-
-
-# --- all cases ---
 
 
 def summary(lines: Sequence[Line]) -> dict[str, Any]:
@@ -233,47 +120,6 @@ def _places(lines: Sequence[Line]) -> float | None:
     return float(np.mean(counts)) if counts else None
 
 
-def calibration(lines: Sequence[Line]) -> dict[str, Any]:
-    """Return how many findings are right, by their stated probability.
-
-    A finding is right if its effect is hidden, at any insertion point: its probability is the sum over its places. placed: its
-    insertion point is one of its likely places too. sure: those said with at least SURE, by plant and cleanliness too. Findings
-    in records without an effect are wrong; parameters off their given values are no findings of effects and do not count.
-    """
-    said: list[tuple[str, float, bool, bool]] = []
-    for x in lines:
-        if "failed" in x:
-            continue
-        room = f"{x['plant']}, {'messy' if x.get('messy') else 'tidy'}"
-        truths = [] if x["part"] == "clean" else x["truth"]
-        for f in effects_found(x):
-            told = members(f)
-            right = any(_is(x, t, m, place=False) for t in truths for m in told)
-            said.append((room, f["probability"], right, right and any(_is(x, t, m) for t in truths for m in told)))
-
-    def row(part: Sequence[tuple[str, float, bool, bool]]) -> dict[str, Any]:
-        n, right = len(part), sum(r for _, _, r, _ in part)
-        return {
-            "findings": n,
-            "stated": float(np.mean([p for _, p, _, _ in part])) if n else None,
-            "right": right / n if n else None,
-            "limits": limits(right, n) if n else None,
-            "placed": sum(q for *_, q in part) / n if n else None,
-        }
-
-    edges = list(pairwise(BINS))
-    return {
-        "bins": {
-            f"{low:g} to {high:g}": row([s for s in said if low <= s[1] < high or (high == BINS[-1] and s[1] == high)])
-            for low, high in edges
-        },
-        "sure": row([s for s in said if s[1] >= SURE]),
-        "sure_by_plant": {
-            r: row([s for s in said if s[0] == r and s[1] >= SURE]) for r in sorted({s[0] for s in said})
-        },
-    }
-
-
 def _confusion(lines: Sequence[Line]) -> dict[str, dict[str, int]]:
     """Return by hidden effect the first named effect, or the verdict if nothing was named."""
     table: dict[str, Counter[str]] = {}
@@ -293,7 +139,7 @@ def _confusion(lines: Sequence[Line]) -> dict[str, dict[str, int]]:
 def _ambiguity(lines: Sequence[Line]) -> dict[str, Any]:
     """Return, for the cases with an ambiguity set, how often it contains the truth, and its number of members."""
     sets = [(x, x["ambiguity"][0]) for x in lines if "failed" not in x and x["ambiguity"]]
-    inside = [any(_is(x, x["truth"][0], r) for r in members) for x, members in sets]
+    inside = [any(is_truth(x, x["truth"][0], r) for r in members) for x, members in sets]
     return {
         "sets": len(sets),
         "coverage": float(np.mean(inside)) if sets else None,
@@ -331,7 +177,7 @@ def _strangers(lines: Sequence[Line]) -> dict[str, Any]:
     records cannot distinguish them.
     """
     ran = [x for x in lines if "failed" not in x]
-    named = [x for x in ran if x["verdict"] == "named" and not any(_is(x, x["truth"][0], f) for f in x["found"])]
+    named = [x for x in ran if x["verdict"] == "named" and not any(is_truth(x, x["truth"][0], f) for f in x["found"])]
     alike = [x for x in named if x.get("apart") is not None and x["apart"] < 1.0]
     return {
         "cases": len(ran),
@@ -352,7 +198,7 @@ def _location(lines: Sequence[Line]) -> dict[str, Any]:
     """Return how often the insertion point is right where the effect is, by itself and within the set."""
     named = [x for x in lines if "failed" not in x and x["verdict"] in ("named", "ambiguous") and x["found"]]
     named = [x for x in named if same_effect(x["truth"][0]["effect"], x["found"][0]["effect"])]
-    exact = sum(_is(x, x["truth"][0], x["found"][0]) for x in named)
+    exact = sum(is_truth(x, x["truth"][0], x["found"][0]) for x in named)
     inside = sum(outcome(x) in ("right", "covered") for x in named)
     n = len(named)
     return {"cases": n, "place": exact / n if n else None, "place_or_in_set": inside / n if n else None}
@@ -437,8 +283,8 @@ def _baselines(large: Sequence[Line], clean: Sequence[Line], outside: Sequence[L
         told = [(x, rule(name, x)) for x in large if "failed" not in x]
         n = max(len(told), 1)
         found[title] = {
-            "right": sum(t is not None and _is(x, x["truth"][0], t) for x, t in told) / n,
-            "wrong_effect": sum(t is not None and not _is(x, x["truth"][0], t, place=False) for x, t in told) / n,
+            "right": sum(t is not None and is_truth(x, x["truth"][0], t) for x, t in told) / n,
+            "wrong_effect": sum(t is not None and not is_truth(x, x["truth"][0], t, place=False) for x, t in told) / n,
             "false_names": sum(rule(name, x) is not None for x in clean if "failed" not in x),
             "outside_names": sum(rule(name, x) is not None for x in outside if "failed" not in x),
         }
