@@ -1,4 +1,7 @@
-"""Makes `tests` importable by its own name, wherever pytest is started and whichever copy of the package is tested."""
+"""Settings of all tests: `tests` is importable by its own name, and no property test depends on the clock.
+
+The first holds wherever pytest is started and whichever copy of the package is tested.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,12 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+from hypothesis import HealthCheck, settings
+
 tests = ModuleType("tests")
 tests.__path__ = [str(Path(__file__).parent)]
 sys.modules["tests"] = tests
+
+# The deadline of an example and the health check of slow data measure the machine's load.
+settings.register_profile("clockless", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("clockless")

@@ -156,10 +156,10 @@ def _moderate(value: float) -> float:
 
 def _grown(inner: st.SearchStrategy[Tree]) -> st.SearchStrategy[Tree]:
     def one(name: str, a: Tree) -> Tree:
-        return f"{name}({a[0]})", lambda at: _moderate(_ONE[name](a[1](at)))
+        return f"{name}({a[0]})", lambda at: _moderate(_ONE[name](a[1](at) * at["one"]))
 
     def two(form: str, a: Tree, b: Tree) -> Tree:
-        return form.format(f"({a[0]})", f"({b[0]})"), lambda at: _moderate(_TWO[form](a[1](at), b[1](at)))
+        return form.format(f"({a[0]})", f"({b[0]})"), lambda at: _moderate(_TWO[form](a[1](at) * at["one"], b[1](at) * at["one"]))
 
     def minus(a: Tree) -> Tree:
         return f"-({a[0]})", lambda at: -a[1](at)
@@ -174,7 +174,7 @@ def _grown(inner: st.SearchStrategy[Tree]) -> st.SearchStrategy[Tree]:
 trees: st.SearchStrategy[Tree] = st.recursive(_leaf(), _grown, max_leaves=10)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(trees)
 def test_a_text_has_the_value_that_python_gives_it(tree: Tree) -> None:
     text, by_python = tree

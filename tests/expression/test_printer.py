@@ -113,7 +113,7 @@ def _text(r: random.Random, depth: int) -> str:
     return r.choice(_FORMS).format(*parts, R=relation, E=r.choice(_EXPONENTS), F=r.choice(_ONE))
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.integers(0, 2**32), st.integers(1, 5))
 def test_what_the_parser_gives_is_written_and_read_back_the_same(seed: int, depth: int) -> None:
     try:

@@ -308,7 +308,7 @@ def test_what_is_read(tmp_path, version):
     assert list(found.outputs) == ["y"] and list(found.inputs) == ["u"]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(place=st.integers(0, 10_000), byte=st.integers(0, 255), cut=st.booleans())
 def test_a_damaged_file_is_read_or_refused_with_a_reason(tmp_path_factory, place, byte, cut):
     path = tmp_path_factory.mktemp("f") / "a.fmu"

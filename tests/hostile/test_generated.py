@@ -51,7 +51,7 @@ def test_what_had_ended_in_a_traceback_does_not(number: int, command: str, tmp_p
     assert (end.code, end.bug) == (0, ""), end.said
 
 
-@settings(max_examples=8, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=8, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_a_drawn_study_is_read_simulated_and_exported(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -210,7 +210,7 @@ def test_no_loop_through_an_input(link):
         loop(link, "nothing")
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.floats(0.05, 5.0))
 def test_margins_equal_python_control(seed, gain):
     rng = np.random.default_rng(seed)

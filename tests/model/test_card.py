@@ -211,7 +211,7 @@ def bits(model: Model) -> list[Any]:
     return [model.name, repr(model.parameters), repr(model.inputs), list(model.states), list(model.signals)]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(models())
 def test_any_model_comes_back_to_the_last_bit(model: Model) -> None:
     again = parse_card(write_card(model))
