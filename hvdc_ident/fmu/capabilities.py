@@ -41,7 +41,7 @@ OFFERS = {
     "interpolated inputs": "canInterpolateInputs",
     "state access": "canGetAndSetFMUstate",
     "serialised state": "canSerializeFMUstate",
-    "one instance a process": "canBeInstantiatedOnlyOncePerProcess",
+    "only one instance per process": "canBeInstantiatedOnlyOncePerProcess",
     "needs its tool": "needsExecutionTool",
 }
 """Attributes of FMI, by the words for them."""
@@ -127,7 +127,7 @@ class Capabilities:
             *([f"  {self.description}"] if self.description else []),
             f"  offers {', '.join(self.interfaces) or 'neither model exchange nor co-simulation'}; binaries: "
             f"{', '.join(libraries) or 'none'}{'; C sources' if self.sources else ''}",
-            f"  here: {self.problem or 'runs'}",
+            f"  on this machine: {self.problem or 'it can be run'}",
             f"  {sizes}, {self.indicators} event indicators",
         ]
         if self.experiment:
