@@ -159,7 +159,9 @@ def _grown(inner: st.SearchStrategy[Tree]) -> st.SearchStrategy[Tree]:
         return f"{name}({a[0]})", lambda at: _moderate(_ONE[name](a[1](at) * at["one"]))
 
     def two(form: str, a: Tree, b: Tree) -> Tree:
-        return form.format(f"({a[0]})", f"({b[0]})"), lambda at: _moderate(_TWO[form](a[1](at) * at["one"], b[1](at) * at["one"]))
+        return form.format(f"({a[0]})", f"({b[0]})"), lambda at: _moderate(
+            _TWO[form](a[1](at) * at["one"], b[1](at) * at["one"])
+        )
 
     def minus(a: Tree) -> Tree:
         return f"-({a[0]})", lambda at: -a[1](at)
