@@ -18,7 +18,7 @@ from typing import Any
 from hvdc_ident.errors import InputError
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""How a text begins that a spreadsheet takes for a formula."""
+"""Beginnings of texts that a spreadsheet takes for a formula."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from hvdc_ident.expression.grammar import IDENTIFIER, is_reserved
 from hvdc_ident.expression.parser import EXACT
 
 SUM, PRODUCT, POWER, ATOM = range(4)
-"""How tightly a text holds together: what binds looser than its surroundings is put in parentheses."""
+"""Ranks of a text by its outermost operation: one of a lower rank than its surroundings is put in parentheses."""
 
 _RELATIONS = {sp.Lt: "<", sp.Le: "<=", sp.Gt: ">", sp.Ge: ">=", sp.Eq: "==", sp.Ne: "!="}
 

@@ -27,7 +27,7 @@ BEYOND = 10.0
 
 SideStatus = Literal["closed", "open-at-bound", "not-found"]
 Physical = Mapping[str, tuple[bool, bool]]
-"""By unknown whether its lower and its upper bound are set by physics; else they only limit the search."""
+"""Two flags for each unknown: its lower, and its upper bound is set by physics; else it only limits the search."""
 
 
 @dataclass(frozen=True)

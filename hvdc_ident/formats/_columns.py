@@ -15,7 +15,7 @@ from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import MAX_BYTES, check_times, once
 
 TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo", "time_s", "t_s")
-"""What a time vector is called, lower case, in the order of preference."""
+"""Names of a time vector, lower case, in the order of preference."""
 
 
 def own_names(labels: Sequence[str]) -> tuple[str, ...]:

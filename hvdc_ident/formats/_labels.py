@@ -13,7 +13,7 @@ TIME_WORDS = (
     "time", "zeit", "temps", "tiempo", "tempo", "tijd", "timestamp", "zeitstempel", "datetime", "date/time", "date time",
     "datum/zeit", "time stamp", "horodatage", "utc", "b:tnow",
 )  # fmt: skip
-"""What a column of times is called, lower case, where it is not the first."""
+"""Names of a column of times, lower case, where it is not the first."""
 
 _BRACKETS = re.compile(r"(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]", re.DOTALL)
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]*)\)", re.DOTALL)

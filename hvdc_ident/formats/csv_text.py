@@ -41,7 +41,7 @@ _MISSING = {
     "", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "#nv", "#n/d", "null", "none", "<na>", "1.#qnan", "-1.#qnan",
     "1.#ind", "-1.#ind", "--", "---",
 }  # fmt: skip
-"""What stands, in lower case, in cells of what was not recorded: as pandas reads it, and Excel's words."""
+"""Texts, in lower case, of cells in which nothing was recorded: those that pandas reads so, and Excel's."""
 _QUOTED_COMMA = re.compile(r'(?:^|,)\s*"[^",]*,[^"]*"\s*(?:,|$)')
 _EMPTY = ' \t,;"\r\n'
 _DIRECTIVE = re.compile(r'"?sep=."?', re.IGNORECASE)

@@ -101,7 +101,7 @@ def rise_at_ends(optimum: LocalAnalysis, i: int, ends: tuple[float, float]) -> f
 
 
 def physical_bounds(problem: Problem) -> dict[str, tuple[bool, bool]]:
-    """By parameter two flags: its lower and its upper bound is the model's own."""
+    """Return two flags for each parameter: its lower, and its upper bound is the model's own."""
     parameters = problem.simulator.parameters
     return {f.name: (f.min == parameters[f.name].min, f.max == parameters[f.name].max) for f in problem.free}
 

@@ -32,11 +32,11 @@ from hvdc_ident.simulate import ModelEquations
 from hvdc_ident.text import listed
 
 SECONDS = 10.0
-"""How long the symbolic test may compute; the shipped link takes 3."""
+"""Time that the symbolic test may take; the shipped link takes 3 s."""
 METHOD = "numerical, local"
 POINTS = 5
 WIDE = 8
-"""Of so many points one lies in each eighth of every parameter's range."""
+"""Number of points of which one lies in each eighth of every parameter's range."""
 INSIDE = (0.2, 0.8)
 """Share of the bounds that the points are drawn from: at a bound a parameter may do nothing that does else."""
 SMALL = 1e-2

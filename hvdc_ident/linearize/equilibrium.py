@@ -18,7 +18,7 @@ from hvdc_ident.simulate import ACCURACY
 
 Equations = Callable[[Array], tuple[Array, Array]]
 SHORTEST = 2.0**-10
-"""Of the way of a homotopy: a part that has to be shorter ends it."""
+"""Shortest part of a homotopy's way: where one would have to be shorter, it ends."""
 
 
 @dataclass(frozen=True)

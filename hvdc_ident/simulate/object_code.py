@@ -229,7 +229,7 @@ KERNEL_FILES = (
     "codegen", "equations", "events", "exogenous", "integrator", "native", "run_state", "simd", "simulation",
     "steady_state_kernels", "steps",
 )  # fmt: skip
-"""What they are made from."""
+"""Modules that these functions are made from."""
 
 
 @cache

@@ -149,7 +149,7 @@ class Equilibria:
         places, guesses = [k for k, _ in given], np.array([g for _, g in given])
 
         def moved(v: Array) -> Array:
-            """By how many times its size each guessed state has moved."""
+            """Return the distance of each guessed state from its guess, in its size."""
             return np.abs(v[places] - guesses) / (1.0 + np.abs(guesses))
 
         begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))

@@ -42,7 +42,7 @@ from hvdc_ident.study import schema
 
 TIME_SHIFT = "time-shift"
 MEDIAN_EFFICIENCY = 0.37
-"""Of the median absolute deviation as an estimate of the standard deviation of normal noise (Rousseeuw, Croux 1993)."""
+"""Efficiency of the median absolute deviation as an estimate of normal noise's standard deviation (Rousseeuw, Croux 1993)."""
 
 
 @dataclass(frozen=True)
@@ -387,7 +387,7 @@ def _window(table: schema.ExperimentTable, time: Array, place: str) -> tuple[flo
 
 
 def _noise_columns(table: schema.ExperimentTable) -> dict[str, str]:
-    """By output the column of its standard deviations, where one is named."""
+    """Return the column of the standard deviations of each output that names one."""
     return {o: n.column for o, n in table.noise.items() if isinstance(n, schema.NoiseTable)}
 
 

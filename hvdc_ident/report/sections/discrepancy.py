@@ -74,7 +74,7 @@ def _effects(found: dict[str, Any]) -> str:
 
 
 def _findings(found: dict[str, Any]) -> str:
-    """What is missing apart from where, with probabilities, where more than one effect or place is likely."""
+    """Return the likely effects and, apart from them, their places, with probabilities, where there is more than one of either."""
     rows = []
     for f in found.get("findings") or []:
         delay = f.get("equivalent_delay") or {}

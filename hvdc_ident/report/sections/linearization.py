@@ -19,7 +19,7 @@ CHECKS = {
     "directional": "central differences",
     "finite-difference": "differences of another step size",
 }
-"""What a Jacobian of each method was compared with."""
+"""Second Jacobian that one of each method was compared with."""
 
 
 def _render(results: Results) -> str:
