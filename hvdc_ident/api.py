@@ -497,7 +497,7 @@ def export(
     from hvdc_ident.linearize import LinearModel
     from hvdc_ident.model import Model
     from hvdc_ident.study.assemble import is_study, model_of, subject_of, values_of
-    from hvdc_ident.study.export import export as write
+    from hvdc_ident.study.export import write
 
     found: Any = source if isinstance(source, LinearModel) else subject_of(source)
     if values is not None and not isinstance(values, str):
@@ -507,7 +507,7 @@ def export(
         from hvdc_ident.linearize import linearize as linear_model
 
         found = linear_model(found)
-    return write(found, path, linear, fmu, values, folder)
+    return write(found, path, linear, fmu, values, folder).path
 
 
 def _are_times(data: Any) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +13,7 @@ import numpy as np
 from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, homotopy, newton, weights
+from hvdc_ident.linearize.equilibrium import At, Equations, EquilibriumSearch, Root, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model
@@ -213,18 +213,14 @@ def _constrained(model: Model, search: EquilibriumSearch, guess: Mapping[str, fl
     near = (
         None if own is None else search.guesses({**dict(zip(search.variables, own.tolist(), strict=False)), **guess})[0]
     )
+    tries: list[tuple[Callable[[Equations, Array, Array, Array], Root], Array | None]]
+    tries = [(newton, v) for v in ([*starts[:1], near, *starts[1:]] if guess else [near, *starts])]
+    tries += [(homotopy, v) for v in (near, *starts[:1])]
     with np.errstate(all="ignore"):
-        for v in [*starts[:1], near, *starts[1:]] if guess else [near, *starts]:
+        for solve, v in tries:
             if v is None:
                 continue
-            root = newton(search.equations, v, search.low, search.high)
-            if root.found:
-                return root
-            best = root if best is None or root.shares.max() < best.shares.max() else best
-        for v in (near, *starts[:1]):
-            if v is None:
-                continue
-            root = homotopy(search.equations, v, search.low, search.high)
+            root = solve(search.equations, v, search.low, search.high)
             if root.found:
                 return root
             best = root if best is None or root.shares.max() < best.shares.max() else best

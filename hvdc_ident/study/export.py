@@ -23,7 +23,6 @@ from hvdc_ident.study.study import Study
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
-    from hvdc_ident.study.study import Study
 
 
 SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
@@ -169,31 +168,6 @@ def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOpti
     )
 
 
-def export(
-    source: Study | Model | LinearModel,
-    path: str | Path,
-    linear: bool = False,
-    fmu: FmuOptions | None = None,
-    values: str | None = None,
-    folder: str | Path | None = None,
-) -> Path:
-    """The path, written in the format of its ending: .toml, .fmu and .mo are the model, .ssv its parameters, the others its linear model.
-
-    source: a study, a model (linearised at its steady state) or a linear model. linear: the linear model even where the
-    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. values: of a study, "given", "start" or
-    "fitted"; left out, the fitted ones where a fit stands in its folder of results (folder, by default the study's own),
-    else the given ones. The file says which it holds. Raises StudyError for an ending that is not known, where the model
-    is not of the kind that the ending needs, and where fitted values are asked for and none stand.
-
-    >>> import tempfile
-    >>> from hvdc_ident import export, load_model
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     export(load_model("vsc-hvdc-link"), f"{folder}/link.mat").name
-    'link.mat'
-    """
-    return write(source, path, linear, fmu, values, folder).path
-
-
 def write(
     source: Study | Model | LinearModel,
     path: str | Path,
@@ -203,9 +177,14 @@ def write(
     folder: str | Path | None = None,
     reduced: bool = False,
 ) -> Written:
-    """Return the file as `export` writes it, with what is to be said of it: which values it holds, whether an FMU holds a binary.
+    """Write a file in the format of its ending: .toml, .fmu and .mo are the model, .ssv its parameters, the others its linear model.
 
-    reduced: the reduced linear model that a study's [linearize] asks for.
+    source: a study, a model (linearised at its steady state) or a linear model. linear: the linear model even where the
+    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. values: of a study, "given", "start" or
+    "fitted"; left out, the fitted ones where a fit stands in its folder of results (folder, by default the study's own),
+    else the given ones. reduced: the reduced linear model that a study's [linearize] asks for. The result says which values
+    the file holds, and whether an FMU holds a binary. Raises StudyError for an ending that is not known, where the model is
+    not of the kind that the ending needs, and where fitted values are asked for and none stand.
     """
     from hvdc_ident.linearize.export import formats
     from hvdc_ident.linearize.export import write as write_linear
@@ -349,7 +328,7 @@ def attach(folder: Path) -> Path | None:
     card = folder / Path(str(name)).name
     if not name or not card.is_file():
         return None
-    return export(read_card(card), card.with_suffix(".fmu"))
+    return write(read_card(card), card.with_suffix(".fmu")).path
 
 
 def ssv(values: Mapping[str, float], name: str, note: str = "") -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.fit import FitParameter, FitResult, Group, Problem, fit, fit_each, fit_individually
+from hvdc_ident.fit import FitResult, Group, Problem, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.frequency_data import with_responses
 from hvdc_ident.fit.likelihood import loss
@@ -122,14 +122,10 @@ def _one_by_one(
     parts = [part_of(problem, g, at) for g in groups] or [problem]
     table: dict[str, Any] = {}
     for part in parts:
-        begun = replace(part, free=tuple(_from(f, at[f.name]) for f in part.free))
+        begun = replace(part, free=tuple(replace(f, start=min(max(at[f.name], f.min), f.max)) for f in part.free))
         if len(begun.fitted_experiments) > 1:
             table |= fit_each(begun, whiten=whiten, executor=executor, progress=progress)
     return table
-
-
-def _from(free: FitParameter, value: float) -> FitParameter:
-    return replace(free, start=min(max(value, free.min), free.max))
 
 
 def curves_of(problem: Problem, result: FitResult) -> dict[str, dict[str, Curve]]:

@@ -178,19 +178,16 @@ def _place(loc: typing.Sequence[int | str], table: Any) -> str:
     """`experiment 'step-up'.window`: the place in the words of the file."""
     text, inner = "", table
     for part in loc:
-        inner = _inner(inner, part)
+        if isinstance(inner, dict):
+            inner = inner.get(part)
+        else:
+            inner = inner[part] if isinstance(inner, list) and isinstance(part, int) and part < len(inner) else None
         if isinstance(part, int):
             name = inner.get("name") if isinstance(inner, dict) else None
             text += f" '{name}'" if isinstance(name, str) else f" number {part + 1}"
         elif part != "[key]":
             text += f".{part}" if text else str(part)
     return text
-
-
-def _inner(inner: Any, part: int | str) -> Any:
-    if isinstance(inner, dict):
-        return inner.get(part)
-    return inner[part] if isinstance(inner, list) and isinstance(part, int) and part < len(inner) else None
 
 
 def _unknown_key(key: str, outer: tuple[int | str, ...], table: dict[str, Any], where: str) -> StudyError:
@@ -229,15 +226,10 @@ def _table_at(outer: tuple[int | str, ...]) -> type[BaseModel] | None:
         else:
             inner = [a for a in typing.get_args(kind) if a is not str]
             kind = inner[-1] if inner else None
-        kind = _without_none(kind)
+        if typing.get_origin(kind) in (types.UnionType, typing.Union):
+            members = [a for a in typing.get_args(kind) if a is not type(None)]
+            kind = members[-1] if members else None
     return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
-
-
-def _without_none(kind: Any) -> Any:
-    if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        rest = [a for a in typing.get_args(kind) if a is not type(None)]
-        return rest[-1] if rest else None
-    return kind
 
 
 def _shown(value: Any) -> str:

@@ -17,7 +17,7 @@ from hvdc_ident.cli import app
 from hvdc_ident.errors import StudyError
 from hvdc_ident.linearize import linearize
 from hvdc_ident.models import load_model
-from hvdc_ident.study.export import FmuOptions, export
+from hvdc_ident.study.export import FmuOptions, write
 from hvdc_ident.study.study import load_study
 
 STUDY = """
@@ -108,12 +108,12 @@ def test_parameters_are_an_ssp_parameter_set(study: Path, tmp_path: Path) -> Non
 
 def test_a_model_may_be_given_in_python(tmp_path: Path) -> None:
     link = load_model("vsc-hvdc-link")
-    path = export(link, tmp_path / "x.fmu", fmu=FmuOptions(version="3.0", binary=False))
+    path = write(link, tmp_path / "x.fmu", fmu=FmuOptions(version="3.0", binary=False)).path
     assert read_model_description(str(path)).fmiVersion == "3.0"
-    assert export(link, tmp_path / "L.mo").read_text().startswith("model L ")
-    assert "A[6, 6]" in export(linearize(link), tmp_path / "K.mo").read_text()
+    assert write(link, tmp_path / "L.mo").path.read_text().startswith("model L ")
+    assert "A[6, 6]" in write(linearize(link), tmp_path / "K.mo").path.read_text()
     with pytest.raises(StudyError, match="no export has this ending"):
-        export(linearize(link), tmp_path / "x.fmu")
+        write(linearize(link), tmp_path / "x.fmu")
 
 
 def test_a_study_of_an_fmu_has_no_equations_to_write(study: Path, tmp_path: Path) -> None:

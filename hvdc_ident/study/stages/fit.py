@@ -124,15 +124,16 @@ def _head(study: Study, values: Mapping[str, float]) -> str:
 def lines_of(data: Mapping[str, Any]) -> list[str]:
     """The status and the verdict on the residuals, then every estimate beside its given value, then what is held."""
     from hvdc_ident.fit.result import FIT_WORDS
+    from hvdc_ident.study.measured_responses import response_lines
 
     lines = [f"{data['status']}: {data['message']}"]
     judged = data.get("adequacy") or {}
     lines += [f"{FIT_WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
     lines += [f"Next: {judged['next']}"] if judged.get("next") else []
     lines += [f"{data['roughness']['text']}."] if data.get("roughness") else []
-    from hvdc_ident.study.measured_responses import response_lines
-
-    beside = _beside(data)
+    chi2 = judged.get("chi2_per_dof")
+    # How large the residual is against the noise that every interval rests on.
+    beside = f"chi2/dof {chi2:.3g}" if chi2 is not None else "noise from the residual"
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
         given = f" (given {data['candidates'][name]['given']:.6g})"
@@ -143,12 +144,6 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     lines += _conditions(data)
     lines += response_lines(data.get("responses", ()), "fitted")
     return lines + _searched(data)
-
-
-def _beside(data: Mapping[str, Any]) -> str:
-    """Return the remark beside every interval: how large the residual is against the noise the interval rests on."""
-    chi2 = (data.get("adequacy") or {}).get("chi2_per_dof")
-    return f"chi2/dof {chi2:.3g}" if chi2 is not None else "noise from the residual"
 
 
 def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:
