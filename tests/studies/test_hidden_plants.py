@@ -146,9 +146,9 @@ TOGETHER = [  # plant, effect, slot, from, parameters
 @pytest.mark.parametrize(("name", "effect", "at", "source", "values"), TOGETHER)
 def test_both_simulators_agree_on_effects(name, effect, at, source, values):
     plant = PLANTS[name]
-    plain, mine = (own(plant, hidden=h) for h in ((), [Hidden(effect, at, values, source)]))
+    plain, mine = (own(plant, hidden=h, rows=60) for h in ((), [Hidden(effect, at, values, source)]))
     use = EffectUse(effect, (at,), FrozenMap(values), source=source)
-    theirs = packages(plant, apply_effects(model_of(name), [use]))
+    theirs = packages(plant, apply_effects(model_of(name), [use]), rows=60)
     size = np.abs(mine - plain).max()
     assert size > 1e-3
     assert np.abs(mine - theirs).max() < 0.01 * size + 2e-4 * np.ptp(plain)
