@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hvdc_ident.cli import app
-from hvdc_ident.errors import SimulationError
+from hvdc_ident.errors import SimulationError, unknown_name
 from hvdc_ident.study.stages import stages
 
 CARD = """\
@@ -200,6 +200,29 @@ def test_a_refused_option_says_why_and_what_to_try(study: Path, words: tuple[str
     assert refused.exit_code == 2 and reason in refused.stderr and "expected" in refused.stderr
     assert ". Try: " in refused.stderr
     assert sorted(study.parent.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("step.csv", "time,u\n0,1\n1,2\n", ("a file of waveforms, not a study", "hvdc-ident convert step.csv --list")),
+        ("step.txt", "time u\n0 1\n1 2\n", ("a file of waveforms, not a study", "hvdc-ident convert step.txt --list")),
+        ("step.mat", "\0\1\2", ("a file of waveforms, not a study", "hvdc-ident convert step.mat --list")),
+        ("plant.fmu", "PK", ("this is an FMU, not a study", "hvdc-ident check plant.fmu")),
+        ("study.txt", "[model", ("not valid TOML", "hvdc-ident new DIR")),
+    ],
+)
+def test_a_file_that_is_no_study_is_called_by_its_kind(
+    tmp_path: Path, name: str, content: str, words: tuple[str, ...]
+) -> None:
+    (tmp_path / name).write_text(content)
+    refused = call("run", tmp_path / name)
+    assert refused.exit_code == 2 and all(w in refused.stderr for w in words)
+
+
+def test_only_the_nearest_names_are_suggested() -> None:
+    assert str(unknown_name("gain", "KIVCD", ["KIP", "KIVDC", "KIQ"])).endswith("Try: did you mean 'KIVDC'?")
+    assert str(unknown_name("gain", "KI", ["KIP", "KPVDC", "KIQ"])).endswith("Try: did you mean 'KIQ' or 'KIP'?")
 
 
 def test_new_writes_a_study_that_passes_check(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from hvdc_ident.errors import StudyError, nearest
-from hvdc_ident.formats import formats
+from hvdc_ident.errors import InputError, StudyError, nearest
+from hvdc_ident.formats import formats, list_signals
 from hvdc_ident.study.schema import StudyFile
 
 LARGEST = 1_000_000  # bytes; a study of a thousand experiments has a third of it
@@ -76,11 +76,11 @@ def checked(table: dict[str, Any], where: str) -> StudyFile:
 
 
 def _refuse_other_kinds(path: Path) -> None:
-    """Raise StudyError for a file whose ending is that of waveforms or of an FMU."""
+    """Raise StudyError for an FMU and for a file of waveforms; a *.txt is one where its signals can be listed."""
     ending = path.suffix.lower()
     if ending == ".fmu":
         what, hint = "an FMU", f"`hvdc-ident check {path.name}` lists its variables; a study names it in [model] source"
-    elif any(ending in f.SUFFIXES for f in formats().values()):
+    elif any(ending in f.SUFFIXES for f in formats().values()) and (ending != ".txt" or _lists_signals(path)):
         convert = f"`hvdc-ident convert {path.name} --list ''` lists its signals"
         what, hint = "a file of waveforms", f"{convert}; a study names it in data of an [[experiment]]"
     else:
@@ -88,6 +88,13 @@ def _refuse_other_kinds(path: Path) -> None:
     raise StudyError(
         f"this is {what}, not a study", where=path.name, expected="a study file (TOML)", got=f"'{ending}'", hint=hint
     )
+
+
+def _lists_signals(path: Path) -> bool:
+    try:
+        return bool(list_signals(path))
+    except InputError:
+        return False
 
 
 def _toml(content: bytes, where: str) -> dict[str, Any]:
