@@ -113,3 +113,34 @@ def test_an_effect_in_words():
     line = {"effect": "droop", "at": ["eq1", "eq2"], "from": "Q1", "parameters": {"k": {"value": 0.1316, "ci95": None}}}
     assert diagnosing.label(line) == "droop at eq1, eq2 from Q1 (k 0.132)"
     assert diagnosing.effects_of({"effects": []}) == "-"
+
+
+def test_findings_in_a_table_each_on_its_line():
+    lag = {
+        "effect": "lag", "same_as": ["lag", "window-mean"], "probability": 0.97, "parameters": {
+            "T": {"value": 1.46e-3, "ci95": [1.4e-3, 1.5e-3], "unit": "s"}
+        },
+        "places": [{"at": [p], "probability": q} for p, q in (("P2", 0.5), ("P2_m", 0.3), ("Pdc2", 0.1), ("Ir2", 0.1))],
+        "equivalent_delay": {"value": 1.46e-3, "ci95": None, "unit": "s"},
+    }  # fmt: skip
+    loss = {
+        "effect": "coupling", "same_as": ["coupling"], "probability": 1.0, "equivalent_delay": None,
+        "parameters": {"k": {"value": -0.5, "ci95": None, "unit": ""}},
+        "places": [{"at": ["Idc"], "probability": 1.0, "from": "P2"}],
+    }  # fmt: skip
+    both = {
+        "verdict": "named",
+        "findings": [lag, loss],
+        "remainder": {"share": 0.02, "held_out": None, "noise_units": 1.1},
+    }
+    none = {"verdict": "no-evidence", "findings": [], "remainder": {}}
+    lines = diagnosing.findings({"filters": both, "nothing": none}, "case").splitlines()
+    first = (
+        "| filters | named | lag or window-mean | 0.970 | T 0.00146 (0.00140 to 0.00150) | 1.46 "
+        "| P2 (0.50); P2_m (0.30); Pdc2 (0.10); 1 more | 2.0 %; - | 1.10 |"
+    )
+    assert lines[2:] == [
+        first,
+        "|  |  | coupling | 1.00 | k -0.500 | - | Idc from P2 (1.0) |  |  |",
+        "| nothing | no-evidence | - | - | - | - | - | - | - |",
+    ]
