@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit
 from hvdc_ident.discrepancy.formula import Term, at_run, formula_job, terms
+from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.filtered import filters
 from hvdc_ident.discrepancy.outside.law import regression
 from hvdc_ident.discrepancy.race import done
@@ -23,9 +24,6 @@ from hvdc_ident.discrepancy.signatures.candidates import additive, source_signal
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
-
-TRIED = 6
-"""Formulas, the best by regression, that are refitted."""
 
 
 def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
@@ -65,7 +63,7 @@ def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
             ranked.append((gain - PRICE * len(formula), [library[k] for k in formula], coefficients))
     ranked.sort(key=lambda r: -r[0])
     jobs = []
-    for _, chosen, coefficients in ranked[:TRIED]:
+    for _, chosen, coefficients in ranked[:SHORTLIST]:
         try:
             jobs.append(formula_job(found.before, place, chosen, coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model

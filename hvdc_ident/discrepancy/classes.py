@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
 from hvdc_ident.discrepancy.explain import advice
-from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.options import SURE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, Hypothesis, Place, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
@@ -21,8 +21,6 @@ from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import listed, quantity
 
-NEEDED = 4.0
-"""Standard deviations by which a coefficient has to be off 0 for a formula not to be another one with something idle in it."""
 SLIGHT = 1e-3
 """Share of what a form explains by which a formula may explain more and not refute it: of so much the noise is not known."""
 MISSED = 0.15
@@ -101,7 +99,7 @@ def _all_needed(refit: Refit) -> bool:
     """Return True where every parameter of the last effect is clearly off 0."""
     sizes, names = refit.sizes(refit.placed[-1]), refit.placed[-1].names
     stds = {n: refit.std.get(names[n]) for n in sizes}
-    return all(std is not None and abs(sizes[n]) > NEEDED * std for n, std in stds.items())
+    return all(std is not None and abs(sizes[n]) > SURE * std for n, std in stds.items())
 
 
 def _rival(trial: CandidateFit, behind: float) -> Rival:

@@ -14,7 +14,8 @@ from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import effects
 
 CLEARLY = 30.0
-"""In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say."""
+"""In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say. With a smaller squared
+difference of their answers, in noise units, two models are one to these data."""
 CLEAR = 2.0
 """Standard deviations by which an effect has to be off doing nothing."""
 
@@ -149,10 +150,6 @@ def material_gap(
     return before is not None and after is not None and before - after > share
 
 
-AGREED = 10.0
-"""By how much chi2 of the held-out data has to fall for them to agree, or to rise for them to speak against an effect."""
-SILENT = 30.0
-"""Squared difference of held-out answers, in noise units, below which those data cannot judge an effect."""
 STEP = 0.05
 """Share of the gap that a second effect has to take away at least."""
 
@@ -182,7 +179,7 @@ def objections(
     if was is None or now is None:
         return "nothing can be left out to judge it by"
     # Records that an effect does not move are better or worse by the noise they hold.
-    if not now < was and ((now**2 - was**2) * unseen_rows(refit) > AGREED or not silent(before, refit)):
+    if not now < was and ((now**2 - was**2) * unseen_rows(refit) > options.named_bic or not silent(before, refit)):
         pooled = f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
         return speaks_against(before, refit) or pooled
     tables = (worst(before), worst(refit)) if tolerance else None
@@ -194,7 +191,7 @@ def objections(
         then, since = as_recorded(before), as_recorded(refit)
         gaps = (fitted, *((then.get(role), since.get(role)) for role in ("fit", "holdout")))
         shown = not tolerance and any(material_gap(*gap, options.holdout_share, None, None) for gap in gaps)
-        if not (shown and ((was**2 - now**2) * unseen_rows(refit) > AGREED or silent(before, refit))):
+        if not (shown and ((was**2 - now**2) * unseen_rows(refit) > options.named_bic or silent(before, refit))):
             return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
     if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
         return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
@@ -235,7 +232,7 @@ def silent(before: Refit, after: Refit) -> bool:
     one, two = (held_out(r.problem, r.theta) for r in (before, after))
     if not one or not two:
         return False
-    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < SILENT
+    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < CLEARLY
 
 
 def as_recorded(refit: Refit) -> dict[str, float]:

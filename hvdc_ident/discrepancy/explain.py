@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Table
@@ -122,10 +123,6 @@ def at_given(refitted: Refit, given: Mapping[str, float]) -> Refit:
     """The nominal model at the given values, nuisances as they were found. given: of all candidates, held ones too."""
     held = refitted.problem.held | {n: v for n, v in given.items() if n in refitted.problem.held}
     return replace(refitted, problem=replace(refitted.problem, held=held), theta=refitted.theta_at_given)
-
-
-SURE = 4.0
-"""Standard deviations by which a value has to be off the given one."""
 
 
 def off_given(last: Refit, given: Refit) -> Finding | None:

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import BEAM, TOLERANCE
 from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
 from hvdc_ident.discrepancy.proposals import by_latent, by_score, joined, views_of
-from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refitted import (
     all_far,
     best_each,
@@ -31,19 +31,12 @@ from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.size_profile import has_to_be_met, resized, sized
 from hvdc_ident.effects import Probe, effects
 
-RACE = Race(sprint=6, reach=0.4, second=12)
 FIELD = 40
 """Proposals refitted at a time."""
 OF_EFFECT = 8
 """Of one effect among these at most: places that cannot be told apart are neighbours, and come later."""
-AT_PLACE = 2
-"""Sizes of one effect at one place among them."""
 BATCHES = 1
 """Further times that so many are refitted where nothing comes near the noise, unless a thorough search is asked for."""
-NEIGHBOURS = 60
-"""Neighbours refitted at a time."""
-LEADERS = 2
-"""Effects, the best, whose neighbours are refitted."""
 TURNS = 3
 """Times that the neighbours of what is then best are refitted."""
 LEVEL = 0.9
@@ -62,19 +55,19 @@ def explored(
     chance = opened.scores.threshold(0.5)
     field = [p for p in field if p.score > chance or p.fall > chance]
     taken = _entrants(opened, field)
-    trials += refitted(search, opened, taken, f"round {number}", trials, RACE)
+    trials += refitted(search, opened, taken, f"round {number}", trials)
     opened, trials = _with_neighbours(search, opened, trials, field, number)
     if number > 1:
         return opened, tuple(trials)
     # Sizes that have to be met: where nothing explains the records, or what does is a kind of delay.
-    far = all_far(opened.before, trials, near=0.01)
-    late = {opened.candidates[t.pick.candidate].at for t in by_cost(trials)[:LEADERS] if _late(t) is not None}
+    far = all_far(opened.before, trials, near=TOLERANCE)
+    late = {opened.candidates[t.pick.candidate].at for t in by_cost(trials)[:BEAM] if _late(t) is not None}
     opened, more = by_latent(search, opened, views, number, lambda c: has_to_be_met(c) and (far or c.at in late))
     if more:
         trials = best_each(
             [
                 *trials,
-                *refitted(search, opened, _entrants(opened, more), f"round {number}: sizes to be met", trials, RACE),
+                *refitted(search, opened, _entrants(opened, more), f"round {number}: sizes to be met", trials),
             ]
         )
         trials = once_more(search, opened, trials, f"round {number}: sizes to be met")
@@ -92,7 +85,7 @@ def explored(
             return replace(opened, untried=len(rest)), tuple(trials)
         batches -= 1
         done |= {id(p) for p in taken}
-        trials = best_each([*trials, *refitted(search, opened, taken, f"round {number}: the others", trials, RACE)])
+        trials = best_each([*trials, *refitted(search, opened, taken, f"round {number}: the others", trials)])
         opened, trials = _with_neighbours(search, opened, trials, field, number)
     return opened, tuple(trials)
 
@@ -130,7 +123,7 @@ def _entrants(opened: Round, field: Sequence[Pick]) -> list[Pick]:
         place = c.effect, c.at, c.source
         if len(taken) == FIELD:
             break
-        if effect_count.get(c.effect, 0) >= OF_EFFECT or place_count.get(place, 0) >= AT_PLACE:
+        if effect_count.get(c.effect, 0) >= OF_EFFECT or place_count.get(place, 0) >= BEAM:
             continue
         effect_count[c.effect] = effect_count.get(c.effect, 0) + 1
         place_count[place] = place_count.get(place, 0) + 1
@@ -152,7 +145,7 @@ def _with_neighbours(
         if not picks:
             break
         before = by_cost(trials)[0]
-        more = refitted(search, opened, picks, f"round {number}: neighbours", trials, RACE)
+        more = refitted(search, opened, picks, f"round {number}: neighbours", trials)
         trials = best_each([*trials, *more])
         if by_cost(trials)[0] is before:
             break
@@ -169,7 +162,7 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
     for t in sound:
         if opened.before.chi2 - t.refit.chi2 >= least:
             each.setdefault(opened.candidates[t.pick.candidate].effect, t)
-    return list(each.values())[:LEADERS]
+    return list(each.values())[:BEAM]
 
 
 @dataclass(frozen=True)
@@ -239,7 +232,7 @@ def _neighbours(
                 picks.append(Pick(n, opened.scores.columns[opened.score_p(n)[2]].probe, 1.0, score, lead.gains))
         picks += _other_forms(opened, lead.number, trials, asked)
     more = [replace(found[n], probes=tuple(probes)) for n, probes in extra.items()]
-    return replace(opened, candidates=joined(found, more)), sorted(picks, key=lambda p: -p.score)[:NEIGHBOURS]
+    return replace(opened, candidates=joined(found, more)), sorted(picks, key=lambda p: -p.score)[:FIELD]
 
 
 def _as_late(candidate: CandidateEffect, late: float | None) -> tuple[int, float] | None:

@@ -22,6 +22,7 @@ from scipy.linalg import block_diag, solve_triangular
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.scores import SEEN, Path, Whitening
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.executor import Executor, mapped
@@ -203,8 +204,6 @@ def _hats(time: Array, knots: int) -> tuple[Array, scipy.sparse.csr_array]:
 SHARE = 0.7
 """Of what the best slot could make good, up to which another one is too little. Of 222 hidden effects of at least ten times
 what can be detected the own slot had less than nine tenths for three, and for none less than eight."""
-SURE = 4.0
-"""Standard deviations of chance by which it has to be too little."""
 SHOWN = 3
 """Slots, those where most could be made good, of which the course of what is missing is told."""
 

@@ -6,6 +6,15 @@ from dataclasses import dataclass
 
 from hvdc_ident.errors import StudyError
 
+SURE = 4.0
+"""Standard errors beyond which nothing is put down to chance: one in 16 000, where a diagnosis asks some hundred such questions."""
+TOLERANCE = 0.01
+"""Share of the squared gap, a tenth of its amplitude, that nobody asks about: no model leaves noise alone of real records."""
+SHORTLIST = 6
+"""The best by a cheap measure (a score, a regression) that are tried in full: formulas, filters, places, earlier rivals."""
+BEAM = 2
+"""Hypotheses that are followed side by side."""
+
 
 @dataclass(frozen=True)
 class DiagnosisOptions:

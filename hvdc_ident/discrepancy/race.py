@@ -23,9 +23,9 @@ class Race:
     sprint, that run another before that is asked.
     """
 
-    sprint: int = 15
-    reach: float = 0.7
-    second: int = 0
+    sprint: int = 6
+    reach: float = 0.4
+    second: int = 12
 
     def run(
         self, search: SearchContext, before: float, jobs: Sequence[RefitJob], texts: Sequence[str], best: float = np.inf

@@ -13,6 +13,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Experiment, event_time, noise_floor
 from hvdc_ident.discrepancy.noise_colour import TANH, Colour, Likelihood, likelihood, together, without_common
+from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
 from hvdc_ident.fit.noise_model import AR, autoregression, scatter_of, segments
@@ -22,8 +23,6 @@ from hvdc_ident.immutable import FrozenMap
 
 FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
-SURE = 3.3
-"""Standard errors by which the records before the event must exceed a given noise to replace it."""
 GIVEN = "given"
 """The source of a standard deviation that stands as it was given."""
 SOFT = 1e-6

@@ -10,6 +10,7 @@ import numpy as np
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, unseen_rows
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, of_held_out, unseen
 from hvdc_ident.discrepancy.refit_jobs import job
@@ -19,7 +20,6 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.model import AnyModel
 
-RACE = Race()
 PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
 NEAR = 0.05
@@ -46,7 +46,6 @@ def refitted(
     picks: Sequence[Pick],
     text: str,
     earlier: Sequence[CandidateFit] = (),
-    race: Race = RACE,
 ) -> list[CandidateFit]:
     """The picks refitted in a race with each other and with those refitted earlier."""
     before, found = opened.before, opened.candidates
@@ -61,7 +60,7 @@ def refitted(
             trials.append(CandidateFit(p, none, -np.inf))
     texts = [f"{text}: {found[p.candidate].label}" for p in of]
     best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
-    refits = race.run(search, before.chi2, jobs, texts, best)
+    refits = Race().run(search, before.chi2, jobs, texts, best)
     if sound := [r for r in refits if not r.failure]:
         search.lead(min(sound, key=lambda r: r.chi2))
     return [*trials, *(CandidateFit(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
@@ -72,21 +71,19 @@ def once_more(
     opened: Round,
     trials: Sequence[CandidateFit],
     text: str,
-    most: int = AGAIN,
-    best: float = np.inf,
 ) -> list[CandidateFit]:
     """The trials, with another size where one is found beside the gains that a refit came to.
 
-    best: the least chi2 of refits done elsewhere; those far behind it are left as they are. Of each effect the best comes
-    first, and the others where still nothing comes near the noise.
+    Those far behind the best are left as they are. Of each effect the best comes first, and the others where still nothing comes
+    near the noise.
     """
     found, was = opened.candidates, opened.before.chi2
     order = by_cost(trials)
-    goal = max(WORTHY * (was - min([best, *(t.refit.chi2 for t in order)])), telling(opened.before))
+    goal = max(WORTHY * (was - min((t.refit.chi2 for t in order), default=was)), telling(opened.before))
     chosen: dict[str, list[CandidateFit]] = {}
     for t in sorted(order, key=lambda t: t.refit.chi2):
         effect = found[t.pick.candidate].effect
-        if effects()[effect].needs_grid and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < most:
+        if effects()[effect].needs_grid and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < AGAIN:
             chosen[effect].append(t)
     kept = list(trials)
     for heat in ([group[:1] for group in chosen.values()], [group[1:] for group in chosen.values()]):
@@ -140,13 +137,13 @@ def on_bound(refit: Refit) -> bool:
 
 def excess(refit: Refit) -> bool:
     """Return True where a model leaves more than noise, by size."""
-    return refit.chi2 / refit.rows > 1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective))
+    return refit.chi2 / refit.rows > 1.0 + SURE * float(np.sqrt(2.0 / refit.effective))
 
 
 def misses(refit: Refit) -> bool:
     """Return True where a model leaves more of unseen data than of those it was fitted to, by more than chance."""
     seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
-    return now is not None and now**2 > seen * (1.0 + 3.0 * float(np.sqrt(2.0 / refit.effective)))
+    return now is not None and now**2 > seen * (1.0 + SURE * float(np.sqrt(2.0 / refit.effective)))
 
 
 def left_by(refit: Refit) -> float:

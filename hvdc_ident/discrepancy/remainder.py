@@ -21,6 +21,7 @@ from hvdc_ident.discrepancy.context import SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
 from hvdc_ident.discrepancy.scores import runs
@@ -28,10 +29,6 @@ from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
 
-PLACES = 8
-"""Insertion points, those where most of the remainder could be made good, at which the latent input is tried."""
-TOLERANCE = 0.01
-"""Share of the squared gap, a tenth of its amplitude, that nobody asks about: no model leaves noise alone of real records."""
 DRAWS = 100
 """Records of noise: a p of 1 % is the least that is asked for."""
 
@@ -112,7 +109,7 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     search.tell(0, 1, "anything else that is missing")
     jobs = [_LatentJob(nominal, {n: p.only(s) for n, p in inner.items()}, s, None) for s in places]
     falls = list(mapped(search.executor, _fall, jobs))
-    best = sorted(range(len(places)), key=lambda k: -falls[k])[:PLACES]
+    best = sorted(range(len(places)), key=lambda k: -falls[k])[:SHORTLIST]
     drawn = draws(nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), DRAWS, search.seed + 5)
     noise = nominal.projected(np.vstack(drawn))
     jobs = [_LatentJob(nominal, {n: p.only(places[k]) for n, p in inner.items()}, places[k], noise) for k in best]

@@ -11,6 +11,7 @@ from scipy.special import fdtrc
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
+from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit
@@ -19,8 +20,6 @@ from hvdc_ident.effects import effects
 BINS = 8
 AFTER = 10
 """Rows after a break of an input in which a quick answer to it is looked for."""
-LOUDER = 4.0
-"""Standard deviations by which they have to be louder than the others."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ def loud_after_breaks(nominal: Nominal) -> bool:
     at, power = np.concatenate(near), np.concatenate(squares)
     if not at.any() or at.all():
         return False
-    limit = 1.0 + LOUDER * float(np.sqrt(2.0 / np.count_nonzero(at)))
+    limit = 1.0 + SURE * float(np.sqrt(2.0 / np.count_nonzero(at)))
     return bool(np.mean(power[at]) > limit * np.mean(power[~at]))
 
 

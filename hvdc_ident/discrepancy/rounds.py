@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, behinds, best_of, evidence_between, objections
-from hvdc_ident.discrepancy.explore import explored
+from hvdc_ident.discrepancy.explore import FIELD, explored
 from hvdc_ident.discrepancy.latent import reach
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.proposals import by_latent, views_of
@@ -16,17 +16,13 @@ from hvdc_ident.discrepancy.refitted import all_far, excess, like_noise, once_mo
 from hvdc_ident.discrepancy.scores import runs, scored, tones
 from hvdc_ident.discrepancy.signatures.candidates import candidates
 
-REFIT_SCORE = 0.5
-"""What of a refit's fall of chi2 counts as a score where there is no other: a refit moves more than a score does."""
-LEAST_SCORE = 0.25
-"""The same where there is one: the sizes that it is of may be none that the refit came to, as of a moving mean's zeros."""
+SCORED = 0.25
+"""Part of a refit's fall of chi2 that counts as a score: a refit moves more than a score does, and ends at sizes not scored."""
 LARGE = 2.0
 """Times its rows: chi2 of a model with an effect in it from which it is asked where anything would explain the rest."""
 NEARLY = 0.1
 """Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
 
-REFITTED = 24
-"""Proposals refitted where no score told of anything."""
 
 BEYOND = "none of it leaves noise, and what is found from the data alone does"
 
@@ -73,7 +69,7 @@ def _met(search: SearchContext, opened: Round, nominal: Nominal) -> Round:
     opened, picks = by_latent(search, opened, views_of(opened, nominal), 1, lambda _: True)
     if not picks or opened.scores.p(max(p.score for p in picks)) > search.options.significance:
         return opened
-    trials = refitted(search, opened, picks[:REFITTED], "round 1: refits of many sizes")
+    trials = refitted(search, opened, picks[:FIELD], "round 1: refits of many sizes")
     if all_far(opened.before, trials):
         trials = once_more(search, opened, trials, "round 1: once more")
     return closed(search, replace(opened, significant=True, why=""), trials, 1)
@@ -113,5 +109,5 @@ def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: R
     gave is scored by its refit. Where a refit brings many times what scores do at the sizes tried, these were the wrong ones.
     """
     best, fall = max(trial.pick.score, opened.score_p(trial.pick.candidate)[0]), before.chi2 - trial.refit.chi2
-    score = max(best, LEAST_SCORE * fall) if best else REFIT_SCORE * fall
+    score = max(best, SCORED * fall)
     return objections(before, trial, opened.scores.p(score), search.options, search.tolerance, first=first)

@@ -10,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between
+from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
@@ -19,9 +20,6 @@ from hvdc_ident.discrepancy.released import released
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-
-BEAM = 2
-"""Hypotheses that are searched one step further where none of them passes alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +154,6 @@ def _different(found: Round) -> list[CandidateFit]:
     return list(each.values())
 
 
-OTHERS = 6
-"""Rivals of each effect in its own round that are tried again once the other effects are in."""
-
-
 def settled(
     search: SearchContext, first: Refit, here: Refit, kept: Sequence[Round], number: int
 ) -> tuple[Refit, list[Round], tuple[str, ...]]:
@@ -221,7 +215,7 @@ def _looked_again(
     sound = [t for t in again.trials if t.pick.candidate != mine]
     tried = {own.label, *(again.candidates[t.pick.candidate].label for t in sound)}
     refits: list[tuple[Pick, RefitJob]] = []
-    for trial in found.trials[: OTHERS + 1]:
+    for trial in found.trials[: SHORTLIST + 1]:
         placed = trial.refit.placed[-1]
         among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
         with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival

@@ -18,6 +18,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.nominal import orthonormal
+from hvdc_ident.discrepancy.options import BEAM, SURE
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, RefitResult, found_by, judged, of_held_out, run, signal
 from hvdc_ident.discrepancy.refit_jobs import as_given
@@ -146,10 +147,6 @@ BETTER = 0.02
 """Share by which chi2 has to fall for another hop."""
 COUNTS = 12
 """Numbers of steps, on either side of the one there is, that a level may be from 0."""
-UNSURE = 3.0
-"""Standard deviations within which sizes are one to the fitted data."""
-POLISHED = 2
-"""Refits, the best, of what has levels that are polished without slopes."""
 ROUGH = 20.0
 """Times its rows: chi2 up to which one is."""
 RUNS = 500
@@ -197,7 +194,7 @@ def hopped(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]
         here = here | moving
     here = further(here, _Sweep(_closely))
     here |= further({k: here[k] for k in counted}, _Sweep(_other_counts, between=False))
-    best = [k for k in sorted(counted, key=lambda k: _left(here[k]))[:POLISHED] if here[k].chi2 < ROUGH * here[k].rows]
+    best = [k for k in sorted(counted, key=lambda k: _left(here[k]))[:BEAM] if here[k].chi2 < ROUGH * here[k].rows]
     polished = mapped(search.executor, _polished, [here[k] for k in best])
     here |= {k: outcome.refit(jobs[k]) for k, outcome in zip(best, polished, strict=True)}
     found = stuck | _agreed(search, here)
@@ -291,7 +288,7 @@ def _within(here: Refit) -> Array:
     """Sizes within the uncertainty of the one there is; none where that is not known."""
     _, own, low, high = _size(here)
     std = here.std.get(here.placed[-1].names[sized(here.placed[-1].candidate)])
-    return np.empty(0) if not std else np.clip(own + std * np.linspace(-UNSURE, UNSURE, PIECE), low, high)
+    return np.empty(0) if not std else np.clip(own + std * np.linspace(-SURE, SURE, PIECE), low, high)
 
 
 def _size(here: Refit) -> tuple[int, float, float, float]:

@@ -17,9 +17,10 @@ from hvdc_ident.discrepancy.evidence import material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import TOLERANCE
 from hvdc_ident.discrepancy.record_noise import FEWEST
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
-from hvdc_ident.discrepancy.remainder import TOLERANCE, Remainder, remainder_of
+from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, Verdict
 from hvdc_ident.discrepancy.search import SearchOutcome
@@ -279,8 +280,6 @@ def _signals(last: Refit) -> dict[str, dict[str, Array]]:
     return found
 
 
-TRIFLE = 0.005
-"""Share of what is explained of which nothing is made: of real records no model leaves noise alone."""
 VARYING_P = 1e-4
 """Chance under noise of experiments that agree on a size: the test is of first order, and a name is not to be lost by that."""
 
@@ -344,7 +343,7 @@ def _varying(last: Refit, left: Nominal, explained: float) -> Doubt | None:
     """Doubt because the experiments ask for different sizes of an effect."""
     for placed in last.placed:
         found, label = constancy(last, left, placed), placed.candidate.label
-        if found.p < VARYING_P and found.told > TRIFLE * explained:
+        if found.p < VARYING_P and found.told > TOLERANCE * explained:
             why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
             return Doubt(why, f"The same input in several sizes, in which {label} answers.")
     return None

@@ -11,6 +11,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.formula import Law, filled, labelled
+from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.filtered import shape, transfer_function
 from hvdc_ident.discrepancy.outside.law import STABLE, Regression, law, over_signal, over_time, regression
 from hvdc_ident.discrepancy.refit import Refit
@@ -20,9 +21,6 @@ from hvdc_ident.effects import effects
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import listed
-
-PLACES = 6
-"""Places, the best over time, at which what is missing is sought over signals too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +163,7 @@ def _curve(search: SearchContext, opened: Round) -> Fallback:
     in_time = [shape(p, "time", np.linspace(begin, end, len(hats)), hats) for p in _places(search, opened)]
     in_time.sort(key=lambda s: -s.worth)
     shapes = [s for s in in_time if s.worth > 0]
-    for place in [s.place for s in in_time[:PLACES]]:
+    for place in [s.place for s in in_time[:SHORTLIST]]:
         for over in dict.fromkeys([place, *signals[:4]]):
             if np.ptp(np.concatenate([a.signal(over) for a in paths.values()])) > 0:
                 shapes.append(shape(place, over, *over_signal(paths, over)))

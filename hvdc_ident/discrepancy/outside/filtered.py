@@ -17,6 +17,7 @@ from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, best_of
 from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.law import standing
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refitted import refitted
@@ -26,8 +27,6 @@ from hvdc_ident.immutable import FrozenMap
 
 BESIDES = ("low", "high")
 """Parameters of the filter below and above its band."""
-PLACES = 4
-"""Places, the best by score, at which the filter is refitted."""
 LATE = -0.5
 """Real part of the zeros, from -1 (those of a filter that only delays, in place of its poles) to 1, from which they are a
 notch's or a resonance's."""
@@ -48,7 +47,7 @@ def filters(search: SearchContext, found: Round, nominal: Nominal) -> tuple[Cand
     everywhere = candidates(before.model, signals, times, ("filter",), search.places)
     whole = tuple(c for c in everywhere if found.reaches(c))
     scores = scored(nominal, whole, paths, bootstraps=0, seed=search.seed, executor=search.executor)
-    picks = best_of(scores, whole)[:PLACES]
+    picks = best_of(scores, whole)[:SHORTLIST]
     both = replace(found, candidates=(*map(_band, whole), *whole), scores=scores)
     wider = [replace(p, candidate=p.candidate + len(whole)) for p in picks]
     trials = refitted(search, both, [*picks, *wider], "outside the catalogue")

@@ -18,9 +18,11 @@ from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import Ruler
 from hvdc_ident.discrepancy.formula import Law, Term, at_run, formula_job, hats, terms
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
+from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, unseen
-from hvdc_ident.discrepancy.refitted import RACE, is_far
+from hvdc_ident.discrepancy.refitted import is_far
 from hvdc_ident.discrepancy.residual_checks import residual_tests
 from hvdc_ident.discrepancy.scores import Path, Whitening
 from hvdc_ident.discrepancy.signatures.candidates import source_signals
@@ -140,12 +142,8 @@ STABLE = 0.8
 AGAIN = 25
 CLOSE = 2.0
 """What a formula may leave, in noise units (of chi2 a row, and held out)."""
-PLACES = 6
-"""Places, the best by regression, at which the form is tried by full simulation."""
 KNOTS = 11
 """Of a curve: a tenth of what its signal travels from one to the next."""
-CURVES = 2
-"""Curves, the best by regression, that are tried by full simulation where no formula comes near the noise."""
 MOSTLY = 0.75
 """Share of what is beyond noise that a form has to explain to first order to be tried by full simulation."""
 OVER = 6
@@ -210,11 +208,13 @@ def law(search: SearchContext, found: Round, best: Refit | None = None) -> Law |
         return None
     gap = before.chi2 - before.rows
     forms = [f for f in _forms(search, found, paths) if f.fall > MOSTLY * gap]
-    formulas = [shorter for form in [f for f in forms if f.stability is not None][:PLACES] for shorter in form.less()]
+    formulas = [
+        shorter for form in [f for f in forms if f.stability is not None][:SHORTLIST] for shorter in form.less()
+    ]
     told = _best(search, found, formulas, best)
     if told is not None and told.near:
         return told
-    return _best(search, found, [f for f in forms if f.stability is None][:CURVES], best) or told
+    return _best(search, found, [f for f in forms if f.stability is None][:BEAM], best) or told
 
 
 def _best(search: SearchContext, found: Round, forms: Sequence[_Form], best: Refit | None) -> Law | None:
@@ -225,7 +225,7 @@ def _best(search: SearchContext, found: Round, forms: Sequence[_Form], best: Ref
             jobs.append(formula_job(before, form.place, form.terms, form.coefficients))
             of.append(form)
     texts = [f"outside the catalogue: {form.label}" for form in of]
-    refits = RACE.run(search, before.chi2, jobs, texts)
+    refits = Race().run(search, before.chi2, jobs, texts)
     k, one = standing(search, found, refits, [form.stability for form in of], best)
     return one and replace(one, terms=of[k].terms)
 
