@@ -11,7 +11,7 @@ Young, 1993 (the largest of several statistics under noise).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -28,7 +28,10 @@ from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
+from hvdc_ident.immutable import FrozenMap
 
+NOISE_SHARE, RANGE_SHARE = 0.1, 0.01
+"""Of an output's noise, and of its range: an error below the larger is of no interest where the study says nothing else."""
 DRAWS = 100
 """Records of noise: a p of 1 % is the least that is asked for."""
 
@@ -38,10 +41,12 @@ class Remainder:
     """What is left of the gap.
 
     share: of the squared misfit beyond noise, fitted data; held_out: the same of the others, None where they showed no gap.
-    noise_units: root mean square of the fitted residual, in standard deviations of the noise. held_out_p: the chance that noise
-    is as loud as the held-out residual. record: the held-out experiment of which most is left, record_units: so much, in noise
-    units. p: the chance that noise alone makes a latent input as likely anywhere; at: where it is likeliest, empty where it was
-    not looked for. log_evidence: of the latent input there, in nats.
+    beyond: by output the root mean square of what is beyond noise, in tolerances: those of the study, or a tenth of the noise or
+    a hundredth of the output's range, whichever is larger. noise_units: root mean square of the fitted residual, in standard
+    deviations of the noise. held_out_p: the chance that noise is as loud as the held-out residual. record: the held-out
+    experiment of which most is left, record_units: so much, in noise units. p: the chance that noise alone makes a latent input
+    as likely anywhere; at: where it is likeliest, empty where it was not looked for. log_evidence: of the latent input there, in
+    nats.
     """
 
     share: float
@@ -53,6 +58,7 @@ class Remainder:
     log_evidence: float = 0.0
     record: str = ""
     record_units: float = 0.0
+    beyond: FrozenMap[float] = field(default_factory=FrozenMap)
 
     @property
     def largest(self) -> float:
@@ -61,8 +67,8 @@ class Remainder:
 
     @property
     def below_tolerance(self) -> bool:
-        """True where nobody need ask what is left."""
-        return self.largest <= TOLERANCE
+        """True where nobody need ask what is left: next to nothing of the gap, or less than the tolerance of every output."""
+        return self.largest <= TOLERANCE or bool(self.beyond and max(self.beyond.values()) <= 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +97,26 @@ def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float)
     records = held_out_by_record(last)
     most = max(records, key=lambda n: records[n], default="")
     units = float(np.sqrt(last.chi2 / last.rows))
-    found = Remainder(share, held, units, held_p, record=most, record_units=records.get(most, 0.0))
+    found = Remainder(
+        share, held, units, held_p,
+        record=most, record_units=records.get(most, 0.0), beyond=_beyond(search.tolerance, last, floor),
+    )  # fmt: skip
     return _tested(search, last, found)
+
+
+def _beyond(tolerance: Mapping[str, float], last: Refit, floor: float) -> FrozenMap[float]:
+    """By output the root mean square beyond noise over all records, in units of its tolerance."""
+    found = {}
+    for output, row in last.problem.rmse(last.theta).items():
+        std = last.noise[output].std or 0.0
+        values = [
+            e.measured[output] for e in last.problem.experiments if e.measured is not None and output in e.outputs
+        ]
+        extent = max((float(np.nanmax(v) - np.nanmin(v)) for v in values), default=0.0)
+        band = tolerance.get(output) or max(NOISE_SHARE * std, RANGE_SHARE * extent)
+        squares = [np.inf if v is None else v**2 for v in row.values()]
+        found[output] = float(np.sqrt(max(float(np.mean(squares)) - floor * std**2, 0.0))) / band if band > 0 else 0.0
+    return FrozenMap(found)
 
 
 def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:

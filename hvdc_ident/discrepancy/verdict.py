@@ -35,6 +35,8 @@ REFUTED = 0.1
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
 REFUTED_P = 0.01
+TOLD = 3
+"""Places of an effect that a sentence lists."""
 STRONG = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
@@ -106,7 +108,7 @@ def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Jud
         text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {rest}."
         return replace(found, verdict="unnameable", text=text, sets=())
     against = doubt(outcome.refit, left, explained)
-    if against is None and rest and remainder.largest > TOLERANCE:
+    if against is None and rest and not remainder.below_tolerance:
         against = remains(_names(found), rest)
     if against is not None and sure:
         return _in_doubt(found, labels, against)
@@ -167,9 +169,10 @@ def _class_text(each: Sequence[EffectClass]) -> str:
     """The classes of one effect in words, those that hold 95 % together."""
     told = []
     for c in likely(each):
-        places = len({(r.at, r.source) for r, _ in c.members})
-        where = f"{listed(c.members[0][0].at)}" + (f" or one of {places - 1} other places" if places > 1 else "")
-        told.append(f"{c.names[0]} at {where} ({c.probability:.0%})")
+        at = list(dict.fromkeys((r.at, r.source) for r, _ in c.members))
+        where = " or ".join(listed(places) for places, _ in at[:TOLD])
+        more = f" or one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
+        told.append(f"{c.names[0]} at {where}{more} ({c.probability:.0%})")
     return ", or ".join(told)
 
 
