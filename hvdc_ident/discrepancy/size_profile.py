@@ -32,8 +32,8 @@ from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator, Tolerance
 
-BENT = 50
-"""Sizes of an effect that has not to be met."""
+BENT = 30
+"""Sizes of an effect that need not be met to the last digit: a refit goes the rest of the way."""
 WIDE = 20.0
 """Below the least and above the largest probe of such an effect: how far its sizes reach."""
 BETWEEN = 7
