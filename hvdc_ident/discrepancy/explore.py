@@ -248,7 +248,7 @@ def _as_late(candidate: CandidateEffect, late: float | None) -> tuple[int, float
 def _other_forms(
     opened: Round, number: int, trials: Sequence[CandidateFit], asked: set[tuple[int, Hashable]]
 ) -> list[Pick]:
-    """The same effect at the same place with other optional parts, each at its best score."""
+    """Return picks of this effect at this place with other optional parts, each at its best score."""
     c = opened.candidates[number]
     done = {frozenset(c.probes[t.pick.probe].free) for t in trials if t.pick.candidate == number}
     best: dict[frozenset[str], tuple[float, int]] = {}

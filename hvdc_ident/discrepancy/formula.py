@@ -21,7 +21,7 @@ from hvdc_ident.simulate import ModelSimulator
 MOST = 7
 """Signals the terms are made of."""
 TIME = "time"
-"""What a drift grows with, s: of a signal from nothing, or with it of its gain."""
+"""Name of the time, s, in a formula: a signal drifts in proportion to it, or its gain does."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
 FAR = 5.0
 """Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little."""
 EXACT = 1e3
-"""The same for an effect in proportion to its size, whose score at one size is that at every."""
+"""Largest such factor for an effect in proportion to its size, whose score at one size is that at every."""
 ROOM = 3.0
 """Times the size asked for: how far a refit may go."""
 

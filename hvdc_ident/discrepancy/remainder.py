@@ -1,4 +1,4 @@
-"""What a hypothesis leaves: how much of the gap, and whether anything more could explain it.
+"""Remainder of a hypothesis: the share of the gap that it leaves, and whether anything more could explain that.
 
 The test puts a latent input at every insertion point, beside the effects: any course over time, with a prior that is as
 large as the records ask for. Its marginal likelihood is 1 where nothing is missing; how large it becomes by chance, with
@@ -38,7 +38,7 @@ DRAWS = 100
 
 @dataclass(frozen=True)
 class Remainder:
-    """What is left of the gap.
+    """Part of the gap that a hypothesis leaves.
 
     share: of the squared misfit beyond noise, fitted data; held_out: the same of the others, None where they showed no gap.
     beyond: by output the root mean square of what is beyond noise, in tolerances: those of the study, or a tenth of the noise or

@@ -91,7 +91,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Finding:
-    """What is missing: an effect, wherever it is.
+    """A missing effect, wherever it is, or the parameters whose values are off.
 
     same_as: all names of it, its own first: effects that are the same equation there. probability: of the effect, summed over
     its places. parameters: at the likeliest place; their intervals hold over the likely places. places: the likely ones, the

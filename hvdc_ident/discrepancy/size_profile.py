@@ -139,7 +139,7 @@ OF_LEVELS = 12
 AMONG = 3
 """Times as many, the best on the fitted data, among which the held-out ones choose."""
 CLOSE = 1.3
-"""The same as WIDTH for the closest look."""
+"""Multiple above the size, and share below it, that the closest search spans."""
 PHASE = 0.2
 """Of a step or period: by how much the last one of a record moves from one size of the closest look to the next."""
 MOST = 1500

@@ -31,7 +31,7 @@ from hvdc_ident.text import listed
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
 REFUTED = 0.1
-"""The same from which the effect's form is refuted, where what is left is no noise."""
+"""Share of the gap that, left over and no noise, refutes the form of an effect."""
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
 REFUTED_P = 0.01
@@ -118,8 +118,7 @@ def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Jud
 def findings_of(
     search: SearchContext, outcome: SearchOutcome, judgement: Judgement, placed: Sequence[FoundEffect]
 ) -> tuple[Finding, ...]:
-    """What is missing, as far as it is told: of each effect that was put in the likely classes; and the values of parameters
-    that were held and are off.
+    """Return the findings: of each effect that was put in its likely classes, then the held parameters whose values are off.
 
     placed: the effects that were put in, with their sentences.
     """
@@ -149,7 +148,7 @@ def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
 
 
 def _rest(remainder: Remainder) -> str:
-    """What is left, in words; empty where that may be noise."""
+    """Return the remainder in words; empty where it may be noise."""
     parts = []
     if remainder.p <= REFUTED_P and remainder.share > TOLERANCE:
         parts.append(

@@ -141,7 +141,7 @@ STABLE = 0.8
 """Share of noise records from which the same terms have to be chosen where more than noise is left."""
 AGAIN = 25
 CLOSE = 2.0
-"""What a formula may leave, in noise units (of chi2 a row, and held out)."""
+"""Largest chi2 a row, and largest held-out residual in noise units, that a formula may leave."""
 KNOTS = 11
 """Of a curve: a tenth of what its signal travels from one to the next."""
 MOSTLY = 0.75

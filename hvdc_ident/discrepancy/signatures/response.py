@@ -27,7 +27,7 @@ FEWEST = 600
 AFTER = np.geomspace(2e-5, 2e-2, 22)
 """Where instants are put after a jump, s: what a missing lag or delay does happens there."""
 AROUND = AFTER[10:17:6]
-"""The same after a corner, where less happens at once: an input that was recorded has one at every row."""
+"""Parts after a corner, where less happens at once: an input that was recorded has one at every row."""
 
 
 @dataclass(frozen=True, eq=False)
