@@ -10,6 +10,8 @@ SURE = 4.0
 """Standard errors beyond which nothing is put down to chance: one in 16 000, where a diagnosis asks some hundred such questions."""
 TOLERANCE = 0.01
 """Share of the squared gap, a tenth of its amplitude, that nobody asks about: no model leaves noise alone of real records."""
+REFUTED = 0.1
+"""Share of the squared gap that, left over and no noise, refutes the form of an effect: the form misses a third of the amplitude."""
 SHORTLIST = 6
 """The best by a cheap measure (a score, a regression) that are tried in full: formulas, filters, places, earlier rivals."""
 BEAM = 2
@@ -26,7 +28,6 @@ class DiagnosisOptions:
     set_bic: rivals within it join the ambiguity set.
     most: effects, at most.
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
-    refuted: share of what an effect explains that may be left, in structure, in the region it was put there for.
     starts: runs of the nominal multistart.
     fallback: search for a form outside the catalogue.
     thorough: refit candidates, too, whose scores tell little, where no other comes near the noise.
@@ -41,7 +42,6 @@ class DiagnosisOptions:
     set_bic: float = 6.0
     most: int = 3
     holdout_share: float = 0.1
-    refuted: float = 0.1
     starts: int = 2
     fallback: bool = True
     thorough: bool = False

@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.context import SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import SHORTLIST, TOLERANCE
+from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
 from hvdc_ident.discrepancy.scores import runs
@@ -67,8 +67,9 @@ class Remainder:
 
     @property
     def below_tolerance(self) -> bool:
-        """True where nobody need ask what is left: next to nothing of the gap, or less than the tolerance of every output."""
-        return self.largest <= TOLERANCE or bool(self.beyond and max(self.beyond.values()) <= 1.0)
+        """True where nobody need ask what is left: next to nothing of the gap, or a small part and within every output's tolerance."""
+        within = bool(self.beyond) and max(self.beyond.values()) <= 1.0
+        return self.largest <= TOLERANCE or (within and self.largest <= REFUTED)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.evidence import material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import TOLERANCE
+from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import FEWEST
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
@@ -30,8 +30,6 @@ from hvdc_ident.text import listed
 
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
-REFUTED = 0.1
-"""Share of the gap that, left over and no noise, refutes the form of an effect."""
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
 REFUTED_P = 0.01

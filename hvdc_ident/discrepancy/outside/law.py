@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import Ruler
 from hvdc_ident.discrepancy.formula import Law, Term, at_run, formula_job, hats, terms
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
+from hvdc_ident.discrepancy.options import BEAM, REFUTED, SHORTLIST
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, unseen
@@ -339,7 +339,7 @@ def _tested(
         return None  # what it leaves has to be next to noise
     explained = before.chi2 - refit.chi2
     tests = residual_tests(refit.nominal(), {}, bootstraps=100, seed=search.seed)
-    if any(b.p <= 0.01 and b.excess > search.options.refuted * explained for b in tests):
+    if any(b.p <= 0.01 and b.excess > REFUTED * explained for b in tests):
         return None
     ahead = best is None or ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic
     near = ahead and not is_far(before, refit)
