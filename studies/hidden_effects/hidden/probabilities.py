@@ -53,7 +53,7 @@ def calibration(lines: Sequence[Line]) -> dict[str, Any]:
             "findings": n,
             "stated": float(np.mean([p for _, p, _, _ in part])) if n else None,
             "right": right / n if n else None,
-            "limits": limits(right, n) if n else None,
+            "limits": list(limits(right, n)) if n else None,
             "placed": sum(q for *_, q in part) / n if n else None,
         }
 
