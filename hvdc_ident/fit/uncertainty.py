@@ -148,9 +148,11 @@ def uncertainty(
     from_misfit = any(source[b.output] == MISFIT for b in blocks)
     if from_misfit and count > p:
         sandwich = sandwich * ((count - p) / max(count - float(np.trace(inverse @ meat)), 0.05 * count))
-    raw_std, std = np.sqrt(np.diag(inverse)), np.sqrt(np.diag(sandwich))
+    # Of a direction that is hardly determined rounding may leave a variance below 0.
+    raw_std, std = np.sqrt(np.diag(inverse)), np.sqrt(np.maximum(np.diag(sandwich), 0.0))
     lift = np.where(std < raw_std, raw_std / np.where(std > 0, std, 1.0), 1.0)
     corrected = sandwich * np.outer(lift, lift)
+    np.fill_diagonal(corrected, np.maximum(np.diag(corrected), raw_std**2))
     known = not from_misfit and not any(rho.values())
     dof = min(noise_dof, np.inf if known else max(1.0, sum(effective.values()) - p))
     return Uncertainty(
