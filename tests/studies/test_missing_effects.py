@@ -109,6 +109,34 @@ def test_dymolas_record_is_even_and_the_true_gains_leave_what_is_pinned():
     assert off("dymola_missing", found) == []
 
 
+def test_what_dymolas_link_lacks_is_the_resistance_that_the_card_has_too_much():
+    values = expected("dymola_missing")["values"]
+    drop, late = values["told nothing"]["findings"][:2]
+    both_stations = (
+        2 * 0.267 / 409.6
+    )  # ohm of the authors' model, which the study's Rdc has in it and the terminals do not
+    low, high = drop["parameters"]["b"]["ci95"]
+    assert drop["places"][0]["at"] == ["outputs.Vdc2"] and low < both_stations < high and drop["probability"] > 0.95
+    assert late["places"][0]["at"] == ["Pdc2"]
+    plain, found = (values["refits"][c] for c in ("fitted", "with the findings"))
+    assert found["rmse"]["Vdc2"] < 0.1 * plain["rmse"]["Vdc2"]
+    for gain, true in DYMOLA.TRUE.items():
+        assert found["values"][gain] == pytest.approx(true, rel=0.01), gain
+
+
+@needs_dymola
+def test_without_that_resistance_the_card_leaves_as_little():
+    cases = expected("dymola_missing")["values"]["refits"]
+    model, even, _ = DYMOLA.setup()
+    assert model.values["Rdc"] == pytest.approx(DYMOLA.LINE + 2 * 0.267 / 409.6, rel=1e-9)
+    size = cases["the same, and the found delay"]["sizes"]["delay_Pdc2_T"]
+    late = {"effect": "delay", "at": ["Pdc2"], "from": "", "parameters": {"T": size}}
+    corrected = diagnosing.augmented(model.with_values({"Rdc": DYMOLA.LINE}), [late])
+    row = DYMOLA.errors(corrected, even, cases["the same, and the found delay"]["values"])
+    assert off("dymola_missing", {"refits": {"the same, and the found delay": {"rmse": row}}}) == []
+    assert row["Vdc2"] < 0.1 * cases["fitted"]["rmse"]["Vdc2"]
+
+
 def test_an_effect_in_words():
     line = {"effect": "droop", "at": ["eq1", "eq2"], "from": "Q1", "parameters": {"k": {"value": 0.1316, "ci95": None}}}
     assert diagnosing.label(line) == "droop at eq1, eq2 from Q1 (k 0.132)"
