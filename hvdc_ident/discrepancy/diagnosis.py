@@ -21,6 +21,7 @@ from hvdc_ident.discrepancy.localise import localise
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
+from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.refit import Refit, judged
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
@@ -104,6 +105,8 @@ def diagnose(
         notes = (*notes, CLOSED)
     if (untried := outcome.rounds[0].untried) and judgement.verdict != "named":
         notes = (*notes, UNTRIED.format(untried))
+    if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
+        notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
 
 

@@ -8,7 +8,7 @@ the truth than those which the misfit has moved.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.discrepancy.context import Round, SearchContext
@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import BEAM, TOLERANCE
 from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
-from hvdc_ident.discrepancy.proposals import by_latent, by_score, joined, views_of
+from hvdc_ident.discrepancy.proposals import View, by_latent, by_score, joined, views_of
 from hvdc_ident.discrepancy.refitted import (
     all_far,
     best_each,
@@ -48,46 +48,60 @@ def explored(
 ) -> tuple[Round, tuple[CandidateFit, ...]]:
     """The round and its refits. A first round goes on until a refit comes near the noise or nothing is left to try."""
     views = views_of(opened, nominal)
-    field = by_score(opened)
     opened, more = by_latent(search, opened, views, number, lambda c: not has_to_be_met(c))
-    field = sorted([*field, *more], key=lambda p: -p.fall)
-    trials: list[CandidateFit] = []
     chance = opened.scores.threshold(0.5)
-    field = [p for p in field if p.score > chance or p.fall > chance]
+    field = sorted((p for p in [*by_score(opened), *more] if max(p.score, p.fall) > chance), key=lambda p: -p.fall)
     taken = _entrants(opened, field)
-    trials += refitted(search, opened, taken, f"round {number}", trials)
+    trials = refitted(search, opened, taken, f"round {number}")
     opened, trials = _with_neighbours(search, opened, trials, field, number)
-    if number > 1:
-        return opened, tuple(trials)
-    # Sizes that have to be met: where nothing explains the records, or what does is a kind of delay.
+    if number == 1:
+        opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views)
+    if number == 1 and _tells(opened, trials):
+        if search.options.fallback and not (_noise(search, trials) or search.spent):
+            opened = _outside(search, opened, nominal, trials)
+        opened, trials = _with_the_others(search, opened, trials, field, taken)
+    return opened, tuple(trials)
+
+
+def _with_sizes_to_be_met(
+    search: SearchContext,
+    opened: Round,
+    trials: list[CandidateFit],
+    field: Sequence[Pick],
+    views: Callable[[], Sequence[View]],
+) -> tuple[Round, list[CandidateFit]]:
+    """The trials with sizes that have to be met: where nothing explains the records, or what does is a kind of delay."""
     far = all_far(opened.before, trials, near=TOLERANCE)
     late = {opened.candidates[t.pick.candidate].at for t in by_cost(trials)[:BEAM] if _late(t) is not None}
-    opened, more = by_latent(search, opened, views, number, lambda c: has_to_be_met(c) and (far or c.at in late))
-    if more:
-        trials = best_each(
-            [
-                *trials,
-                *refitted(search, opened, _entrants(opened, more), f"round {number}: sizes to be met", trials),
-            ]
-        )
-        trials = once_more(search, opened, trials, f"round {number}: sizes to be met")
-        opened, trials = _with_neighbours(search, opened, trials, [*field, *more], number)
-    if not _tells(opened, trials):
-        return opened, tuple(trials)
-    if search.options.fallback and not _noise(search, trials):
-        opened = _outside(search, opened, nominal, trials)
+    if search.spent or not (far or late):
+        return opened, trials
+    opened, more = by_latent(search, opened, views, 1, lambda c: has_to_be_met(c) and (far or c.at in late))
+    if not more:
+        return opened, trials
+    met = refitted(search, opened, _entrants(opened, more), "round 1: sizes to be met", trials)
+    trials = once_more(search, opened, best_each([*trials, *met]), "round 1: sizes to be met")
+    return _with_neighbours(search, opened, trials, [*field, *more], 1)
+
+
+def _with_the_others(
+    search: SearchContext, opened: Round, trials: list[CandidateFit], field: Sequence[Pick], taken: Sequence[Pick]
+) -> tuple[Round, list[CandidateFit]]:
+    """The trials with proposals that promise less, so many at a time while nothing comes near the noise.
+
+    taken: those that were refitted. The round keeps the number of those that never were.
+    """
     done = {id(p) for p in taken}
     batches = math.inf if search.options.thorough else BATCHES
     while all_far(opened.before, trials) and not opened.law:
         rest = [p for p in field if id(p) not in done]
         taken = _entrants(opened, rest)
         if not taken or not batches or search.spent:
-            return replace(opened, untried=len(rest)), tuple(trials)
+            return replace(opened, untried=len(rest)), trials
         batches -= 1
         done |= {id(p) for p in taken}
-        trials = best_each([*trials, *refitted(search, opened, taken, f"round {number}: the others", trials)])
-        opened, trials = _with_neighbours(search, opened, trials, field, number)
-    return opened, tuple(trials)
+        trials = best_each([*trials, *refitted(search, opened, taken, "round 1: the others", trials)])
+        opened, trials = _with_neighbours(search, opened, trials, field, 1)
+    return opened, trials
 
 
 def _noise(search: SearchContext, trials: Sequence[CandidateFit]) -> bool:
@@ -136,6 +150,8 @@ def _with_neighbours(
 ) -> tuple[Round, list[CandidateFit]]:
     """The trials with the neighbours of the best, again while one of these is better."""
     trials = best_each(trials)
+    if search.spent:
+        return opened, trials
     asked: set[tuple[int, Hashable]] = set()
     for _ in range(TURNS):
         leaders = _leaders(opened, trials)

@@ -57,13 +57,20 @@ def _on(
     return [better.get(k, r) for k, r in enumerate(refits)]
 
 
+UNTRIED = "not tried: the budget ended"
+"""Failure of a refit that was not begun."""
+
+
 def done(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
-    """The jobs' refits, in their order, wherever they are done."""
+    """The jobs' refits, in their order, wherever they are done; once the budget is over none but the first is begun."""
     if jobs:
         search.tell(0, len(jobs), texts[0])
-    outcomes = mapped(search.executor, find, jobs)
-    refits = []
-    for k, (job, outcome) in enumerate(zip(jobs, outcomes, strict=True)):
+    outcomes = iter(mapped(search.executor, find, jobs))
+    refits: list[Refit] = []
+    for k, job in enumerate(jobs):
+        if k and search.spent:
+            refits += [Refit(j.model, j.placed, j.problem, j.noise, j.begins[0], failure=UNTRIED) for j in jobs[k:]]
+            break
+        refits.append(next(outcomes).refit(job))
         search.tell(k + 1, len(jobs), texts[k])
-        refits.append(outcome.refit(job))
     return refits

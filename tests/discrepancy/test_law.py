@@ -182,5 +182,8 @@ def test_a_budget_ends_the_search_and_what_was_not_tried_is_said(monkeypatch: py
     found = diagnose(
         model(), metered("torque", rough), FREE, effects=["lag", "gain", "limit", "deadband"], options=options
     )
-    assert any("were not refitted" in note for note in found.notes)
+    assert any("The budget ended before" in note for note in found.notes)
     assert len({line.round for line in found.candidates}) == 1
+    # The verdict so far is of the one that was refitted; the others say why they were not.
+    status = [line.status for line in found.candidates]
+    assert status.count("refitted") >= 1 and any("the budget ended" in s for s in status)
