@@ -65,9 +65,15 @@ class Watch:
         now = (time.perf_counter(), time.process_time())
         wall, own = self.spent.get(self.phase, (0.0, 0.0))
         self.spent[self.phase] = (wall + now[0] - self.since[0], own + now[1] - self.since[1])
-        self.phase, self.since = ": ".join(text.split(": ")[: 2 if text.startswith("round") else 1]), now
+        self.phase, self.since = _phase(text), now
         if not self.quiet:
             print(f"  {done}/{total} {text}", file=sys.stderr, flush=True)
+
+
+def _phase(text: str) -> str:
+    """Return the phase of a progress text, without the candidate of the step and the best so far."""
+    said = text.partition(";")[0].split(": ")
+    return ": ".join(said[: 2 if len(said) > 2 else 1]) if text.startswith("round") else said[0]
 
 
 def recorded(count: int) -> tuple[Experiment, ...]:

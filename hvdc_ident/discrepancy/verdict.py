@@ -91,7 +91,7 @@ def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Jud
     assert found.remainder is not None
     remainder, each = found.remainder, [classes(g) for g in found.sets]
     sure = all(c[0].probability >= CERTAIN for c in each)
-    names = ", ".join(_class_text(c) for c in each)
+    names = "; and ".join(_class_text(c) for c in each)
     rest = _rest(remainder)
     if rest and remainder.largest > REFUTED:
         if all(c[0].probability >= CERTAIN for c in each) or _all_of_one_kind(found.sets):
@@ -150,12 +150,12 @@ def _rest(remainder: Remainder) -> str:
     parts = []
     if remainder.p <= REFUTED_P and remainder.share > TOLERANCE:
         parts.append(
-            f"{remainder.share:.1%} of the gap is left and is no noise; an unknown input at {remainder.at} would explain it"
+            f"{remainder.share:.1%} of the gap is left, which is no noise and which an unknown input at {remainder.at} would explain"
         )
     if (remainder.held_out or 0.0) > TOLERANCE and remainder.held_out_p <= REFUTED_P:
         record = f", most of it in '{remainder.record}' ({remainder.record_units:.3g} times the noise)"
         parts.append(f"{remainder.held_out:.1%} of the held-out gap is left{record if remainder.record else ''}")
-    return " and ".join(parts)
+    return "; ".join(parts)
 
 
 def _names(found: Judgement) -> list[str]:
@@ -167,10 +167,10 @@ def _class_text(each: Sequence[EffectClass]) -> str:
     told = []
     for c in likely(each):
         at = list(dict.fromkeys((r.at, r.source) for r, _ in c.members))
-        where = " or ".join(listed(places) for places, _ in at[:TOLD])
-        more = f" or one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
-        told.append(f"{c.names[0]} at {where}{more} ({c.probability:.0%})")
-    return ", or ".join(told)
+        where = ", or at ".join(listed(places) for places, _ in at[:TOLD])
+        more = f", or at one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
+        told.append(f"{c.names[0]} ({c.probability:.0%}) at {where}{more}")
+    return "; or ".join(told)
 
 
 def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
