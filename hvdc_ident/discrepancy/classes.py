@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
 from hvdc_ident.discrepancy.explain import advice
-from hvdc_ident.discrepancy.options import SURE, DiagnosisOptions
+from hvdc_ident.discrepancy.options import SURE, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, Hypothesis, Place, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
@@ -188,9 +189,17 @@ class EffectClass:
     probability: float
     members: tuple[tuple[Rival, float], ...]
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The effects that were refitted, the likeliest first."""
+        return tuple(dict.fromkeys(r.effect for r, _ in self.members if r.refitted)) or self.names[:1]
+
 
 def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
-    """The classes of an ambiguity set, the likeliest first. Evidence is exp(-delta BIC/2), every hypothesis as likely before."""
+    """The classes of an ambiguity set, the likeliest first. Evidence is exp(-delta BIC/2), every hypothesis as likely before.
+
+    Effects that are the same equation are one, and so are kinds of delay that are as long: what differs is within the tolerance.
+    """
     parent = {r.effect: r.effect for r in group} | {r.same_as: r.same_as for r in group if r.same_as}
 
     def root(name: str) -> str:
@@ -201,6 +210,9 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
     for r in group:
         if r.same_as:
             parent[root(r.effect)] = root(r.same_as)
+    for one, other in combinations([r for r in group if (r.late or 0.0) > 0.0], 2):
+        if _as_long(one, other):
+            parent[root(other.effect)] = root(one.effect)
     # One hypothesis under two names is one hypothesis.
     weights = [0.0 if r.same_as and not r.refitted else float(np.exp(-0.5 * r.delta_bic)) for r in group]
     total = sum(weights)
@@ -213,6 +225,12 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
         names = tuple(dict.fromkeys(r.effect for r, _ in ordered))
         each.append(EffectClass(names, sum(p for _, p in members), tuple(ordered)))
     return tuple(sorted(each, key=lambda c: -c.probability))
+
+
+def _as_long(one: Rival, other: Rival) -> bool:
+    """Return True for two delays whose difference is within the tolerance: that share of the squared gap that they make good."""
+    a, b = one.late or 0.0, other.late or 0.0
+    return abs(a - b) <= np.sqrt(TOLERANCE) * max(a, b)
 
 
 def likely(each: Sequence[EffectClass]) -> list[EffectClass]:
@@ -260,6 +278,9 @@ def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
     delays = [late for r, _ in likely if (late := r.late) is not None]
     delay = (min(delays), max(delays)) if delays else None
     sentence = sentence or f"{best.effect} at {listed(best.at)}"
+    others = [n for n in dict.fromkeys(r.effect for r, _ in likely if r.refitted) if n != best.effect]
+    if others and best.late is not None:
+        sentence += f", or another kind of delay as long ({', '.join(others)})"
     return Finding(
         best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, places),
         None if best.late is None else EffectSize(best.late, delay, "s"),

@@ -184,7 +184,8 @@ def _at_place(job: _PlaceJob) -> tuple[list[_Spot], Array]:
     nominal = job.view.nominal
     latent = Inversion.of(nominal, job.view.paths, job.found[0].candidate.at[0])
     noise = latent.against(job.noise)
-    spots, largest = [], np.zeros(noise.shape[1])
+    chosen: list[tuple[CandidateEffect, float, float, Array]] = []
+    largest = np.zeros(noise.shape[1])
     for dense in job.found:
         for signals in (latent.own, latent.told) if job.own else (latent.told,):
             parts = [_at_knots(latent, part, signals) for part in dense.parts()]
@@ -192,10 +193,13 @@ def _at_place(job: _PlaceJob) -> tuple[list[_Spot], Array]:
             falls, scores = (np.concatenate([t[k] for t in tables]) for k in range(2))
             largest = np.max([largest, *(t[2] for t in tables)], axis=0)
             at_knots = np.hstack(parts)
-            best = _minima(falls, scores)
-            for k, theta in zip(best, latent.answers(nominal, at_knots[:, best]), strict=True):
-                spots.append(_Spot(dense.alone(k), float(scores[k]), float(falls[k]), theta))
-    return spots, largest
+            chosen += [
+                (dense.alone(k), float(scores[k]), float(falls[k]), at_knots[:, k]) for k in _minima(falls, scores)
+            ]
+    if not chosen:
+        return [], largest
+    thetas = latent.answers(nominal, np.column_stack([c[3] for c in chosen]))
+    return [_Spot(*c[:3], theta) for c, theta in zip(chosen, thetas, strict=True)], largest
 
 
 def _at_knots(latent: Inversion, dense: Dense, signals: Sequence[Array]) -> Array:

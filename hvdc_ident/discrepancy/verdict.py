@@ -169,7 +169,7 @@ def _class_text(each: Sequence[EffectClass]) -> str:
         at = list(dict.fromkeys((r.at, r.source) for r, _ in c.members))
         where = ", or at ".join(listed(places) for places, _ in at[:TOLD])
         more = f", or at one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
-        told.append(f"{c.names[0]} ({c.probability:.0%}) at {where}{more}")
+        told.append(f"{' or '.join(c.kinds)} ({c.probability:.0%}) at {where}{more}")
     return "; or ".join(told)
 
 

@@ -194,6 +194,15 @@ def test_effects_that_are_one_equation_are_one_class() -> None:
     assert set(one.names) == {"lag", "inductance"}
 
 
+def test_kinds_of_delay_that_are_as_long_are_one_class() -> None:
+    """A mean over T is late by T/2. Of delays that differ by a tenth a hundredth of the squared answer is left."""
+    (one,) = classes([rival("delay", "wm", T=0.02), rival("window-mean", "wm", 3.0, T=0.0404)])
+    assert one.kinds == ("delay", "window-mean") and one.probability == pytest.approx(1.0)
+    apart = classes([rival("delay", "wm", T=0.02), rival("window-mean", "wm", 3.0, T=0.06)])
+    assert [c.kinds for c in apart] == [("delay",), ("window-mean",)]
+    assert rated([[rival("delay", "wm", T=0.02), rival("lag", "wm", 1.0, T=0.02)]]).verdict == "named"
+
+
 @pytest.mark.parametrize(
     ("share", "p", "held_out", "held_out_p", "verdict"),
     [
