@@ -11,7 +11,6 @@ from common import diagnosing, paper
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.effects import apply_effects
-from hvdc_ident.effects import effects as catalogue
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.immutable import FrozenMap
@@ -117,27 +116,12 @@ def sized(told: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [{**e, "parameters": {n: s["value"] for n, s in e["parameters"].items()}} for e in told["effects"]]
 
 
-def delay(effects: Sequence[Mapping[str, Any]]) -> float:
-    """Return the total low-frequency delay of the effects in one loop, s, from their transfer functions."""
-    return sum(delay_of(e["parameters"]) for e in effects if (delay_of := catalogue()[e["effect"]].equivalent_delay))
-
-
-def augmented(told: Mapping[str, Any]) -> Model:
-    """Return the plain link with the inserted effects at their estimated sizes."""
-    uses = [
-        {"effect": e["effect"], "at": e["at"], "parameters": dict(e["parameters"])}
-        | ({"from": e["from"]} if e["from"] else {})
-        for e in told["effects"]
-    ]
-    return apply_effects(load_model(paper.LINK), uses)
-
-
 def figure_8(told: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """Return the RMSE of Irorder1 over KIVDC in the paper's step, plain and augmented link, each with its fitted KPVDC."""
     step = paper.step("Vdc", paper.REFERENCE, ["Irorder1"])
     lines = {
         "plain link": (load_model(paper.LINK), told["refitted"]),
-        "augmented link": (augmented(told), told["augmented"]),
+        "augmented link": (diagnosing.augmented(load_model(paper.LINK), told["effects"]), told["augmented"]),
     }
     return {
         name: {f"{k:g}": paper.rmse(step, {"KPVDC": gains["KPVDC"], "KIVDC": k}, model)["Irorder1"] for k in AT}
