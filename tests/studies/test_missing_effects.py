@@ -101,6 +101,15 @@ def test_the_card_and_the_tools_differ_as_pinned():
         assert left[part][window][output] > 2 * described[window][output], part
 
 
+def test_the_removed_slew_rate_is_named_with_the_described_size():
+    told = expected("two_tools_one_link")["values"]["named"]["slew of the power set-point"]
+    first = told["findings"][0]
+    low, high = first["parameters"]["rate"]["ci95"]
+    assert told["verdict"] == "named" and first["effect"] == "rate-limit"
+    assert low < TOOLS.card().values["slew"] < high
+    assert ["Pref2"] in [p["at"] for p in first["places"]]
+
+
 @needs_dymola
 def test_dymolas_record_is_even_and_the_true_gains_leave_what_is_pinned():
     model, even, free = DYMOLA.setup()
