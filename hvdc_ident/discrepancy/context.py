@@ -61,7 +61,8 @@ class Course:
 class SearchContext:
     """Settings of a search, which stay over its rounds.
 
-    deadline: instant at which its budget ends (`time.monotonic`), s. held: candidates of the fit that the nominal model holds.
+    deadline: instant at which its budget ends (`time.monotonic`), s. held: candidates of the fit that the nominal
+    model holds; stated: its other parameters, with bounds as near as they are known.
     """
 
     effects: tuple[str, ...] | Literal["all"]
@@ -73,6 +74,7 @@ class SearchContext:
     course: Course | None = None
     deadline: float = math.inf
     held: tuple[FitParameter, ...] = ()
+    stated: tuple[FitParameter, ...] = ()
 
     @property
     def spent(self) -> bool:

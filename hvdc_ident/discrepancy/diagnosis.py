@@ -23,6 +23,7 @@ from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
 from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.refit import Refit, judged
+from hvdc_ident.discrepancy.released import stated
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
@@ -92,7 +93,8 @@ def diagnose(
         ModelSimulator(model), given, free, held or {}, report, starts=chosen.starts, seed=seed, executor=executor
     )
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
-    search = replace(search, held=tuple(f for f in free if f.name not in first.problem.names))
+    held_now = tuple(f for f in free if f.name not in first.problem.names)
+    search = replace(search, held=held_now, stated=stated(model, free))
     outcome = from_either_side(search, first)
     judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)

@@ -103,6 +103,6 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         free_initial_states=free_initial_states,
     )
     nuisance = here.theta[len(here.problem.free) :]
-    gains = [at[f.name] for f in first.problem.free]
+    gains = [at.get(f.name, f.start) for f in first.problem.free]
     begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])
     return RefitJob(model, tuple(again), problem, (begin,), here.noise)

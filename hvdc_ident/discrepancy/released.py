@@ -1,7 +1,8 @@
-"""Parameters as hypotheses: those that were held are set free where the records, under a hypothesis, speak against their values.
+"""Parameters as hypotheses: those that are held are set free where the records, under a hypothesis, speak against their values.
 
-The report of a model that lacks something holds parameters for the misfit that is being diagnosed. What such a parameter is
-off would be told as an effect, so "this parameter is off its value" is compared with the effects, and asked again beside them.
+The report of a model that lacks something holds parameters for the misfit that is being diagnosed, and what a study states of
+the others is known to a few per cent at best. What such a parameter is off would be told as an effect, so "these parameters are
+off their values" is compared with the effects, and asked again beside them.
 """
 
 from __future__ import annotations
@@ -16,28 +17,47 @@ from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.refit_jobs import job_of
+from hvdc_ident.discrepancy.refitted import is_noise
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.model import AnyModel, Model
 
+KNOWN = 0.02
+"""Share by which the stated value of a parameter that is no candidate may be off: data sheets and tests are no better."""
 SEEN = 1e-6
-"""Share of its squared derivative that the free parameters must not make good, for a parameter to be told at all."""
+"""Share of its squared derivative that the others must not make good, for a parameter to be told at all."""
+STEP = 1e-3
+"""Share of a value, or of its range where that is 0, by which it is moved for a derivative."""
+
+
+def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitParameter, ...]:
+    """Return the parameters of a model that are no candidates, with bounds as near as they are known.
+
+    None of a model that is closed inside: each derivative would be a run.
+    """
+    if not isinstance(model, Model):
+        return ()
+    others = {n: p.value for n, p in model.parameters.items() if p.value and n not in {f.name for f in candidates}}
+    return tuple(FitParameter(n, v, v - KNOWN * abs(v), v + KNOWN * abs(v)) for n, v in others.items())
 
 
 def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
     """Return the nominal model and the hypothesis `here`, with those held parameters free that bring more evidence than they cost.
 
-    base: the nominal model that `here` adds effects to, at its values. One parameter is set free at a time, the one whose
-    score is largest, until the next gains no more in BIC than an effect needs to be named.
+    base: the nominal model that `here` adds effects to, at its values. One is set free at a time, the one that gains most, and has
+    to gain as much in BIC as an effect needs to be named. Nothing is asked of a hypothesis that leaves noise, or whose runs fail
+    once parameters are moved.
     """
-    while held := [f for f in search.held if f.name not in here.problem.names]:
+    while not (search.spent or is_noise(here, search.seed)):
+        held = [f for f in (*search.held, *search.stated) if f.name not in here.problem.names]
+        best = _most_wanted(search, here, held)
+        if best is None:
+            break
+        search.tell(0, 1, f"with {best.name} free")
+        wider = _with_free(base, best)
         try:
-            best = _most_wanted(here, held)
-            if best is None:
-                break
-            search.tell(0, 1, f"with {best.name} free")
-            wider = _with_free(base, best)
             freed = run(job_of(wider, here, here.placed, {}))
-        except SimulationError:  # with this parameter moved the model does not run: its value stays what it is
+        except SimulationError:
             break
         if freed.failure or not evidence_between(here, freed, Ruler.of(freed), 1) > search.options.named_bic:
             break
@@ -47,32 +67,41 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
 
 def _with_free(refit: Refit, parameter: FitParameter) -> Refit:
     """Return the nominal model with one parameter more among the free ones, at the value that it was held at."""
-    count, value = len(refit.problem.free), refit.problem.held.get(parameter.name, parameter.given)
+    count, value = len(refit.problem.free), _value(refit, parameter)
     held = {n: v for n, v in refit.problem.held.items() if n != parameter.name}
     free = replace(parameter, start=float(np.clip(value, parameter.min, parameter.max)))
     problem = replace(refit.problem, free=(*refit.problem.free, free), held=type(refit.problem.held)(held))
     return replace(refit, problem=problem, theta=np.insert(refit.theta, count, free.start))
 
 
-def _most_wanted(here: Refit, held: Sequence[FitParameter]) -> FitParameter | None:
-    """Return the held parameter whose derivative explains most of what is left; None where they explain nothing of it."""
-    residual, columns = _derivatives(here, held)
-    scores = []
-    basis = here.nominal().basis
-    for column in columns.T:
-        rest = column - basis @ (basis.T @ column)
-        power = float(rest @ rest)
-        told = power > SEEN * float(column @ column)
-        scores.append(float(residual @ rest) ** 2 / power if told else 0.0)
-    k = int(np.argmax(scores))
-    return held[k] if scores[k] > 0.0 else None
+def _value(refit: Refit, parameter: FitParameter) -> float:
+    return refit.problem.held.get(parameter.name, parameter.given)
 
 
-def _derivatives(here: Refit, held: Sequence[FitParameter]) -> tuple[Array, Array]:
-    """Return (N,) the whitened residual and (N, k) its derivative by each held parameter."""
-    wide, count = here, len(here.problem.free)
-    for f in held:
-        wide = _with_free(wide, f)
-    blocks = wide.problem.blocks(wide.theta)
-    jacobian = np.vstack([b.jacobian for b in blocks])
-    return np.concatenate([b.residual for b in blocks]), jacobian[:, count : count + len(held)]
+def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter]) -> FitParameter | None:
+    """Return the held parameter with which chi2 falls most, to first order; None where it falls with none."""
+    if not held:
+        return None
+    nominal = here.nominal()
+    whole = np.column_stack([_derivative(here, f) for f in held])
+    columns = nominal.projected(whole)
+    power = np.sum(columns**2, axis=0)
+    told = power > SEEN * np.sum(whole**2, axis=0)
+    falls = np.where(told, (columns.T @ nominal.residual) ** 2 / np.where(told, power, 1.0), 0.0)
+    k = int(np.argmax(falls))
+    # In chi2 of the noise: of a misfit its own size is no measure of what may be left.
+    return held[k] if falls[k] > search.options.named_bic else None
+
+
+def _derivative(here: Refit, parameter: FitParameter) -> Array:
+    """Return (N,) the change of the whitened residual with a held parameter, by differences; 0 where it does not run."""
+    value = _value(here, parameter)
+    extent = parameter.max - parameter.min
+    step = STEP * (abs(value) or (extent if np.isfinite(extent) else 1.0))
+    held = type(here.problem.held)({**here.problem.held, parameter.name: value + step})
+    residual = here.nominal().residual
+    try:
+        moved = replace(here.problem, held=held).blocks(here.theta)
+    except SimulationError:
+        return np.zeros_like(residual)
+    return (np.concatenate([b.residual for b in moved]) - residual) / step

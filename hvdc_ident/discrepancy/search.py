@@ -61,19 +61,28 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
 
     Beside each of them, and beside none, parameters that were held are set free where the records speak against their values.
     """
-    base, here = released(search, first, first)
-    if here is not first and is_far(first, here):
-        # What is missing may be told as a parameter too: then the effect has more evidence, and the parameter is asked again.
+    found = None
+    if not search.held:  # a stated value has to bring more than an effect that leaves noise could leave it
         found = one_round(search, first, 1)
-        if found.winner is not None and _more_evident(found.winner.refit, here):
+        if found.winner is not None and is_noise(found.winner.refit, search.seed):
             return _onwards(search, first, first, [found])
+    base, here = released(search, first, first)
+    if here is first:
+        return _onwards(search, first, first, [found] if found else [])
+    # What is missing may be told by parameters too: then an effect has as much evidence, and they are asked again beside it.
+    # Where it has no more, a candidate that was held is the likelier cause, and a stated value the less likely one.
+    moved = set(here.problem.names) - set(first.problem.names)
+    level = search.options.set_bic if moved & {f.name for f in search.stated} else -search.options.set_bic
+    found = found or one_round(search, first, 1)
+    if found.winner is not None and _behind(found.winner.refit, here) <= level:
+        return _onwards(search, first, first, [found])
     return _onwards(search, base, here, [])
 
 
-def _more_evident(one: Refit, other: Refit) -> bool:
-    """Return True where the first hypothesis has more evidence."""
+def _behind(one: Refit, other: Refit) -> float:
+    """By how much evidence, in BIC, the first hypothesis is behind the other."""
     ruler = Ruler.of(min(one, other, key=lambda r: r.chi2))
-    return evidence_between(other, one, ruler, len(one.problem.free) - len(other.problem.free)) > 0.0
+    return evidence_between(one, other, ruler, len(other.problem.free) - len(one.problem.free))
 
 
 def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round]) -> SearchOutcome:

@@ -127,7 +127,7 @@ def findings_of(
             best = one.members[0][0]
             sentence = own.text if (best.effect, best.at, best.source) == (own.effect, own.at, own.source) else ""
             found.append(replace(finding(of, one, sentence), share=share))
-    freed = {f.name for f in search.held} & set(outcome.refit.problem.names)
+    freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
     if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
         found.append(replace(moved, share=share))
     return tuple(found)

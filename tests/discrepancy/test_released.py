@@ -48,3 +48,13 @@ def test_a_held_parameter_whose_value_is_right_stays_held() -> None:
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))]
     assert found.parameters_after["b"] == 0.3
     assert not [f for f in found.findings if f.effect == "parameter"]
+
+
+def test_a_stated_value_that_is_two_per_cent_off_is_told_beside_the_effect() -> None:
+    """The inertia is no candidate; scipy has 0.2 and the card 0.197."""
+    card = model().with_values({"J": 0.197})
+    found = diagnose(card, experiments(lag=0.03), FREE, effects=TRIED)
+    assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))]
+    assert found.verdict == "named" and found.effects[0].parameters["T"].value == pytest.approx(0.03, rel=0.02)
+    (inertia,) = [f for f in found.findings if f.effect == "parameter"]
+    assert inertia.parameters["J"].value == pytest.approx(0.2, rel=2e-3)
