@@ -101,13 +101,20 @@ def test_the_card_and_the_tools_differ_as_pinned():
         assert left[part][window][output] > 2 * described[window][output], part
 
 
-def test_the_removed_slew_rate_is_named_with_the_described_size():
-    told = expected("two_tools_one_link")["values"]["named"]["slew of the power set-point"]
+@pytest.mark.parametrize(
+    ("part", "effect", "size", "described", "place"),
+    [
+        ("slew of the power set-point", "rate-limit", "rate", "slew", ["Pref2"]),
+        ("droop of the ac voltage controls", "coupling", "k", "droop", ["eq1", "eq2"]),
+    ],
+)
+def test_a_removed_part_is_named_with_the_described_size(part, effect, size, described, place):
+    told = expected("two_tools_one_link")["values"]["named"][part]
     first = told["findings"][0]
-    low, high = first["parameters"]["rate"]["ci95"]
-    assert told["verdict"] == "named" and first["effect"] == "rate-limit"
-    assert low < TOOLS.card().values["slew"] < high
-    assert ["Pref2"] in [p["at"] for p in first["places"]]
+    assert told["verdict"] == "named" and first["effect"] == effect
+    low, high = sorted(abs(end) for end in first["parameters"][size]["ci95"])
+    assert low < TOOLS.card().values[described] < high
+    assert place in [p["at"] for p in first["places"]]
 
 
 @needs_dymola
