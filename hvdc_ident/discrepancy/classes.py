@@ -269,7 +269,9 @@ def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
             continue
         same = [r for r, _ in likely if r.effect == best.effect and (q.unit in SHARED or r is best)]
         spans = [s for r in same if (s := _span(refits.get((r.effect, r.at, r.source)), n)) is not None]
-        interval = (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None
+        # At a place where the size is another, of other sign say, it is no uncertainty of this one.
+        alike = [s for s in spans if s[0] <= best.parameters[n] <= s[1]]
+        interval = (min(low for low, _ in alike), max(high for _, high in alike)) if alike else None
         parameters[n] = EffectSize(best.parameters[n], interval, q.unit)
     by_place: dict[tuple[tuple[str, ...], str], float] = {}
     for r, p in likely:

@@ -140,7 +140,7 @@ def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
         return judgement.text
     explains = "Together they explain" if len(findings) > 1 else "It explains"
     rest = f"what remains is {left.noise_units:.3g} times the noise" + (
-        ", which changes nothing" if left.below_tolerance else ""
+        ", within the tolerance" if left.below_tolerance else ""
     )
     return f"{' '.join(f.text for f in findings)} {explains} {1.0 - left.share:.1%} of the gap; {rest}."
 

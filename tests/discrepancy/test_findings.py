@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import beside, plain
 
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy import classes as rated
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.discrepancy.remainder import remainder_of
+from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.immutable import FrozenMap
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
@@ -79,3 +83,15 @@ def test_of_noise_alone_a_latent_input_is_as_likely_as_chance_has_it() -> None:
         chances.append(remainder_of(SEARCH, loud, records, 1.0).p)
     assert min(chances) > 0.01 and max(chances) > 0.2
     assert set(SIGMA) == set(model().outputs)
+
+
+def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A coupling on the other side of a difference has the other sign: no interval from one to the other."""
+    spans = {"wm": (-0.035, -0.025), "err": (0.025, 0.035), "torque": (-0.036, -0.026)}
+    sizes = {"wm": -0.030, "err": 0.030, "torque": -0.031}
+    members = [Rival("coupling", (at,), 0.1 * k, FrozenMap({"k": v})) for k, (at, v) in enumerate(sizes.items())]
+    monkeypatch.setattr(rated, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
+    monkeypatch.setattr(rated, "_span", lambda rival, _name: spans[rival.at[0]])
+    found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
+    (one,) = rated.classes(members)
+    assert rated.finding(found, one, "").parameters["k"].ci95 == (-0.036, -0.025)
