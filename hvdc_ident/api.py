@@ -440,8 +440,8 @@ def diagnose(
     ...     return hi.Experiment(t, name, inputs=step, outputs={"y": y})
     >>> records = [record("up", 1.0), record("down", -0.5)]
     >>> found = hi.diagnose(lag, records, {"T": (0.1, 10.0), "k": (0.1, 10.0)}, effects=["delay", "gain"])
-    >>> found.verdict, found.effects[0].effect  # at u or at y, which these two records cannot tell apart
-    ('ambiguous', 'delay')
+    >>> found.verdict, found.effects[0].effect, len(found.findings[0].places)  # at u or at y: these records cannot tell
+    ('named', 'delay', 2)
     """
     from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.fitting import need

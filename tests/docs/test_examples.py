@@ -18,7 +18,6 @@ WITH_EXAMPLES = (
     "hvdc_ident.linearize.operating_point",
     "hvdc_ident.models",
     "hvdc_ident.sensitivity.sweep_run",
-    "hvdc_ident.study.export",
 )
 
 
