@@ -281,10 +281,9 @@ def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
     delay = (min(delays), max(delays)) if delays else None
     sentence = sentence or f"{best.effect} at {listed(best.at)}"
     others = [n for n in dict.fromkeys(r.effect for r, _ in likely if r.refitted) if n != best.effect]
-    if others and best.late is not None:
-        sentence += f", or another kind of delay as long ({', '.join(others)})"
+    other = f", or another kind of delay as long ({', '.join(others)})" if others and best.late is not None else ""
     return Finding(
-        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, places),
+        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, places, other),
         None if best.late is None else EffectSize(best.late, delay, "s"),
     )  # fmt: skip
 
@@ -306,13 +305,14 @@ def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
     return max(value - 1.96 * std, q.min), min(value + 1.96 * std, q.max)
 
 
-def _text(sentence: str, parameters: dict[str, EffectSize], places: Sequence[Place]) -> str:
-    """The sentence with the first parameter's interval, and the other places where it may be."""
-    size = next(iter(parameters.values()), None)
-    if size is not None and size.ci95 is not None and None not in size.ci95:
+def _text(sentence: str, parameters: dict[str, EffectSize], places: Sequence[Place], other: str) -> str:
+    """The sentence with the first interval, other kinds of the effect, and the other places where it may be."""
+    size = next((s for s in parameters.values() if s.ci95 is not None and None not in s.ci95), None)
+    if size is not None and size.ci95 is not None:
         low, high = (quantity(v, size.unit) for v in size.ci95 if v is not None)
         sentence = f"{sentence} (95 %: {low} to {high})"
-    others = [listed(p.at) for p in places[1:]]
+    sentence += other
+    others = [listed(p.at) + (f" from {p.source}" if p.source else "") for p in places[1:]]
     if not others:
         return f"{sentence}."
     shown = listed(others[:4]) if len(others) <= 4 else f"{', '.join(others[:4])} or one of {len(others) - 4} more"
