@@ -5,11 +5,16 @@ The first holds wherever pytest is started and whichever copy of the package is 
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
 
 from hypothesis import HealthCheck, settings
+
+# One thread of linear algebra a process: several test processes on as many cores hinder each other otherwise.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
 
 tests = ModuleType("tests")
 tests.__path__ = [str(Path(__file__).parent)]
