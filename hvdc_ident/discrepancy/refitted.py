@@ -129,12 +129,6 @@ def cost_of(trial: CandidateFit) -> float:
     return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
 
-def on_bound(refit: Refit) -> bool:
-    """Return True where an unknown of the fit ended on one of its bounds."""
-    free = refit.problem.free
-    return any(f.on_bound(v) for f, v in zip(free, refit.theta[: len(free)], strict=True))
-
-
 def excess(refit: Refit) -> bool:
     """Return True where a model leaves more than noise, by size."""
     return refit.chi2 / refit.rows > 1.0 + SURE * float(np.sqrt(2.0 / refit.effective))

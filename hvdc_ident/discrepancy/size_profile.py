@@ -1,6 +1,6 @@
 """The many sizes that a candidate is looked at with, and which candidates are.
 
-Levels of a quantiser and periods of a sampler have to be met (`has_to_be_met`); what bends its signal (`bent`) has to be
+Levels of a quantiser and periods of a sampler have to be met (`has_to_be_met`); what bends its signal has to be
 near. Thousands of sizes are kept as numbers: a probe of each would take longer to send than its trace to work out.
 """
 
@@ -23,7 +23,6 @@ from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, RefitResult, found_by, judged, of_held_out, run, signal
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
@@ -49,27 +48,10 @@ class Dense:
     candidate: CandidateEffect
     sizes: Array
 
-    @property
-    def place(self) -> tuple[str, tuple[str, ...]]:
-        """The effect, and where."""
-        return self.candidate.effect, self.candidate.at
-
     def alone(self, k: int) -> CandidateEffect:
         """The candidate with one of the sizes."""
         return replace(
             self.candidate, probes=(resized(self.candidate.probes[0], sized(self.candidate), float(self.sizes[k])),)
-        )
-
-    def only(self, k: int) -> Dense:
-        """One of the sizes."""
-        return replace(self, sizes=self.sizes[k : k + 1])
-
-    def around(self, k: int) -> Dense:
-        """One of the sizes and those between it and its neighbours, evenly in the logarithm."""
-        own, last = self.sizes[k], self.sizes.size - 1
-        beside = [self.sizes[max(k - 1, 0)], self.sizes[min(k + 1, last)]]
-        return replace(
-            self, sizes=np.unique(np.concatenate([[own], *(np.geomspace(own, b, BETWEEN + 2)[1:-1] for b in beside)]))
         )
 
     def parts(self) -> list[Dense]:
@@ -85,13 +67,6 @@ def has_to_be_met(candidate: CandidateEffect) -> bool:
 def by_level(candidate: CandidateEffect) -> bool:
     """Return True where the size has to be met exactly and is a level of the signal, not a time."""
     return has_to_be_met(candidate) and effects()[candidate.effect].equivalent_delay is None
-
-
-def bent(candidate: CandidateEffect) -> bool:
-    """Return True for a nonlinear effect at one slot with one parameter that need not be met exactly, and no kind of delay."""
-    entry = effects()[candidate.effect]
-    single = len(candidate.at) == 1 and not candidate.source and all(len(p.free) == 1 for p in candidate.probes)
-    return single and entry.equivalent_delay is None and not entry.needs_grid and not is_linear(kind_of(candidate, 0))
 
 
 def widened(candidate: CandidateEffect) -> Dense:
