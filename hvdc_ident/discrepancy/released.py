@@ -20,6 +20,7 @@ from hvdc_ident.discrepancy.refit_jobs import job_of
 from hvdc_ident.discrepancy.refitted import is_noise
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 
 KNOWN = 0.02
@@ -45,10 +46,9 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
     """Return the nominal model and the hypothesis `here`, with those held parameters free that bring more evidence than they cost.
 
     base: the nominal model that `here` adds effects to, at its values. One is set free at a time, the one that gains most, and has
-    to gain as much in BIC as an effect needs to be named. Nothing is asked of a hypothesis that leaves noise, or whose runs fail
-    once parameters are moved.
+    to gain as much in BIC as an effect needs to be named, until noise is left. here: one that leaves more than noise.
     """
-    while not (search.spent or is_noise(here, search.seed)):
+    while not search.spent:
         held = [f for f in (*search.held, *search.stated) if f.name not in here.problem.names]
         best = _most_wanted(search, here, held)
         if best is None:
@@ -62,6 +62,8 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
         if freed.failure or not evidence_between(here, freed, Ruler.of(freed), 1) > search.options.named_bic:
             break
         base, here = wider, freed
+        if is_noise(here, search.seed):
+            break
     return base, here
 
 
@@ -70,7 +72,7 @@ def _with_free(refit: Refit, parameter: FitParameter) -> Refit:
     count, value = len(refit.problem.free), _value(refit, parameter)
     held = {n: v for n, v in refit.problem.held.items() if n != parameter.name}
     free = replace(parameter, start=float(np.clip(value, parameter.min, parameter.max)))
-    problem = replace(refit.problem, free=(*refit.problem.free, free), held=type(refit.problem.held)(held))
+    problem = replace(refit.problem, free=(*refit.problem.free, free), held=FrozenMap(held))
     return replace(refit, problem=problem, theta=np.insert(refit.theta, count, free.start))
 
 
@@ -83,7 +85,7 @@ def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter
     if not held:
         return None
     nominal = here.nominal()
-    whole = np.column_stack([_derivative(here, f) for f in held])
+    whole = np.column_stack([_derivative(here, f, nominal.residual) for f in held])
     columns = nominal.projected(whole)
     power = np.sum(columns**2, axis=0)
     told = power > SEEN * np.sum(whole**2, axis=0)
@@ -93,13 +95,15 @@ def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter
     return held[k] if falls[k] > search.options.named_bic else None
 
 
-def _derivative(here: Refit, parameter: FitParameter) -> Array:
-    """Return (N,) the change of the whitened residual with a held parameter, by differences; 0 where it does not run."""
+def _derivative(here: Refit, parameter: FitParameter, residual: Array) -> Array:
+    """Return (N,) the change of the whitened residual with a held parameter, by differences; 0 where it does not run.
+
+    residual: (N,) with the parameter as it is held.
+    """
     value = _value(here, parameter)
     extent = parameter.max - parameter.min
     step = STEP * (abs(value) or (extent if np.isfinite(extent) else 1.0))
-    held = type(here.problem.held)({**here.problem.held, parameter.name: value + step})
-    residual = here.nominal().residual
+    held = FrozenMap({**here.problem.held, parameter.name: value + step})
     try:
         moved = replace(here.problem, held=held).blocks(here.theta)
     except SimulationError:

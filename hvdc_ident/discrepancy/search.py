@@ -1,4 +1,4 @@
-"""Forward addition round by round, and pairs where one masks the other."""
+"""Forward addition of effects, pairs where one masks the other, and each looked for again beside the others."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
     if not search.held:  # a stated value has to bring more than an effect that leaves noise could leave it
         found = one_round(search, first, 1)
         if found.winner is not None and is_noise(found.winner.refit, search.seed):
-            return _onwards(search, first, first, [found])
-    base, here = released(search, first, first)
+            return SearchOutcome(found.winner.refit, (found,), (found,))
+    base, here = (first, first) if is_noise(first, search.seed) else released(search, first, first)
     if here is first:
         return _onwards(search, first, first, [found] if found else [])
-    # What is missing may be told by parameters too: then an effect has as much evidence, and they are asked again beside it.
+    # Parameters may stand for a missing effect: then the effect has as much evidence, and they are asked again beside it.
     # Where it has no more, a candidate that was held is the likelier cause, and a stated value the less likely one.
     moved = set(here.problem.names) - set(first.problem.names)
     level = search.options.set_bic if moved & {f.name for f in search.stated} else -search.options.set_bic
@@ -118,11 +118,16 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             rounds.append(both[1])
             kept += both
             assert both[1].winner is not None
-            base, here = released(search, base, both[1].winner.refit)
+            here = both[1].winner.refit
+            if not is_noise(here, search.seed):
+                base, here = released(search, base, here)
             break
         kept.append(found)
-        base, here = released(search, base, found.winner.refit)
+        here = found.winner.refit
         if is_noise(here, search.seed):
+            break
+        base, here = released(search, base, here)
+        if here is not found.winner.refit and is_noise(here, search.seed):
             break
     # Where a parameter was set free beside an effect, its rivals were refitted without that.
     if kept and not search.spent and (len(kept) > 1 or _closed_to(base, kept[0])):
@@ -185,7 +190,7 @@ def settled(
         ruler = kept[k].ruler
         assert ruler is not None
         gain = ruler.gain(without.chi2, here.chi2, here.count - without.count)
-        # What was clearly there before the others came may be nothing beside them.
+        # An effect that was clearly there before the others came may be nothing beside them.
         if gain <= search.options.named_bic or at_edge(here, k) or not clear(here, k):
             here = without
             del kept[k]
