@@ -262,25 +262,25 @@ def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
     """The class as it is told. sentence: what the likeliest member does."""
     best = one.members[0][0]
     refits = {_key_of(t.refit): t.refit for t in found.trials}
-    likely = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
+    told = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
     parameters = {}
     for n, q in effects()[best.effect].parameters.items():
         if n not in best.parameters or (q.optional and best.parameters[n] == q.neutral):
             continue
-        same = [r for r, _ in likely if r.effect == best.effect and (q.unit in SHARED or r is best)]
+        same = [r for r, _ in told if r.effect == best.effect and (q.unit in SHARED or r is best)]
         spans = [s for r in same if (s := _span(refits.get((r.effect, r.at, r.source)), n)) is not None]
         # At a place where the size is another, of other sign say, it is no uncertainty of this one.
         alike = [s for s in spans if s[0] <= best.parameters[n] <= s[1]]
         interval = (min(low for low, _ in alike), max(high for _, high in alike)) if alike else None
         parameters[n] = EffectSize(best.parameters[n], interval, q.unit)
     by_place: dict[tuple[tuple[str, ...], str], float] = {}
-    for r, p in likely:
+    for r, p in told:
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
     places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
-    delays = [late for r, _ in likely if (late := r.late) is not None]
+    delays = [late for r, _ in told if (late := r.late) is not None]
     delay = (min(delays), max(delays)) if delays else None
     sentence = sentence or f"{best.effect} at {listed(best.at)}"
-    others = [n for n in dict.fromkeys(r.effect for r, _ in likely if r.refitted) if n != best.effect]
+    others = [n for n in dict.fromkeys(r.effect for r, _ in told if r.refitted) if n != best.effect]
     other = f", or another kind of delay as long ({', '.join(others)})" if others and best.late is not None else ""
     return Finding(
         best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, places, other),

@@ -94,7 +94,7 @@ def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Jud
     names = "; and ".join(_class_text(c) for c in each)
     rest = _rest(remainder)
     if rest and remainder.largest > REFUTED:
-        if all(c[0].probability >= CERTAIN for c in each) or _all_of_one_kind(found.sets):
+        if sure or _all_of_one_kind(found.sets):
             text = f"Missing: something like {names}. It is not all of it: {rest}."
             return replace(
                 found,

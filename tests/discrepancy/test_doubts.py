@@ -54,7 +54,7 @@ def test_what_is_told_by_one_experiment_alone_or_jumps_with_its_size_is_not_aske
 
 
 def doubted(refit: Refit, explained: float = 1.0) -> Doubt | None:
-    """What tells against the refit's effect."""
+    """Return the doubt about the refit's effect, or None."""
     return doubt(refit, refit.nominal(), explained)
 
 

@@ -1,4 +1,4 @@
-"""What is told of a diagnosis: parameters as findings, places apart from effects, and what is left."""
+"""Findings of a diagnosis: parameters among them, places apart from effects, and the remainder."""
 
 from __future__ import annotations
 

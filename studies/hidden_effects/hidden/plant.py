@@ -1,4 +1,4 @@
-"""What a plant of the study consists of."""
+"""A plant of the study: values, equations, and how it is integrated."""
 
 from __future__ import annotations
 
