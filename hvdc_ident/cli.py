@@ -187,20 +187,12 @@ def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
 def _tell_run(study: Study, folder: Path, done: list[Done], console: Console, typed: Callable[[str], str]) -> None:
     """Tell how the stages of a run went. typed: returns a line with the commands in it as they are to be typed here."""
     from hvdc_ident.study.pipeline import heading_of
+    from hvdc_ident.study.run_summary import run_lines
 
     seed = done[0].data["seed"] if done else 0
     found = {d.stage.name: d.data for d in done}
     console.print_json({**heading_of(study, seed), "stages": found, "report": "report.html"})
-    notes = dict.fromkeys(line for d in done for line in d.data.get("steady_state", ()))
-    console.say(*(f"steady state, {line}" for line in notes))
-    for d in done:
-        state = "failed" if d.failed else "done" if d.fresh else "kept from before"
-        # A fit that ended on a bound or found two optima is done, but not by that word alone.
-        status = d.data.get("status")
-        more = f", {status}" if status in ("at-bound", "two-optima") and not d.failed else ""
-        if (d.data.get("adequacy") or {}).get("verdict") == "does-not-fit" and not d.failed:
-            more += f", but the model does not fit; next: {d.data['adequacy']['next']}"
-        console.say(typed(f"{d.stage.name}: {state}{more}"))
+    console.say(*map(typed, run_lines(done)))
     console.say(f"report: {folder / 'report.html'}")
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:

@@ -9,6 +9,7 @@ import functools
 import inspect
 import math
 import os
+import shutil
 import signal
 import sys
 import traceback
@@ -54,6 +55,14 @@ def _limit(flag: str, metavar: str, unit: str, example: str, text: str) -> Any:
     return option(flag, metavar, text, parser=_number(flag, f"{unit} above 0", example, 1e-9))
 
 
+def echo(text: str, *, err: bool = False) -> None:
+    """Print text for people: folded at words to the width of a terminal, as it is where it goes elsewhere."""
+    from hvdc_ident.text import folded
+
+    stream = sys.stderr if err else sys.stdout
+    typer.echo(folded(text, shutil.get_terminal_size().columns) if stream.isatty() else text, err=err)
+
+
 StudyFile = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).", show_default=False)]
 Out = Annotated[Path | None, option("--out", "DIR", "Folder for results; default STUDY-results.")]
 Budget = Annotated[
@@ -87,12 +96,12 @@ class Console:
     def say(self, *lines: str) -> None:
         """Print lines for people, unless stdout is asked to hold JSON or to stay empty."""
         for line in () if self.json or self.quiet else lines:
-            typer.echo(line)
+            echo(line)
 
     def announce(self, lines: Sequence[str]) -> None:
         """Print what to know before the work begins: on stderr where stdout is asked to hold JSON."""
         for line in () if self.quiet else lines:
-            typer.echo(line, err=self.json)
+            echo(line, err=self.json)
 
     def print_json(self, value: Any) -> None:
         """Print JSON where it is asked for."""
@@ -248,7 +257,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
         def end(code: int, message: str) -> NoReturn:
             text = pasteable(message, given.get("study"), given.get("out"), given.get("access"))
-            typer.echo(f"{'interrupted' if code == 130 else 'error'}: {text}", err=True)
+            echo(f"{'interrupted' if code == 130 else 'error'}: {text}", err=True)
             raise typer.Exit(code)
 
         try:

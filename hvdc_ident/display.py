@@ -35,12 +35,22 @@ class Table:
 
         return "\n".join(map(line, cells))
 
+    def without_empty(self) -> Table:
+        """Return the table without the columns that have nothing in any row."""
+        keep = [k for k in range(len(self.header)) if any(row[k] not in (None, "") for row in self.rows)]
+        return Table(tuple(self.header[k] for k in keep), tuple(tuple(row[k] for k in keep) for row in self.rows))
+
     @property
     def html(self) -> str:
         """The table as HTML."""
         head = "".join(f"<th>{escape(h)}</th>" for h in self.header)
         body = "".join("<tr>" + "".join(f"<td>{escape(_text(c))}</td>" for c in row) + "</tr>" for row in self.rows)
         return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def rounded(value: float | None, digits: int = 4) -> float | None:
+    """Return a number with so many significant digits, for a cell of a table."""
+    return None if value is None else float(f"{value:.{digits}g}")
 
 
 def first_rows(

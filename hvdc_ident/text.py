@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 _SMALLER = ((1e-4, 1e6, "µs"), (0.1, 1e3, "ms"))
@@ -32,6 +34,33 @@ def span(low: float, high: float, unit: str = "", digits: int = 4) -> str:
         if unit == "s" and 0.0 < abs(high) < below:
             return f"{factor * low:.{digits}g} and {factor * high:.{digits}g} {smaller}"
     return f"{low:.{digits}g} and {high:.{digits}g} {unit}".rstrip()
+
+
+def figures_of(ci95: Sequence[float | None] | None, fewest: int = 6) -> int:
+    """Return the significant figures that tell the ends of an interval apart: two more than they share, 15 at most."""
+    low, high = ci95 or (None, None)
+    if low is None or high is None or low >= high:
+        return fewest
+    return min(15, max(fewest, math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))) + 2))
+
+
+_COMMAND = re.compile(r"`hvdc-ident [^`]*`|(?<![`\w/.-])hvdc-ident .*$")
+
+
+def folded(text: str, width: int) -> str:
+    """Return the text with lines of at most so many characters, later ones indented; tables and commands stay whole.
+
+    A command is what stands in backquotes, or from `hvdc-ident` to the end of the line: it can still be copied.
+    """
+    return "\n".join(_folded(line, width) for line in text.splitlines())
+
+
+def _folded(line: str, width: int) -> str:
+    if len(line) <= width or re.search(r"\S {2,}\S", line):
+        return line
+    kept = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
+    settings = {"break_long_words": False, "break_on_hyphens": False}
+    return textwrap.fill(kept, width, subsequent_indent="  ", **settings).replace("\0", " ")  # type: ignore[arg-type]
 
 
 def listed(names: Iterable[str]) -> str:

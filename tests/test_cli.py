@@ -117,8 +117,8 @@ def test_a_report_of_nothing_says_what_it_takes(tmp_path: Path) -> None:
 
 def test_a_second_run_keeps_what_stands_and_a_change_is_done_again(study: Path) -> None:
     def states() -> dict[str, str]:
-        lines = [line.split(": ") for line in call("run", study).stdout.splitlines()]
-        return {a: b for a, b in lines if a in ("simulate", "fit")}
+        lines = [line.partition(": ") for line in call("run", study).stdout.splitlines()]
+        return {a: b.split(";")[0] for a, _, b in lines if a in ("simulate", "fit")}
 
     assert states() == {"simulate": "done", "fit": "done"}
     assert states() == {"simulate": "kept from before", "fit": "kept from before"}
@@ -126,6 +126,64 @@ def test_a_second_run_keeps_what_stands_and_a_change_is_done_again(study: Path) 
     assert states() == {"simulate": "kept from before", "fit": "done"}
     study.write_text(STUDY.replace("start = 2", "start = 3"))
     assert states() == {"simulate": "done", "fit": "done"}
+
+
+def test_simulate_prints_the_errors_in_the_outputs_unit(study: Path) -> None:
+    """The model of rate 1/s against a recording of rate 5/s: both are exponentials."""
+    card = study.parent / "lag.toml"
+    card.write_text(CARD.replace('y = "x"', 'y = {value = "x", unit = "kA"}'))
+    recording = np.loadtxt(study.parent / "step.csv", delimiter=",", skiprows=1)
+    time, recorded = recording[:, 0], recording[:, 2]
+    gap = recorded - np.where(time >= 0.5, 1.0 - np.exp(-(time - 0.5)), 0.0)
+    rmse, worst = float(np.sqrt(np.mean(gap**2))), int(np.argmax(np.abs(gap)))
+    shown = call("simulate", study).stdout
+    (found,) = json.loads((study.parent / "study-results" / "simulation.json").read_text())["gaps"]
+    assert found["rmse"] == pytest.approx(rmse, rel=1e-6) and found["noise_units"] == pytest.approx(
+        1e3 * rmse, rel=1e-6
+    )
+    assert found["nrmse"] == pytest.approx(rmse / np.ptp(recorded), rel=1e-6)
+    assert (found["largest"], found["at"]) == (pytest.approx(gap[worst], rel=1e-5), time[worst])
+    assert f"Worst signal: y in step, RMSE {rmse:.4g} kA, {100 * rmse / np.ptp(recorded):.3g} %" in shown
+    assert f"{abs(gap[worst]):.4g} kA above the model at {time[worst]:g} s" in shown
+    assert f"`hvdc-ident fit {study}` estimates what the recordings determine of k." in shown
+
+
+def test_linearize_prints_the_point_the_modes_and_the_limits(study: Path) -> None:
+    """A pendulum of 2 Hz and damping 0.1 beside a lag of 4 s, with its torque held at a limit."""
+    w, zeta = float(4.0 * np.pi / np.sqrt(1.0 - 0.01)), 0.1
+    (study.parent / "lag.toml").write_text(
+        'schema = 1\nname = "swing"\n[inputs]\nu = {value = 3.0, unit = "kN"}\n[states]\n'
+        f'x = {{derivative = "v", unit = "m"}}\nv = {{derivative = "{w**2!r}*(f - x) - {2 * zeta * w!r}*v"}}\n'
+        'z = {derivative = "(x - z)/4"}\n[signals]\nf = "clip(u, -2, 2)"\n[outputs]\nx = "x"\n'
+    )
+    study.write_text('schema = 1\n[model]\nsource = "lag.toml"\n[linearize]\ninputs = ["u"]\noutputs = ["x"]\n')
+    shown = call("linearize", study).stdout
+    assert "mode at 2 Hz, damping 10 %: " in shown
+    assert "operating point: stable, rightmost eigenvalue -0.25 1/s\ninputs: u = 3 kN\noutputs: x = 2" in shown
+    assert "modes without oscillation: 1, the slowest with a time constant of 4 s: z" in shown
+    assert "active limit: f is held by 2 (upper limit)" in shown
+
+
+def test_run_prints_the_verdict_of_each_stage_and_the_values(study: Path) -> None:
+    lines = call("run", study).stdout.splitlines()
+    assert lines[0].startswith("simulate: done; worst is y in step, RMSE 0.")
+    assert lines[1] == "identify: done; identifiable: k"
+    assert lines[2] == "fit: done; converged; the model fits"
+    header, row = lines[4], lines[5].split()
+    assert header.split() == ["parameter", "unit", "given", "fitted", "95", "%", "interval"]
+    assert row[:3] == ["k", "1/s", "1"] and float(row[4]) < 5.0 < float(row[6])
+    assert lines[-1] == f"report: {study.parent / 'study-results' / 'report.html'}"
+
+
+def test_lines_are_folded_at_words_and_commands_stay_whole() -> None:
+    from hvdc_ident.text import folded
+
+    text = "The recordings tell nothing about this one, so try `hvdc-ident fit a/study.toml --force k` and see."
+    lines = folded(text, 50).splitlines()
+    assert len(lines) > 1 and max(map(len, lines)) <= 50 and "`hvdc-ident fit a/study.toml --force k`" in "".join(lines)
+    assert folded(text, 200) == text and " ".join(folded(text, 50).split()) == text
+    table = "parameter   unit   " + 10 * "0.123   "
+    assert folded(table, 40) == table
 
 
 @pytest.mark.parametrize("command", ["check", "simulate", "fit", "run"])

@@ -12,6 +12,7 @@ from hvdc_ident.errors import LinearizationError, SteadyStateError
 from hvdc_ident.model import Model
 from hvdc_ident.study import schema
 from hvdc_ident.study.measured_responses import port_of
+from hvdc_ident.text import quantity
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel, OperatingPoint
@@ -206,19 +207,15 @@ def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[di
     return found, files
 
 
+MODES_SHOWN = 8
+"""Modes on the screen, the least damped first."""
+VALUES_SHOWN = 6
+"""Inputs and outputs of the operating point in one line of the screen."""
+
+
 def lines(data: Mapping[str, Any]) -> list[str]:
     """Return the lines that the stage prints."""
-    values = [complex(*m["eigenvalue"]) for m in data["modes"] if "sliding mean" not in str(m["kind"])]
-    right = max((v.real for v in values), default=None)
-    found = []
-    if right is not None:
-        verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
-        found.append(f"operating point: {verdict}, rightmost eigenvalue {right:.4g} 1/s")
-    found += [f"operating point: {note}" for note in data["notes"]]
-    for m in data["modes"]:
-        if m["eigenvalue"][1] > 0:
-            shares = sorted(m["participation"], key=lambda n: -m["participation"][n])[:3]
-            found.append(f"mode at {m['frequency_hz']:.4g} Hz, damping {100 * m['damping']:.3g} %: {', '.join(shares)}")
+    found = [*_point_lines(data), *(f"operating point: {note}" for note in data["notes"]), *_mode_lines(data)]
     if "trim" in data:
         wanted = ", ".join(f"{n} = {v:g}" for n, v in data["trim"]["outputs"].items())
         made = ", ".join(f"{n} = {v:.6g}" for n, v in data["trim"]["found"].items())
@@ -249,6 +246,55 @@ def lines(data: Mapping[str, Any]) -> list[str]:
     for f in data.get("formulas", ()):
         text = f.get("reason") or f"({f['numerator']}) / ({f['denominator']})"
         found.append(f"{f['output']} from {f['input']}: {text}")
+    return found
+
+
+def stability(data: Mapping[str, Any]) -> str:
+    """Return whether the operating point is stable, with its rightmost eigenvalue; empty for a model without modes."""
+    values = [complex(*m["eigenvalue"]) for m in data["modes"] if "sliding mean" not in str(m["kind"])]
+    right = max((v.real for v in values), default=None)
+    if right is None:
+        return ""
+    verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
+    return f"{verdict}, rightmost eigenvalue {right:.4g} 1/s"
+
+
+def _point_lines(data: Mapping[str, Any]) -> list[str]:
+    """The verdict on stability, the inputs and outputs of the linear model at the point, and the limits that are active."""
+    found = [f"operating point: {verdict}"] if (verdict := stability(data)) else []
+    for kind in ("input", "output"):
+        names = data[f"{kind}_names"]
+        values = zip(names, data["u0" if kind == "input" else "y0"], data[f"{kind}_units"], strict=True)
+        shown = [f"{n} = {quantity(v, u, 6)}" for n, v, u in list(values)[:VALUES_SHOWN]]
+        more = f" and {len(names) - VALUES_SHOWN} more" if len(names) > VALUES_SHOWN else ""
+        found += [f"{kind}s: {', '.join(shown)}{more}"] if shown else []
+    active = data["operating_point"]["active_limits"]
+    for limit in active:
+        found.append(f"active limit: {limit['signal']} is held by {limit['level']} ({limit['limit']} limit)")
+    return [*found] if active or not data["operating_point"]["margins"] else [*found, "active limits: none"]
+
+
+def _mode_lines(data: Mapping[str, Any]) -> list[str]:
+    """The oscillating modes, the least damped first, and how many decay without oscillation, with the slowest of them."""
+    real = [m for m in data["modes"] if m["eigenvalue"][1] == 0.0 and "sliding mean" not in str(m["kind"])]
+    swinging = sorted((m for m in data["modes"] if m["eigenvalue"][1] > 0), key=lambda m: m["damping"])
+    found = []
+    for m in swinging[:MODES_SHOWN]:
+        shares = sorted(m["participation"], key=lambda n: -m["participation"][n])[:3]
+        found.append(f"mode at {m['frequency_hz']:.4g} Hz, damping {100 * m['damping']:.3g} %: {', '.join(shares)}")
+    if len(swinging) > MODES_SHOWN:
+        better = swinging[MODES_SHOWN]["damping"]
+        found.append(f"and {len(swinging) - MODES_SHOWN} more modes, of damping {100 * better:.3g} % and above")
+    if real:
+        slowest = max(real, key=lambda m: m["eigenvalue"][0])
+        rate = slowest["eigenvalue"][0]
+        part = max(slowest["participation"], key=lambda n: slowest["participation"][n])
+        how = (
+            f"the slowest with a time constant of {quantity(-1.0 / rate, 's')}"
+            if rate < 0
+            else f"one at {rate:.4g} 1/s"
+        )
+        found.append(f"modes without oscillation: {len(real)}, {how}: {part}")
     return found
 
 

@@ -262,7 +262,7 @@ def test_a_sound_study_is_not_troubled(tmp_path: Path) -> None:
     path = str(study(tmp_path, 1.0))
     run = CliRunner().invoke
     assert "before the event" not in run(app, ["check", path]).stdout
-    assert run(app, ["simulate", path]).stdout.splitlines()[0].startswith("simulate: done")
+    assert "before the event" not in run(app, ["simulate", path]).stdout
     assert run(app, ["report", path]).exit_code == 0
     assert "one that the model can rest at" in (tmp_path / "s-results" / "report.html").read_text("utf-8")
 

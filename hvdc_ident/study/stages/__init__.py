@@ -68,6 +68,11 @@ def no_lines(data: Mapping[str, Any]) -> Sequence[str]:
     return ()
 
 
+def no_verdict(data: Mapping[str, Any]) -> str:
+    """Return no verdict."""
+    return ""
+
+
 @dataclass(frozen=True)
 class Stage:
     """One stage.
@@ -77,7 +82,8 @@ class Stage:
     after: the stages it builds on; they run first. order: place among the stages of a run.
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
-    from its JSON. searches: whether it also runs at the start values, where a search begins; all run at the given ones.
+    from its JSON. verdict: the same in one phrase, for the screen of a run. searches: whether it also runs at the start
+    values, where a search begins; all run at the given ones.
     """
 
     name: str
@@ -90,6 +96,7 @@ class Stage:
     uses: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
+    verdict: Callable[[Mapping[str, Any]], str] = no_verdict
     searches: bool = False
 
 

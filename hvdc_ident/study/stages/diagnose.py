@@ -123,6 +123,11 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     return [*lines, *data["notes"]]
 
 
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the verdict with its text."""
+    return f"{data['verdict']}: {data['text']}" if "verdict" in data else str(data.get("message", ""))
+
+
 STAGE = Stage(
     name="diagnose",
     file="discrepancy.json",
@@ -133,5 +138,6 @@ STAGE = Stage(
     after=("identify", "fit"),
     takes=("budget",),
     tell=lines_of,
+    verdict=verdict,
     searches=True,
 )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
+from hvdc_ident.text import figures_of
 
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment
@@ -137,7 +137,7 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
         given = f" (given {data['candidates'][name]['given']:.6g})"
-        value = f"{e['value']:.{_figures(e['ci95'])}g}"
+        value = f"{e['value']:.{figures_of(e['ci95'])}g}"
         lines.append(f"{name} = {value}{unit}{given}{_interval(e['ci95'], beside)}" + _note(e))
     held = [n for n in data["candidates"] if n not in data["estimates"]]
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
@@ -152,16 +152,8 @@ def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:
         return ""
     if low is None or high is None:
         return f", 95 %: {'below' if low is None else 'above'} {high if low is None else low:.6g} ({beside})"
-    figures = _figures(ci95)
+    figures = figures_of(ci95)
     return f", 95 %: {low:.{figures}g} to {high:.{figures}g} ({beside})"
-
-
-def _figures(ci95: Sequence[float | None] | None) -> int:
-    """Return the significant figures that tell the ends of an interval apart: 6, or two more than they share; 15 at most."""
-    low, high = ci95 or (None, None)
-    if low is None or high is None or low >= high:
-        return 6
-    return min(15, max(6, math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))) + 2))
 
 
 def _conditions(data: Mapping[str, Any]) -> list[str]:
@@ -196,6 +188,15 @@ def _searched(data: Mapping[str, Any]) -> list[str]:
     return [f"Without bounds of their own, starts were drawn from: {', '.join(ranges)}."] if ranges else []
 
 
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the fit's status, and the verdict on its residuals."""
+    from hvdc_ident.fit.result import FIT_WORDS
+
+    judged = (data.get("adequacy") or {}).get("verdict")
+    words = FIT_WORDS[judged] if judged else ""
+    return f"{data['status']}; {words[:1].lower()}{words[1:]}" if words else str(data["status"])
+
+
 STAGE = Stage(
     name="fit",
     file="fit.json",
@@ -206,5 +207,6 @@ STAGE = Stage(
     after=("identify",),
     takes=("force",),
     tell=lines_of,
+    verdict=verdict,
     searches=True,
 )

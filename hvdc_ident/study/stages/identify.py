@@ -118,6 +118,15 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     return [*lines, f"Measure next: {advice['text']}"] if advice else lines
 
 
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the candidates by their verdicts."""
+    groups: dict[str, list[str]] = {}
+    for name, v in data["parameters"].items():
+        groups.setdefault(v["verdict"], []).append(name)
+    found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
+    return f"{found}; the model does not explain these data" if data["misspecified"] else found
+
+
 STAGE = Stage(
     name="identify",
     file="identifiability.json",
@@ -126,5 +135,6 @@ STAGE = Stage(
     wanted=lambda study: study.settings.identifiability is not None or study.settings.fit is not None,
     order=30,
     tell=lines_of,
+    verdict=verdict,
     searches=True,
 )

@@ -115,18 +115,34 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
     from hvdc_ident.study.linear_analysis import lines
     from hvdc_ident.study.measured_responses import response_lines
+    from hvdc_ident.text import listed
 
     def described(found: Mapping[str, Any], of: str) -> list[str]:
         return lines(found) + response_lines(found.get("responses", ()), of)
 
     fitted = data.get("fitted") or {}
-    found = ["at the given values:", *described(data, "given")]
+    ends = f"from {listed(data['input_names'])} to {listed(data['output_names'])}"
+    found = [f"{data['model']}, linear model of {len(data['state_names'])} states {ends}", "at the given values:"]
+    found += described(data, "given")
     if fitted.get("modes"):
         return [*found, f"at the {data['fitted_note']}:", *described(fitted, "fitted")]
     if fitted.get("message"):
         return [*found, f"At the fitted values there is {fitted['message']}."]
     why = data["fitted_note"]
-    return [*found, f"There is no linear model at fitted values: {why}."] if why else found
+    found += [f"There is no linear model at fitted values: {why}. `hvdc-ident fit STUDY` fits it."] if why else []
+    return [*found, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m, .tex) writes A, B, C and D."]
+
+
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the stability of the operating point, and the least damped mode."""
+    from hvdc_ident.study.linear_analysis import stability
+
+    swinging = [m for m in data["modes"] if m["eigenvalue"][1] > 0]
+    least = min(swinging, key=lambda m: m["damping"], default=None)
+    mode = (
+        "" if least is None else f"; least damped mode {least['frequency_hz']:.4g} Hz, {100 * least['damping']:.3g} %"
+    )
+    return f"{stability(data) or 'no states'}{mode}"
 
 
 STAGE = Stage(
@@ -138,4 +154,5 @@ STAGE = Stage(
     order=45,
     uses=("fit",),
     tell=lines_of,
+    verdict=verdict,
 )

@@ -69,6 +69,19 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     return found
 
 
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the parameter that matters most to each output, by its mean over the experiments."""
+    name = "mu_star" if data["method"] == "morris" else "ST"
+    found = []
+    for output, line in data["measures"].items():
+        total: dict[str, float] = {}
+        for measures in line.values():
+            for parameter, m in measures.items():
+                total[parameter] = total.get(parameter, 0.0) + m[name]
+        found += [f"{max(total, key=lambda p: total[p])} moves {output} most"] if total else []
+    return ", ".join(found)
+
+
 STAGE = Stage(
     name="screen",
     file="screening.json",
@@ -77,4 +90,5 @@ STAGE = Stage(
     wanted=lambda study: study.settings.screening is not None,
     order=27,
     tell=lines_of,
+    verdict=verdict,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
@@ -19,9 +19,11 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.errors import ComputationError
     from hvdc_ident.simulate import simulate
     from hvdc_ident.study.checks import at_given, need_experiments
+    from hvdc_ident.study.study import candidate_lines
 
     need_experiments(study, "simulate")
     table: dict[str, dict[str, float | None]] = {}
+    gaps: list[dict[str, Any]] = []
     status: dict[str, dict[str, str]] = {}
     files: dict[str, str] = {}
     for done, experiment in enumerate(study.experiments):
@@ -41,13 +43,17 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         assert experiment.measured is not None  # a study's experiments have outputs
         for output in experiment.outputs:
             comparable = not ended or np.isfinite(experiment.measured[output][experiment.compared]).any()
-            table.setdefault(output, {})[experiment.name] = _rmse(experiment, simulated, output) if comparable else None
+            gap = _gap(study, experiment, simulated, output) if comparable else None
+            table.setdefault(output, {})[experiment.name] = None if gap is None else gap["rmse"]
+            gaps += [] if gap is None else [gap]
         files[f"simulation.{experiment.name}.csv"] = _comparison_csv(experiment, simulated)
     failed = [name for name, s in status.items() if s["status"] != "converged"]
     data = {
         "values": {**study.model.values, **study.given},
         "rmse": table,
         "units": {o: study.model.outputs[o].unit for o in table},
+        "gaps": _worst_first(gaps),
+        "candidates": candidate_lines(study),
         "experiments": {
             e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording, **status[e.name]}
             for e in study.experiments
@@ -70,10 +76,12 @@ def _until(experiment: Experiment, rows: int) -> Experiment:
     )
 
 
-def _rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
-    """The root mean square of measured - simulated over the rows that are compared, in the output's unit.
+def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: str) -> dict[str, Any]:
+    """Return how far recorded and simulated output are apart over the rows that are compared, in the output's unit.
 
-    Raises StudyError where there is none.
+    rmse: root mean square of recorded - simulated. nrmse: the same over the range that was recorded. noise: standard
+    deviation of the recording's noise, noise_units: the RMSE over it; None where the noise is not known before a fit.
+    largest, at: the difference of largest modulus, and its time in s. Raises StudyError where no row is compared.
     """
     import numpy as np
 
@@ -81,8 +89,29 @@ def _rmse(experiment: Experiment, simulated: Trajectory, output: str) -> float:
 
     rows = compared_rows(experiment, output)
     assert experiment.measured is not None
-    difference = experiment.measured[output][rows] - simulated[output][rows]
-    return float(np.sqrt(np.mean(difference**2)))
+    recorded = experiment.measured[output][rows]
+    difference = recorded - simulated[output][rows]
+    rmse, span = float(np.sqrt(np.mean(difference**2))), float(np.ptp(recorded))
+    note = study.noise[experiment.name][output]
+    noise = note.std if note.source in ("given", "estimated") and note.std > 0.0 else None
+    k = int(np.argmax(np.abs(difference)))
+    return {
+        "output": output,
+        "experiment": experiment.name,
+        "unit": study.model.outputs[output].unit,
+        "rmse": rmse,
+        "nrmse": rmse / span if span > 0.0 else None,
+        "noise": noise,
+        "noise_units": None if noise is None else rmse / noise,
+        "largest": float(difference[k]),
+        "at": float(experiment.time[rows][k]),
+    }
+
+
+def _worst_first(gaps: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the gaps from the largest: in units of the noise where every noise is known, else over the recorded range."""
+    by = "noise_units" if all(g["noise_units"] is not None for g in gaps) else "nrmse"
+    return sorted(gaps, key=lambda g: -(g[by] or 0.0))
 
 
 def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
@@ -96,6 +125,55 @@ def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
     return csv_columns(columns)
 
 
+ROWS = 12
+"""Rows of the table on the screen; what follows is told by its largest."""
+
+
+def worst_of(data: Mapping[str, Any]) -> str:
+    """Return the worst signal with its errors, as a phrase; empty where nothing was compared."""
+    from hvdc_ident.text import quantity
+
+    if not data.get("gaps"):
+        return ""
+    g = data["gaps"][0]
+    over = [f"{100.0 * g['nrmse']:.3g} % of the recorded range"] if g["nrmse"] is not None else []
+    over += [f"{g['noise_units']:.3g} times the noise"] if g["noise_units"] is not None else []
+    return f"{g['output']} in {g['experiment']}, RMSE {', '.join([quantity(g['rmse'], g['unit']), *over])}"
+
+
+def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
+    """The question, a table of the errors from the worst signal on, the largest gap, and what to do next."""
+    from hvdc_ident.display import Table, rounded
+    from hvdc_ident.text import listed, quantity
+
+    gaps, roles = data["gaps"], [e["role"] for e in data["experiments"].values()]
+    held = f", {roles.count('holdout')} of them held out" if "holdout" in roles else ""
+    recordings = f"{len(roles)} recording{'s' if len(roles) > 1 else ''}{held}"
+    found = [f"{data['model']} at its given values against {recordings}:", ""]
+    rows = []
+    for g in gaps[:ROWS]:
+        percent = None if g["nrmse"] is None else rounded(100.0 * g["nrmse"], 3)
+        noise = None if g["noise_units"] is None else rounded(g["noise_units"], 3)
+        name = (g["output"], g["experiment"], data["experiments"][g["experiment"]]["role"])
+        rows.append((*name, rounded(g["rmse"]), g["unit"], percent, noise))
+    header = ("output", "recording", "role", "RMSE", "unit", "NRMSE, %", "RMSE/noise")
+    found += str(Table(header, tuple(rows)).without_empty()).splitlines()
+    found += [f"and {len(gaps) - ROWS} more, with smaller errors"] if len(gaps) > ROWS else []
+    found += ["", "NRMSE: RMSE over the recorded range of the output."] if gaps else []
+    if gaps:
+        g = gaps[0]
+        by = f"{quantity(abs(g['largest']), g['unit'])} {'above' if g['largest'] > 0 else 'below'} the model"
+        found += [f"Worst signal: {worst_of(data)}.", f"Its largest gap: the recording is {by} at {g['at']:.6g} s."]
+    names = list(data["candidates"])
+    if names:
+        found.append(f"Next: `hvdc-ident fit STUDY` estimates what the recordings determine of {listed(names)}.")
+    else:
+        found.append(
+            "Next: name what may be estimated in [parameters], NAME = {min = ..., max = ...}; then `hvdc-ident fit STUDY`."
+        )
+    return found
+
+
 STAGE = Stage(
     name="simulate",
     file="simulation.json",
@@ -103,4 +181,6 @@ STAGE = Stage(
     run=run,
     wanted=lambda study: bool(study.experiments),
     order=10,
+    tell=lines_of,
+    verdict=lambda data: f"worst is {worst}" if (worst := worst_of(data)) else "",
 )

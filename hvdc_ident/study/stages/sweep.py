@@ -135,6 +135,11 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     return lines
 
 
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the number of points and of those that failed."""
+    return f"{data['count']} points of {', '.join(data['parameters'])}, {data['failed'] or 'none'} failed"
+
+
 STAGE = Stage(
     name="sweep",
     file="sweep.json",
@@ -143,4 +148,5 @@ STAGE = Stage(
     wanted=lambda study: bool(study.settings.sweep),
     order=25,
     tell=lines_of,
+    verdict=verdict,
 )

@@ -1,0 +1,68 @@
+"""The screen of a run: the verdict of each stage in a line, the values of the parameters, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hvdc_ident.display import Table, rounded
+from hvdc_ident.study.pipeline import Done
+from hvdc_ident.text import figures_of
+
+
+def run_lines(done: Sequence[Done]) -> list[str]:
+    """Return the screen of a run: for each stage its state and verdict, then the values, then what to do next."""
+    found = {d.stage.name: d.data for d in done if not d.failed}
+    notes = dict.fromkeys(line for d in done for line in d.data.get("steady_state", ()))
+    lines = [f"steady state, {line}" for line in notes]
+    for d in done:
+        state = "failed" if d.failed else "done" if d.fresh else "kept from before"
+        verdict = d.failed or d.stage.verdict(d.data)
+        lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
+    table = values_table(found.get("fit", {}), found.get("diagnose", {}))
+    lines += ["", *str(table).splitlines()] if table.rows else []
+    following = next_step(found)
+    return [*lines, "", following] if following else lines
+
+
+def values_table(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
+    """Return the candidates with their given and fitted values, the interval, and the value beside the missing effect."""
+    after = diagnosis.get("parameters_after", {}) if diagnosis.get("augmented_model") else {}
+    rows = []
+    for name, c in fit.get("candidates", {}).items():
+        e = fit["estimates"].get(name) or {}
+        held = "" if e else f"held, {fit['held'].get(name, 'not fitted').split(':')[0]}"
+        value = (
+            rounded(e.get("value"), figures_of(e.get("ci95"), 5)),
+            interval_text(e.get("ci95")) or held,
+            rounded(after.get(name), 5),
+        )
+        rows.append((name, c["unit"], rounded(c["given"], 6), *value))
+    header = ("parameter", "unit", "given", "fitted", "95 % interval", "with the effect")
+    return Table(header, tuple(rows)).without_empty() if rows else Table(header, ())
+
+
+def interval_text(ci95: Sequence[float | None] | None) -> str:
+    """Return a 95 % interval as "A to B"; an end that is open as "above A" or "below B"; empty where both are."""
+    low, high = ci95 or (None, None)
+    if low is None or high is None:
+        return "" if low is high else f"above {low:.5g}" if low is not None else f"below {high:.5g}"
+    figures = figures_of((low, high))
+    return f"{low:.{figures}g} to {high:.{figures}g}"
+
+
+def next_step(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return what to do next by the results of the stages, by name: measure, diagnose, or export the values."""
+    diagnosis, fit, judged = (found.get(n, {}) for n in ("diagnose", "fit", "identify"))
+    if advice := (diagnosis.get("separating_experiment") or {}).get("text"):
+        return f"Measure next: {advice.rstrip('.')}."
+    if diagnosis.get("augmented_model"):
+        return "Next: `hvdc-ident letter STUDY` writes one page on this for the model's owner."
+    adequacy = fit.get("adequacy") or {}
+    if adequacy.get("verdict") == "does-not-fit" and not diagnosis:
+        return f"Next: {adequacy['next']}"
+    if advice := (judged.get("recommended_experiment") or {}).get("text"):
+        return f"Measure next: {advice}"
+    if fit.get("estimates"):
+        return "Next: `hvdc-ident export STUDY --to FILE` writes the model with the fitted values (.fmu, .mo, .toml)."
+    return ""
