@@ -6,7 +6,7 @@ Nothing heavy is imported before a command needs it, so that the help comes at o
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -65,14 +65,18 @@ def demo(
     console: Console,
 ) -> None:
     """Calibrate the shipped link on recordings made here."""
-    from hvdc_ident.study.examples import write_demo
+    from hvdc_ident.study.demo_truth import truth_lines
+    from hvdc_ident.study.examples import write_demo, write_truth
     from hvdc_ident.study.study import load_study
 
     with console.progress() as progress:
         options = work.options(console, progress)
         study = load_study(write_demo(out, seed=work.seed, progress=progress))
+        truth = write_truth(out, study, seed=work.seed)
         done = _run_all(study, out, options)
-    _tell_run(study, out, done, console, lambda line: pasteable(line, study.path, out, None))
+    found = {d.stage.name: d.data for d in done if not d.failed}
+    compared = truth_lines(truth, found.get("fit", {}), found.get("diagnose", {}))
+    _tell_run(study, out, done, console, lambda line: pasteable(line, study.path, out, None), truth=compared)
 
 
 def new(
@@ -184,15 +188,25 @@ def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
     return done
 
 
-def _tell_run(study: Study, folder: Path, done: list[Done], console: Console, typed: Callable[[str], str]) -> None:
-    """Tell how the stages of a run went. typed: returns a line with the commands in it as they are to be typed here."""
+def _tell_run(
+    study: Study,
+    folder: Path,
+    done: list[Done],
+    console: Console,
+    typed: Callable[[str], str],
+    truth: Sequence[str] = (),
+) -> None:
+    """Tell how the stages of a run went. typed: returns a line with the commands in it as they are to be typed here.
+
+    truth: lines with the values beside the true ones, in place of the table of values.
+    """
     from hvdc_ident.study.pipeline import heading_of
     from hvdc_ident.study.run_summary import run_lines
 
     seed = done[0].data["seed"] if done else 0
     found = {d.stage.name: d.data for d in done}
     console.print_json({**heading_of(study, seed), "stages": found, "report": "report.html"})
-    console.say(*map(typed, run_lines(done)))
+    console.say(*map(typed, run_lines(done, truth)))
     console.say(f"report: {folder / 'report.html'}")
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:

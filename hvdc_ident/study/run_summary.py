@@ -10,8 +10,11 @@ from hvdc_ident.study.pipeline import Done
 from hvdc_ident.text import figures_of
 
 
-def run_lines(done: Sequence[Done]) -> list[str]:
-    """Return the screen of a run: for each stage its state and verdict, then the values, then what to do next."""
+def run_lines(done: Sequence[Done], truth: Sequence[str] = ()) -> list[str]:
+    """Return the screen of a run: for each stage its state and verdict, then the values, then what to do next.
+
+    truth: lines that hold the values beside the true ones, where these are known.
+    """
     found = {d.stage.name: d.data for d in done if not d.failed}
     notes = dict.fromkeys(line for d in done for line in d.data.get("steady_state", ()))
     lines = [f"steady state, {line}" for line in notes]
@@ -20,7 +23,7 @@ def run_lines(done: Sequence[Done]) -> list[str]:
         verdict = d.failed or d.stage.verdict(d.data)
         lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
     table = values_table(found.get("fit", {}), found.get("diagnose", {}))
-    lines += ["", *str(table).splitlines()] if table.rows else []
+    lines += ["", *truth] if truth else ["", *str(table).splitlines()] if table.rows else []
     following = next_step(found)
     return [*lines, "", following] if following else lines
 
