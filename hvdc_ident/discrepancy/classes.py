@@ -283,7 +283,7 @@ def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
     others = [n for n in dict.fromkeys(r.effect for r, _ in told if r.refitted) if n != best.effect]
     other = f", or another kind of delay as long ({', '.join(others)})" if others and best.late is not None else ""
     return Finding(
-        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, places, other),
+        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, best, places, other),
         None if best.late is None else EffectSize(best.late, delay, "s"),
     )  # fmt: skip
 
@@ -305,15 +305,24 @@ def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
     return max(value - 1.96 * std, q.min), min(value + 1.96 * std, q.max)
 
 
-def _text(sentence: str, parameters: dict[str, EffectSize], places: Sequence[Place], other: str) -> str:
-    """The sentence with the first interval, other kinds of the effect, and the other places where it may be."""
+def _text(sentence: str, parameters: dict[str, EffectSize], best: Rival, places: Sequence[Place], other: str) -> str:
+    """The sentence, which tells of the best hypothesis, with the first interval, other kinds of the effect, and other places."""
     size = next((s for s in parameters.values() if s.ci95 is not None and None not in s.ci95), None)
     if size is not None and size.ci95 is not None:
         low, high = (quantity(v, size.unit) for v in size.ci95 if v is not None)
         sentence = f"{sentence} (95 %: {low} to {high})"
-    sentence += other
-    others = [listed(p.at) + (f" from {p.source}" if p.source else "") for p in places[1:]]
-    if not others:
-        return f"{sentence}."
-    shown = listed(others[:4]) if len(others) <= 4 else f"{', '.join(others[:4])} or one of {len(others) - 4} more"
-    return f"{sentence}; the records do not tell this place from {shown}."
+    places_too = list(dict.fromkeys(listed(p.at) for p in places if p.at != best.at))
+    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source != best.source))
+    apart = [f"this place from {_some(places_too)}"] if places_too else []
+    apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if sources_too else []
+    return f"{sentence}{other}; the records do not tell {', nor '.join(apart)}." if apart else f"{sentence}{other}."
+
+
+def _brought(source: str, at: Sequence[str]) -> str:
+    """The signals that an effect brings in at its places, in words."""
+    return listed(tuple(dict.fromkeys(split_sources(source, at))))
+
+
+def _some(names: Sequence[str]) -> str:
+    """Up to four names, and how many more there are."""
+    return listed(names[:4]) if len(names) <= 4 else f"{', '.join(names[:4])} or one of {len(names) - 4} more"

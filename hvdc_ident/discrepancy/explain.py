@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
@@ -54,10 +55,21 @@ def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
     words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought}
     if (late := entry.delay_with(sizes)) is not None:
         words["equivalent_delay"] = quantity(late, "s")
-    text = entry.sentence
+    absent = {n for n, q in entry.parameters.items() if q.optional and sizes.get(n, q.neutral) == q.neutral}
+    text = _without(entry.sentence, absent)
     for name, value in words.items():
         text = text.replace("{" + name + "}", value)
     return text[:1].upper() + text[1:] if text and not text.startswith(at[0]) else text
+
+
+def _without(sentence: str, absent: Collection[str]) -> str:
+    """Return an effect's sentence without the bracketed summands of absent parameters, and without the brackets."""
+    whole = re.search(r"\[.*\]", sentence)
+    if whole is None:
+        return sentence
+    summands = re.findall(r"\[(.*?)\]", whole[0])
+    kept = [s for s in summands if not any(f"{{{n}}}" in s for n in absent)]
+    return sentence.replace(whole[0], " + ".join(kept))
 
 
 def advice(

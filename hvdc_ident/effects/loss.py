@@ -51,7 +51,7 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
-    sentence="{at} loses {a} + {b} |{from}| + {c} {from}^2",
+    sentence="{at} loses [{a}] + [{b} |{from}|] + [{c} {from}^2]",
     excited_by="several levels of the other signal, of both signs",
     example=FrozenMap({"a": 0.002, "b": 0.03, "c": 0.02}),
     confusable=FrozenMap(

@@ -242,11 +242,15 @@ def distance_from_neutral(effect: Effect, values: Mapping[str, float]) -> dict[s
 
 
 def admissible_sources(model: Model, place: str) -> tuple[str, ...]:
-    """Return the inputs, signals, unknowns and states that an effect at this place may bring in without closing a circle."""
+    """Return the inputs, signals, unknowns and states that an effect at this place may bring in without closing a circle.
+
+    A place brings in no signal that is its own: that is a gain.
+    """
     kind, name = insertion_point(model, place)
     names = [*model.inputs, *model.signals, *model.algebraic, *model.states]
     if kind == "output":
-        return tuple(names)
+        shown = model.outputs[name].value
+        return tuple(n for n in names if n != str(shown))
     if kind == "algebraic":
         return tuple(n for n in names if n != name)
     uses = {n: {s.name for s in v.value.free_symbols} for n, v in model.signals.items()}

@@ -14,9 +14,10 @@ from refits import beside, plain
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy import classes as rated
 from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.explain import sentence
 from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.discrepancy.remainder import remainder_of
-from hvdc_ident.discrepancy.result import Rival
+from hvdc_ident.discrepancy.result import Place, Rival
 from hvdc_ident.immutable import FrozenMap
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
@@ -95,3 +96,28 @@ def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(m
     found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
     (one,) = rated.classes(members)
     assert rated.finding(found, one, "").parameters["k"].ci95 == (-0.036, -0.025)
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"a": 0.0, "b": 0.01, "c": 0.0}, "drag loses 0.01 |w|"),
+        ({"a": 0.2, "b": 0.0, "c": -0.5}, "drag loses 0.2 + -0.5 w^2"),
+    ],
+)
+def test_a_sentence_leaves_out_the_parts_that_are_not_there(values: dict[str, float], told: str) -> None:
+    placed = beside(plain(experiments()), "loss", "drag", values, {"b": (-3.0, 3.0)}, source="w").placed[-1]
+    assert sentence(placed, values) == told
+
+
+def test_a_finding_tells_places_and_sources_apart() -> None:
+    best = Rival("coupling", ("eq1", "eq2"), 0.0, FrozenMap({"k": 0.1}), source="Q1f, Q2f")
+    places = [
+        Place(("eq1", "eq2"), 0.4, "Q1f, Q2f"),
+        Place(("Uref1", "Uref2"), 0.3, "Q1f, Q2f"),
+        Place(("Uref1", "Uref2"), 0.3, "iq1, iq2"),
+    ]
+    told = rated._text("It couples", {}, best, places, "")
+    assert (
+        told == "It couples; the records do not tell this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2."
+    )
