@@ -9,19 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit
-from hvdc_ident.discrepancy.formula import Term, at_run, formula_job, terms
+from hvdc_ident.discrepancy.formula import Term, at_run, at_runs, formula_job, terms
 from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.filtered import filters
 from hvdc_ident.discrepancy.outside.law import regression
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.refit import RefitJob
 from hvdc_ident.discrepancy.refitted import PRICE
 from hvdc_ident.discrepancy.rounds import gained
 from hvdc_ident.discrepancy.scores import Path
-from hvdc_ident.discrepancy.signatures.candidates import additive, source_signals
-from hvdc_ident.effects import effects
+from hvdc_ident.discrepancy.signatures.block import block, parameter
+from hvdc_ident.discrepancy.signatures.candidates import additive, proportional, source_signals
+from hvdc_ident.discrepancy.signatures.finite import Kind, is_linear, kind_of
+from hvdc_ident.effects import Probe, effects
 from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
 
@@ -54,7 +59,7 @@ def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
 def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
     """The formulas that by regression leave least for what their coefficients cost."""
     paths = found.answers()
-    library, formulas = _formulas(found.before, paths, place.removeprefix("outputs."), source)
+    library, formulas = _formulas(found, paths, place, source)
     regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
     ranked = []
     for formula in formulas:
@@ -72,11 +77,42 @@ def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
 
 
 def _formulas(
-    before: Refit, paths: Mapping[str, Path], own: str, source: str
+    found: Round, paths: Mapping[str, Path], place: str, source: str
 ) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
     """A library, the slot's own signal first in it, and formulas as places in that: powers, magnitudes and products of the
-    signal with what is brought in, or with any; each also beside a gain."""
-    others = (source,) if source else source_signals(before.model, slot_signals(before.model, paths))
+    signal with what is brought in, or with any; each also beside a gain. None that an effect of the catalogue is."""
+    own = place.removeprefix("outputs.")
+    others = (source,) if source else source_signals(found.before.model, slot_signals(found.before.model, paths))
     library = terms([own, *(s for s in others if s != own)])
-    near = [k for k, t in enumerate(library) if t.form != "x" and (own in t.signals or source in t.signals)]
+    within = [t.form != "x" and (own in t.signals or source in t.signals) for t in library]
+    stated = _stated(found, paths, place) if any(within) else []
+    near = [
+        k
+        for k, t in enumerate(library)
+        if within[k] and not any(proportional(at_runs(t, paths), one) for one in stated)
+    ]
     return library, [*((k,) for k in near), *((k, 0) for k in near)]
+
+
+def _stated(found: Round, paths: Mapping[str, Path], place: str) -> list[list[Array]]:
+    """By run what each effect of the catalogue that is one number times a function of signals adds at the place.
+
+    A formula in proportion to one of them is that effect: a square of a signal is the loss by it.
+    """
+    shapes = []
+    for c in found.candidates:
+        if c.at != (place,):
+            continue
+        for k, probe in enumerate(c.probes):
+            kind = kind_of(c, k)
+            if len(probe.free) == 1 and is_linear(kind):
+                shapes.append([_added(kind, probe, c.source, place, path) for path in paths.values()])
+    return shapes
+
+
+def _added(kind: Kind, probe: Probe, source: str, place: str, path: Path) -> Array:
+    """(K,): the effect's signal less its own, along a run."""
+    u = path.signal(place)[:, None]
+    brought = path.signal(source)[:, None] if source else None
+    values = {parameter(n): np.array([probe.values[n]]) for n in kind.present}
+    return np.asarray(block(kind.effect, kind.present, kind.brings).run(values, path.time, u, brought) - u)[:, 0]

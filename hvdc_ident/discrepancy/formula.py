@@ -146,3 +146,8 @@ def filled(placed: Placed, refit: Refit) -> str:
 def at_run(term: Term) -> Callable[[str, Path], Array]:
     """The term along an experiment's run, as a regression takes it."""
     return lambda _, path: along(term, path.time, path.values)
+
+
+def at_runs(term: Term, paths: Mapping[str, Path]) -> list[Array]:
+    """The term along every run, (K,) each."""
+    return [along(term, path.time, path.values) for path in paths.values()]

@@ -103,3 +103,14 @@ def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> N
     more = {"effect": "gain", "at": "load", "parameters": {"k": 1.2}}
     found = diagnose(model(), shown(apply_effects(model(), [more]), still="load"), FREE, effects=bends, places=["load"])
     assert found.verdict == "named" and not found.ambiguity, "none of them adds"
+
+
+def test_a_formula_that_is_an_effect_of_the_catalogue_is_no_rival_of_it() -> None:
+    """The magnitude of a speed above 0 is the speed, and its square is a loss: neither is outside the catalogue."""
+    leak = {"effect": "conductance", "at": "load", "from": "w", "parameters": {"g": 0.05}}
+    records = answered(apply_effects(model(), [leak]), experiments(), seed=5)
+    found = diagnose(model(), records, FREE, effects=("conductance", "loss"), places=["load"])
+    formulas = {r.expression for group in found.ambiguity for r in group if r.effect == "term"}
+    assert not formulas & {"k1*w", "k1*abs(w)", "k1*w**2", "k1*w*abs(w)"}
+    assert found.findings[0].same_as[0] in ("conductance", "loss")
+    assert found.findings[0].parameters["g"].value == pytest.approx(0.05, rel=0.1)

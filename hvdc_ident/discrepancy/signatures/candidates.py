@@ -106,7 +106,7 @@ def candidates(
                 continue  # without its deadband a droop is a negative coupling, which is tried
             usable = brought
             if effect.name == "conductance":  # of the slot's own signal it is a gain, which is tried
-                usable = tuple(b for b in brought if not _proportional(signals[at[0]], signals[b]))
+                usable = tuple(b for b in brought if not proportional(signals[at[0]], signals[b]))
             found += _at(model, effect, at, joined, still, about, usable)
     return tuple(found)
 
@@ -161,7 +161,7 @@ def own_sources(at: Sequence[str], brought: Sequence[str], known: Collection[str
     return [own for own in families if all(s in known for s in own)]
 
 
-def _proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
+def proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
     """Return True where one signal is the other times a number, in all experiments."""
     u, v = np.concatenate(a), np.concatenate(b)
     across = u * float(np.linalg.norm(v)) - float(np.sign(u @ v)) * v * float(np.linalg.norm(u))
