@@ -47,7 +47,7 @@ class Judgement:
     sets: by effect that was put in, it and what cannot be told from it. experiment: what would show more where nothing was
     excited, or what the doubt is about. instead: the refit of a formula outside the catalogue that explains more than what
     would have been named. doubt: what tells that something else stands behind what was put in, though nothing else that
-    was tried explains as much.
+    was tried explains as much. caveat: what the records do not show of a form that is named.
     """
 
     verdict: Verdict
@@ -57,6 +57,7 @@ class Judgement:
     experiment: Mapping[str, Any] = field(default_factory=dict)
     instead: Law | None = None
     doubt: str = ""
+    caveat: str = ""
     remainder: Remainder | None = None
 
 
@@ -110,6 +111,9 @@ def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Jud
         against = remains(_names(found), rest)
     if against is not None and sure:
         return _in_doubt(found, labels, against)
+    unseen_of_it = one_way(outcome.refit) if sure else None
+    if unseen_of_it is not None:
+        found = replace(found, caveat=unseen_of_it.why, experiment={"text": unseen_of_it.advice})
     return replace(found, verdict="named" if sure else "ambiguous", text=f"Missing: {names}.")
 
 
@@ -142,7 +146,8 @@ def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
     rest = f"what remains is {left.noise_units:.3g} times the noise" + (
         ", within the tolerance" if left.below_tolerance else ""
     )
-    return f"{' '.join(f.text for f in findings)} {explains} {1.0 - left.share:.1%} of the gap; {rest}."
+    caveat = f" {judgement.caveat[:1].upper()}{judgement.caveat[1:]}." if judgement.caveat else ""
+    return f"{' '.join(f.text for f in findings)} {explains} {1.0 - left.share:.1%} of the gap; {rest}.{caveat}"
 
 
 def _rest(remainder: Remainder) -> str:
@@ -166,8 +171,8 @@ def _class_text(each: Sequence[EffectClass]) -> str:
     """The classes of one effect in words, those that hold 95 % together."""
     told = []
     for c in likely(each):
-        at = list(dict.fromkeys((r.at, r.source) for r, _ in c.members))
-        where = ", or at ".join(listed(places) for places, _ in at[:TOLD])
+        at = list(dict.fromkeys(r.at for r, _ in c.members))
+        where = ", or at ".join(listed(places) for places in at[:TOLD])
         more = f", or at one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
         told.append(f"{' or '.join(c.kinds)} ({c.probability:.0%}) at {where}{more}")
     return "; or ".join(told)
@@ -293,11 +298,16 @@ class Doubt:
 
 
 def doubt(last: Refit, left: Nominal, explained: float) -> Doubt | None:
-    """An objection to the form of the effects in the refit `last`; None where there is none.
+    """Doubt because the experiments ask for different sizes of an effect in the refit `last`; None where they do not.
 
     left: its residuals; explained: by how much chi2 fell, beside which a disagreement is nothing.
     """
-    return _one_way(last) or _varying(last, left, explained)
+    for placed in last.placed:
+        found, label = constancy(last, left, placed), placed.candidate.label
+        if found.p < VARYING_P and found.told > TOLERANCE * explained:
+            why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
+            return Doubt(why, f"The same input in several sizes, in which {label} answers.")
+    return None
 
 
 def remains(names: Sequence[str], left: str) -> Doubt:
@@ -311,8 +321,11 @@ def remains(names: Sequence[str], left: str) -> Doubt:
     return Doubt(left, apart + ". ".join(f"{n}: {effects()[n].excited_by}" for n in each))
 
 
-def _one_way(last: Refit) -> Doubt | None:
-    """Doubt because a play was passed in one direction only: whatever shifts a signal once it has moved does the same."""
+def one_way(last: Refit) -> Doubt | None:
+    """Doubt because a play was passed in one direction only: whatever shifts a signal once it has moved does the same.
+
+    It takes away no name, for nothing that shifts a signal so is among the hypotheses: it is said beside the name.
+    """
     for placed in last.placed:
         width = last.sizes(placed).get(effects()[placed.candidate.effect].reversal)
         if width is None:
@@ -323,7 +336,8 @@ def _one_way(last: Refit) -> Doubt | None:
             continue
         if not any(_turned(u, width) for u in seen):
             return Doubt(
-                f"in no record does the signal at {placed.candidate.at[0]} turn by more than {width:.3g}",
+                f"in no record does the signal at {placed.candidate.at[0]} turn by more than {width:.3g}, so another "
+                "hysteresis may look the same",
                 f"{placed.candidate.effect}: {effects()[placed.candidate.effect].excited_by}.",
             )
     return None
@@ -337,13 +351,3 @@ def _turned(u: Array, width: float) -> bool:
         np.any(np.minimum(np.maximum.accumulate(risen), fallen) > width)
         or np.any(np.minimum(np.maximum.accumulate(fallen), risen) > width)
     )
-
-
-def _varying(last: Refit, left: Nominal, explained: float) -> Doubt | None:
-    """Doubt because the experiments ask for different sizes of an effect."""
-    for placed in last.placed:
-        found, label = constancy(last, left, placed), placed.candidate.label
-        if found.p < VARYING_P and found.told > TOLERANCE * explained:
-            why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
-            return Doubt(why, f"The same input in several sizes, in which {label} answers.")
-    return None

@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from hvdc_ident import InputSignal
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.residual_checks import constancy
-from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt
+from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt, one_way
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -74,7 +74,7 @@ def test_a_signal_has_turned_where_it_goes_back_by_more_than_a_width(course: lis
     assert _turned(-np.array(course, dtype=float), 0.5) == turned
 
 
-def test_a_play_that_is_passed_in_one_direction_is_doubted() -> None:
+def test_of_a_play_that_is_passed_in_one_direction_it_is_said() -> None:
     """In a record that rises only, whatever shifts a signal once it has moved looks like a play."""
     refits = {}
     for name, moves in {"up": [0.6], "both": [0.6, -0.9]}.items():
@@ -85,6 +85,6 @@ def test_a_play_that_is_passed_in_one_direction_is_doubted() -> None:
         there = apply_effects(model(), [{"effect": "backlash", "at": ["ref"], "parameters": {"width": 0.2}}])
         first = plain(answered(there, held, seed=0))
         refits[name] = run(beside(first, "backlash", "ref", {"width": 0.18}, {"width": (1e-3, 1.0)}))
-    against = doubted(refits["up"])
+    against = one_way(refits["up"])
     assert against is not None and "turn by more than 0.2" in against.why and "ramps both ways" in against.advice
-    assert doubted(refits["both"]) is None
+    assert one_way(refits["both"]) is None
