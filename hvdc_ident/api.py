@@ -308,7 +308,7 @@ def sweep(
     elif against not in ("data", "base"):
         against = model_of(against)
     chosen: Any = names_of(want, "quantity") or (swept_names(tables) if tables and parameters is None else None)
-    with _open(executor) as pool, _told(progress) as told:
+    with _open(executor) as pool, _told(progress, "sweep", 1) as told:
         return swept(
             study.model,
             study.experiments,
@@ -356,7 +356,7 @@ def identify(
     both = {"pair": list(names_of(pair, "parameter") or ())} if pair else {}
     study = _asked(study_of(model, data, parameters, identifiability=both), "identify")
     need(study, "identify")
-    with _open(executor) as pool, _told(progress) as told:
+    with _open(executor) as pool, _told(progress, "identify", 2) as told:
         return judged(study, seed=seed, executor=pool, progress=told)
 
 
@@ -399,7 +399,7 @@ def fit(
     from hvdc_ident.study.stages.identify import judged
     from hvdc_ident.text import in_python
 
-    with _open(executor) as pool, _told(progress) as told:
+    with _open(executor) as pool, _told(progress, "fit", 4) as told:
         if isinstance(model, Problem):
             return fit_of(model, seed=seed, executor=pool, progress=told, **settings)
         study = _asked(study_of(model, data, parameters, fit=settings), "fit")
@@ -452,7 +452,7 @@ def diagnose(
     tried = {} if chosen is None else {"effects": "all" if chosen == ("all",) else list(chosen)}
     study = _asked(study_of(model, data, parameters, diagnose={**settings, **tried}), "diagnose")
     need(study, "diagnose")
-    with _open(executor) as pool, _told(progress) as told:
+    with _open(executor) as pool, _told(progress, "diagnose", 3) as told:
         found = report or judged(study, seed=seed, executor=pool, progress=told)
         return diagnosed(study, found.to_dict(), seed=seed, executor=pool, progress=told)
 
@@ -592,12 +592,12 @@ def _open(executor: Workers) -> Iterator[Executor | None]:
 
 
 @contextmanager
-def _told(progress: Progress | bool | None) -> Iterator[Progress | None]:
-    """Open a bar on stderr for True; a function is taken as it is."""
+def _told(progress: Progress | bool | None, verb: str, phases: int) -> Iterator[Progress | None]:
+    """Open a bar on stderr for True; a function is taken as it is. phases: how many things the verb counts, one after the other."""
     if not isinstance(progress, bool):
         yield progress
         return
-    from hvdc_ident.executor import progress_bar
+    from hvdc_ident.executor import StageProgress, progress_bar
 
     with progress_bar(quiet=not progress) as shown:
-        yield shown
+        yield StageProgress(shown, verb, phases)

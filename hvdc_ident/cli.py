@@ -20,11 +20,13 @@ from hvdc_ident.command import (
     Console,
     FitWork,
     FmuFormat,
+    Open,
     Out,
     Seed,
     StudyFile,
     Work,
     command,
+    open_page,
     option,
     pasteable,
     within,
@@ -61,6 +63,7 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for study, data, results and report.")
     ] = Path("hvdc-ident-demo"),
+    open_: Open = False,
     work: Work,
     console: Console,
 ) -> None:
@@ -76,7 +79,9 @@ def demo(
         done = _run_all(study, out, options)
     found = {d.stage.name: d.data for d in done if not d.failed}
     compared = truth_lines(truth, found.get("fit", {}), found.get("diagnose", {}))
-    _tell_run(study, out, done, console, lambda line: pasteable(line, study.path, out, None), truth=compared)
+    _tell_run(
+        study, out, done, console, lambda line: pasteable(line, study.path, out, None), truth=compared, opens=open_
+    )
 
 
 def new(
@@ -162,6 +167,7 @@ def run_(
     *,
     study: StudyFile,
     out: Out = None,
+    open_: Open = False,
     work: Work,
     console: Console,
     access: Access,
@@ -174,7 +180,7 @@ def run_(
     folder = out or loaded.folder
     with console.progress() as progress:
         done = _run_all(loaded, folder, work.options(console, progress))
-    _tell_run(loaded, folder, done, console, lambda line: pasteable(line, study, out, access))
+    _tell_run(loaded, folder, done, console, lambda line: pasteable(line, study, out, access), opens=open_)
 
 
 def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
@@ -183,7 +189,7 @@ def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
 
     done = run_all(study, folder, options)
     write_run(folder, heading_of(study, options.seed), done)
-    options.progress(len(done), len(done) + 1, "report")
+    options.progress(0, 1, "report: writing the page")
     write_report(folder)
     return done
 
@@ -195,10 +201,11 @@ def _tell_run(
     console: Console,
     typed: Callable[[str], str],
     truth: Sequence[str] = (),
+    opens: bool = False,
 ) -> None:
     """Tell how the stages of a run went. typed: returns a line with the commands in it as they are to be typed here.
 
-    truth: lines with the values beside the true ones, in place of the table of values.
+    truth: lines with the values beside the true ones, in place of the table of values. opens: the report, in the browser.
     """
     from hvdc_ident.study.pipeline import heading_of
     from hvdc_ident.study.run_summary import run_lines
@@ -208,6 +215,8 @@ def _tell_run(
     console.print_json({**heading_of(study, seed), "stages": found, "report": "report.html"})
     console.say(*map(typed, run_lines(done, truth)))
     console.say(f"report: {folder / 'report.html'}")
+    if opens:
+        open_page(folder / "report.html")
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:
         raise CommandFailed("; ".join(failures))
@@ -244,7 +253,9 @@ def _stage_command(stage: Stage) -> Callable[..., None]:
     return one_stage
 
 
-def letter(*, study: StudyFile, out: Out = None, work: Work, console: Console, access: Access) -> None:
+def letter(
+    *, study: StudyFile, out: Out = None, open_: Open = False, work: Work, console: Console, access: Access
+) -> None:
     """Write one page for the model's owner. It states what the model misses, why, and what is attached."""
     from hvdc_ident.study.export import letter as write
 
@@ -253,6 +264,8 @@ def letter(*, study: StudyFile, out: Out = None, work: Work, console: Console, a
         page, done = write(loaded, out or loaded.folder, work.options(console, progress))
     console.print_json({"schema": 1, "file": page.as_posix(), "verdict": done.data.get("verdict")})
     console.say(f"letter: {page}")
+    if open_:
+        open_page(page)
 
 
 def report(
@@ -262,6 +275,7 @@ def report(
     ],
     out: Out = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Write report.pdf too; needs the extra 'pdf'.")] = False,
+    open_: Open = False,
     console: Console,
     access: Access,
 ) -> None:
@@ -280,6 +294,8 @@ def report(
         console.say(f"report: {write_pdf(page)}")
     console.print_json({"schema": 1, "report": page.as_posix(), "bytes": page.stat().st_size})
     console.say(f"report: {page}")
+    if open_:
+        open_page(page)
 
 
 def export(

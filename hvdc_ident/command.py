@@ -63,8 +63,23 @@ def echo(text: str, *, err: bool = False) -> None:
     typer.echo(folded(text, shutil.get_terminal_size().columns) if stream.isatty() else text, err=err)
 
 
+def open_page(page: Path) -> None:
+    """Open a page in the browser; where there is none, say on stderr where the page is."""
+    import webbrowser
+
+    address = page.resolve().as_uri()
+    try:
+        if webbrowser.get().open(address):
+            return
+        why = "the browser did not open the page"
+    except webbrowser.Error:
+        why = "no browser was found on this machine"
+    echo(f"--open: {why}. Try: {address} in a browser", err=True)
+
+
 StudyFile = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).", show_default=False)]
 Out = Annotated[Path | None, option("--out", "DIR", "Folder for results; default STUDY-results.")]
+Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
 Budget = Annotated[
     float | None,
     option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from hvdc_ident.errors import ComputationError
+from hvdc_ident.text import duration
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -86,44 +88,158 @@ def silent(done: int, total: int, text: str) -> None:
     """Report no progress."""
 
 
+SCALE = 1000
+"""Parts that a stage's progress is counted in."""
+EVERY = 60.0
+"""Seconds between two lines of progress where there is no terminal for a bar."""
+
+
+class StageProgress:
+    """Progress of a stage as people see it, in thousandths of its time: it never runs backwards, whatever is counted inside.
+
+    A stage counts one thing after the other: starts of a search, sides of profiles. Each is a phase; it begins where the
+    total is another one, or the count falls. The time left is that of the phase at its pace so far, and for each phase that
+    is still to come the mean time of those so far. A line with nothing counted (0 of 1) changes the text alone.
+
+    phases: how many there will be. label: before each text. clock: returns s.
+    """
+
+    def __init__(
+        self, progress: Progress, label: str, phases: int = 1, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._progress, self._label, self._phases, self._clock = progress, label, phases, clock
+        self._begun = self._last = clock()
+        self._finished: list[float] = []
+        self._phase: tuple[float, int, int] | None = None
+        self._reached = 0
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        """Report that so much of a phase is done."""
+        now = self._clock()
+        if total > 1:
+            self._count(done, total, now)
+        self._last = now
+        self._progress(self._reached, SCALE, f"{self._label}: {text}")
+
+    def _count(self, done: int, total: int, now: float) -> None:
+        if self._phase is None or total != self._phase[2] or done < self._phase[1]:
+            if self._phase is not None:
+                self._finished.append(now - self._phase[0])
+            self._phase = (self._last if done else now, done, total)
+        begun = self._phase[0]
+        self._phase = (begun, done, total)
+        share = done / total
+        if not share:
+            return
+        whole = (now - begun) / share
+        to_come = max(0, self._phases - len(self._finished) - 1)
+        left = (1.0 - share) * whole + to_come * (sum(self._finished) + whole) / (len(self._finished) + 1)
+        elapsed = now - self._begun
+        if elapsed + left > 0.0:
+            self._reached = max(self._reached, min(SCALE, round(SCALE * elapsed / (elapsed + left))))
+
+
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Progress]:
-    """Yield the function to report progress to: a bar on stderr once the work has taken a second; with quiet, `silent`."""
+    """Yield the function to report progress to: a bar on stderr once the work has taken a second; with quiet, `silent`.
+
+    Where stderr is no terminal there is a line a minute.
+    """
     if quiet:
         yield silent
         return
-    begun, bar = time.monotonic(), None
-
-    def show(done: int, total: int, text: str) -> None:
-        nonlocal bar
-        if bar is None:
-            if time.monotonic() - begun < PATIENCE:
-                return
-            bar = _opened_bar()
-        bar.update(bar.task_ids[0], completed=done, total=total, description=text)
-
+    bar = _Bar() if sys.stderr.isatty() else _Lines()
     try:
-        yield show
+        yield bar
     finally:
-        if bar is not None:
-            bar.stop()
+        bar.close()
+
+
+class _Lines:
+    """Progress as lines, one a minute at most."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic()
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        if time.monotonic() - self._last >= EVERY:
+            self._last = time.monotonic()
+            print(f"{100 * done // max(total, 1)} %, {text}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """End the lines."""
+
+
+class _Bar:
+    """Progress as a bar that appears once the work has taken a second; another stage begins it anew."""
+
+    def __init__(self) -> None:
+        self._begun = time.monotonic()
+        self._shown: Any = None
+        self._label, self._stage_begun = "", self._begun
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        now, label = time.monotonic(), text.partition(":")[0] if ":" in text else ""
+        if label != self._label:
+            self._label, self._stage_begun = label, now
+        if self._shown is None:
+            if now - self._begun < PATIENCE:
+                return
+            self._shown = _opened_bar()
+        share = done / total if total else 0.0
+        finish = now + (now - self._stage_begun) * (1.0 - share) / share if share else None
+        self._shown.update(
+            self._shown.task_ids[0],
+            completed=done,
+            total=total,
+            description=text,
+            begun=self._stage_begun,
+            finish=finish,
+        )
+
+    def close(self) -> None:
+        """Take the bar off the terminal."""
+        if self._shown is not None:
+            self._shown.stop()
+
+
+def times_of(begun: float, finish: float | None, now: float) -> str:
+    """Return how long a stage has taken and how much longer it takes, as "1:05, about 20 s left". Instants in s."""
+    elapsed = int(now - begun)
+    hours, minutes = divmod(elapsed // 60, 60)
+    shown = f"{hours}:{minutes:02d}:{elapsed % 60:02d}" if hours else f"{minutes}:{elapsed % 60:02d}"
+    if finish is None:
+        return shown
+    left = finish - now
+    return f"{shown}, {'about ' + duration(math.ceil(left)) if left > 1.0 else 'a moment'} left"
 
 
 def _opened_bar() -> Any:
     from rich import progress as rich_progress
     from rich.console import Console
+    from rich.table import Column
+    from rich.text import Text
+
+    class Times(rich_progress.ProgressColumn):
+        """The times of a task, told anew at every refresh."""
+
+        def render(self, task: rich_progress.Task) -> Text:
+            """Return the times of the task."""
+            return Text(times_of(task.fields["begun"], task.fields["finish"], time.monotonic()))
 
     columns = (
-        rich_progress.BarColumn(),
-        rich_progress.MofNCompleteColumn(),
-        rich_progress.TimeElapsedColumn(),
-        rich_progress.TextColumn("left"),
-        rich_progress.TimeRemainingColumn(),
-        rich_progress.TextColumn("{task.description}", markup=False),
+        rich_progress.BarColumn(bar_width=20),
+        rich_progress.TaskProgressColumn(),
+        Times(table_column=Column(no_wrap=True)),
+        rich_progress.TextColumn(
+            "{task.description}", markup=False, table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")
+        ),
     )
     # Lines printed meanwhile go above the bar on a terminal; elsewhere stdout is left alone.
     console = Console(file=sys.stderr)
-    bar = rich_progress.Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty())
-    bar.add_task("", total=None)
+    bar = rich_progress.Progress(
+        *columns, console=console, transient=True, expand=True, redirect_stdout=sys.stdout.isatty()
+    )
+    bar.add_task("", total=None, begun=time.monotonic(), finish=None)
     bar.start()
     return bar

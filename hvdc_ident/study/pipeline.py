@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
+from hvdc_ident.executor import Progress, StageProgress
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.study.checks import steady_notes, violations
 from hvdc_ident.study.executors import open_executor
@@ -75,12 +76,14 @@ def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
     done: dict[str, Done] = {}
     refused: dict[str, InputError] = {}
     rest = _rest_of(study, options)
+    asked = [s for s in stages() if s.wanted(study)]
     with exclusive(folder):
-        for wanted in (s for s in stages() if s.wanted(study)):
+        for number, wanted in enumerate(asked, 1):
+            numbered = replace(options, progress=_numbered(options.progress, number, len(asked)))
             if any(b in refused or (b in done and done[b].failed) for b in wanted.after):
                 continue
             try:
-                done[wanted.name] = _kept_or_run(study, wanted, folder, options, rest)
+                done[wanted.name] = _kept_or_run(study, wanted, folder, numbered, rest)
             except InputError as error:
                 refused[wanted.name] = error
         if refused and all(d.failed for d in done.values()):
@@ -88,6 +91,11 @@ def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
         for name, reason in refused.items():
             done[name] = _written(study, stage(name), folder, options, _failed(reason), rest())
     return [done[s.name] for s in stages() if s.name in done]
+
+
+def _numbered(progress: Progress, number: int, count: int) -> Progress:
+    """Return progress that says before each text which of so many stages it is."""
+    return lambda done, total, text: progress(done, total, f"{number} of {count}, {text}")
 
 
 def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) -> None:
@@ -132,8 +140,9 @@ def _run(
         if _kept(study, wanted, folder, options) is None:
             _written(study, wanted, folder, options, StageResult({"status": FIRST, **first}, failed=FIRST), levels)
 
+    progress = StageProgress(options.progress, wanted.name, wanted.phases(study))
     try:
-        outcome = wanted.run(study, replace(options, folder=folder, keep=keep), earlier)
+        outcome = wanted.run(study, replace(options, folder=folder, keep=keep, progress=progress), earlier)
     except ComputationError as error:
         outcome = _failed(error)
     return _written(study, wanted, folder, options, outcome, levels)

@@ -73,6 +73,11 @@ def no_verdict(data: Mapping[str, Any]) -> str:
     return ""
 
 
+def one_phase(study: Study) -> int:
+    """Return 1, for a stage that counts one thing."""
+    return 1
+
+
 @dataclass(frozen=True)
 class Stage:
     """One stage.
@@ -83,7 +88,8 @@ class Stage:
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON. verdict: the same in one phrase, for the screen of a run. searches: whether it also runs at the start
-    values, where a search begins; all run at the given ones.
+    values, where a search begins; all run at the given ones. phases: how many things it counts, one after the other, as
+    progress.
     """
 
     name: str
@@ -98,6 +104,7 @@ class Stage:
     tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
     verdict: Callable[[Mapping[str, Any]], str] = no_verdict
     searches: bool = False
+    phases: Callable[[Study], int] = one_phase
 
 
 @cache

@@ -209,4 +209,5 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
+    phases=lambda study: 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ())),  # search, profiles
 )
