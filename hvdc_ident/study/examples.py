@@ -22,6 +22,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
+from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
@@ -305,9 +306,10 @@ SIGNALS = {  # name of the recording: set-point of the dc voltage
     "ramp": InputSignal.ramp(0.1, 1.0, 0.4, 1.019),
 }
 
-TEXT = """\
+TEXT = f"""{SCHEMA_LINE}
 # A study: a model, its recordings, and the stages to run. Check it with `hvdc-ident check study.toml`,
 # run it with `hvdc-ident run study.toml`; the report is then study-results/report.html.
+# By the line above, editors that know TOML schemas (Even Better TOML, taplo) complete and check the keys.
 schema = 1
 name = "my-study"
 
@@ -319,25 +321,25 @@ source = "vsc-hvdc-link"          # a shipped model (`hvdc-ident models`), or a 
 # [[model.effect]]                # an effect the plant is known to have (`hvdc-ident effects`)
 # effect = "lag"
 # at = ["Ir1", "Ir2"]
-# parameters = {T = 0.0016}
+# parameters = {{T = 0.0016}}
 
 # The parameters that may be estimated: start value and bounds of the search. All others keep the model's values.
 # given = ... states the vendor's value; if left out, the model's. Results are compared with it, never with start.
 [parameters]
-KPVDC = {start = 20, min = 10, max = 40}
-KIVDC = {start = 650, min = 550, max = 950}
+KPVDC = {{start = 20, min = 10, max = 40}}
+KIVDC = {{start = 650, min = 550, max = 950}}
 
 # One table for each recording. The first column of the file is the time in s.
 [[experiment]]
 name = "step-up"
 data = "step-up.csv"
-inputs = ["Vdcref1"]              # or {Vdcref1 = "column name"}; inputs not listed keep the model's value
-outputs = ["Irorder1"]            # or {Irorder1 = "column name"}
-# noise = {Irorder1 = 1e-4}       # standard deviation; if left out, estimated before the event
+inputs = ["Vdcref1"]              # or {{Vdcref1 = "column name"}}; inputs not listed keep the model's value
+outputs = ["Irorder1"]            # or {{Irorder1 = "column name"}}
+# noise = {{Irorder1 = 1e-4}}       # standard deviation; if left out, estimated before the event
 # event = 0.1                     # s; if left out, found from the inputs
 # window = [0.0, 0.8]             # s: the rows that are compared; if left out, all of them
-# values = {Pref2 = 0.5}          # constant inputs that differ from the model's values
-# columns = {Irorder1 = {name = "I:REG:1", unit = "kA", scale = 5.54}}   # value in the model = scale x recorded
+# values = {{Pref2 = 0.5}}          # constant inputs that differ from the model's values
+# columns = {{Irorder1 = {{name = "I:REG:1", unit = "kA", scale = 5.54}}}}   # value in the model = scale x recorded
 # nuisance = ["time-shift", "Pref2"]   # unknowns of this recording: clock offset, offset of an input
 
 [[experiment]]
@@ -365,6 +367,7 @@ def write_starter(folder: Path) -> Path:
     tables = {name: _recording(name, signal, random) for name, signal in SIGNALS.items()}
     for name, table in tables.items():
         write_text(folder / f"{name}.csv", table)
+    write_schemas(folder)
     return write_text(path, TEXT)
 
 

@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     FiniteFloat,
     StringConstraints,
+    WithJsonSchema,
     model_validator,
 )
 
@@ -91,17 +92,25 @@ def _check_spread(low: float, high: float, scale: str) -> None:
         raise ValueError("a log scale needs min above 0")
 
 
+_TEXT: dict[str, Any] = {"type": "string", "minLength": 1}
+_TEXTS: dict[str, Any] = {"type": "array", "items": _TEXT, "minItems": 1}
+_NAME_OR_NAMES = WithJsonSchema({"anyOf": [_TEXT, _TEXTS]})  # what the validators before the types also take
+
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 FileName = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^\w[\w .+-]*$")]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Names = Annotated[list[Name], Field(min_length=1)]
-NameOrNames = Annotated[Names, BeforeValidator(_as_list)]
-OneOrThree = Annotated[list[Name], BeforeValidator(_one_or_three)]
-Axes = Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2)]
+NameOrNames = Annotated[Names, BeforeValidator(_as_list), _NAME_OR_NAMES]
+OneOrThree = Annotated[list[Name], BeforeValidator(_one_or_three), _NAME_OR_NAMES]
+Axes = Annotated[list[Name], BeforeValidator(_as_list), Field(min_length=1, max_length=2), _NAME_OR_NAMES]
 Three = Annotated[list[Name], Field(min_length=3, max_length=3)]
 Band = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(_rising)]
-Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name)]
+Columns = Annotated[
+    dict[Name, Name],
+    BeforeValidator(_column_by_name),
+    WithJsonSchema({"anyOf": [_TEXTS, {"type": "object", "additionalProperties": _TEXT}]}),
+]
 Interpolation = Literal["hold", "linear"]
 
 
@@ -479,7 +488,11 @@ class FitTable(TomlTable):
     optimiser: Name = "trust-region"
     loss: Name = "linear"
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    whiten: Annotated[Literal["no", "pre-event", "residual"], BeforeValidator(_whitening)] = "no"
+    whiten: Annotated[
+        Literal["no", "pre-event", "residual"],
+        BeforeValidator(_whitening),
+        WithJsonSchema({"enum": ["no", "pre-event", "residual", True, False]}),
+    ] = "no"
     guard: NotNegative = 0.0
     residual: Literal["time", "frequency"] = "time"
     band: Band | None = None

@@ -1,0 +1,144 @@
+"""The JSON Schemas accept what the readers accept, and refuse the keys that they refuse."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from hvdc_ident.errors import InputError
+from hvdc_ident.model.card import parse_card, write_card
+from hvdc_ident.model.check import SECTIONS
+from hvdc_ident.models import load_model, shipped_models
+from hvdc_ident.study import json_schema
+from hvdc_ident.study.examples import write_demo, write_starter
+from hvdc_ident.study.parse import checked
+
+ROOT = Path(__file__).resolve().parents[2]
+BLOCK = re.compile(r"^```toml\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def _shipped() -> tuple[dict[str, str], dict[str, str]]:
+    """The texts of all studies and of all cards that are shipped: files, and whole ones in the pages' blocks."""
+    texts = {
+        str(p.relative_to(ROOT)): p.read_text("utf-8")
+        for p in sorted((ROOT / "studies").rglob("*.toml"))
+        if "-results" not in str(p)
+    }
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        blocks = [b for b in BLOCK.findall(page.read_text("utf-8")) if b.startswith("schema = 1")]
+        texts |= {f"{page.name} block {i}": b for i, b in enumerate(blocks)}
+    texts |= {f"shipped model {n}": write_card(load_model(n)) for n in shipped_models()}  # type: ignore[arg-type]
+    studies = {n: t for n, t in texts.items() if "source" in tomllib.loads(t).get("model", {})}
+    return studies, {n: t for n, t in texts.items() if n not in studies}
+
+
+STUDIES, CARDS = _shipped()
+
+
+VALIDATORS = {n: jsonschema.Draft202012Validator(json.loads(json_schema.schema_text(n))) for n in json_schema.NAMES}
+
+
+def _accepts(name: str, table: dict[str, Any]) -> bool:
+    return VALIDATORS[name].is_valid(table)
+
+
+@pytest.mark.parametrize("name", json_schema.NAMES)
+def test_schemas_are_schemas_that_describe_every_key(name: str) -> None:
+    schema = VALIDATORS[name].schema
+    jsonschema.Draft202012Validator.check_schema(schema)
+    for table in (schema, *schema["$defs"].values()):
+        assert all(p["description"].count("Example: ") == 1 for p in table["properties"].values())
+
+
+def test_every_key_of_the_readers_has_a_text_and_no_other() -> None:
+    texts = json_schema.key_texts("study")
+    tables = {path or "study": table for path, table in json_schema.study_tables().items()}
+    assert {p: {f.alias or n for n, f in t.model_fields.items()} for p, t in tables.items()} == {
+        p: set(keys) for p, keys in texts.items()
+    }
+    texts = json_schema.key_texts("model-card")
+    assert {s: {f.name for f in fields(kind)} for s, (kind, _, _) in SECTIONS.items()} == {
+        s: set(keys) for s, keys in texts.items() if s != "card"
+    }
+    assert set(texts["card"]) == {"schema", "name", "description", *SECTIONS}
+
+
+@pytest.mark.parametrize("kind", ["study", "model-card"])
+def test_examples_of_keys_are_toml_that_names_the_key(kind: str) -> None:
+    for table, keys in json_schema.key_texts(kind).items():
+        for key, text in keys.items():
+            assert set(text) <= {"text", "unit", "example"} and text["text"].endswith("."), (table, key)
+            tomllib.loads(text["example"])
+            assert re.search(rf"\b{re.escape(key)}\b", text["example"]) or table in ("signals", "outputs"), (table, key)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_studies_are_accepted_and_misspelt_keys_refused_as_by_the_reader(name: str) -> None:
+    study = tomllib.loads(STUDIES[name])
+    assert _accepts("study", study)
+    for wrong in _misspelt(study):
+        try:
+            checked(copy.deepcopy(wrong), "study.toml")
+            read = True
+        except InputError:
+            read = False
+        assert _accepts("study", wrong) is read, wrong
+
+
+def test_new_studies_are_accepted_and_name_their_schema(tmp_path: Path) -> None:
+    for path in (write_starter(tmp_path / "new"), write_demo(tmp_path / "demo")):
+        assert _accepts("study", tomllib.loads(path.read_text("utf-8")))
+    first = (tmp_path / "new" / "study.toml").read_text("utf-8").splitlines()[0]
+    named = tmp_path / "new" / first.removeprefix("#:schema ")
+    assert named.read_text("utf-8") == json_schema.schema_text("study")
+    assert (named.parent / "model-card.json").read_text("utf-8") == json_schema.schema_text("model-card")
+
+
+@pytest.mark.parametrize("name", CARDS)
+def test_cards_are_accepted_and_misspelt_keys_refused(name: str) -> None:
+    card = tomllib.loads(CARDS[name])
+    parse_card(CARDS[name])
+    assert _accepts("model-card", card)
+    for key in card:
+        assert not _accepts("model-card", {f"{k}x" if k == key else k: v for k, v in card.items()})
+    for section in SECTIONS:
+        for item, keys in card.get(section, {}).items():
+            for key in keys if isinstance(keys, dict) else ():
+                wrong = copy.deepcopy(card)
+                wrong[section][item][f"{key}x"] = wrong[section][item].pop(key)
+                assert not _accepts("model-card", wrong), (section, item, key)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '[fit]\nstarts = "4"',
+        "[fit]\nguard = -1",
+        '[[sweep]]\nparameter = "K"\nsampling = "grod"',
+        "[diagnose]\nmost = 0",
+    ],
+)
+def test_values_that_the_reader_refuses_are_refused(line: str) -> None:
+    study = tomllib.loads(f'schema = 1\n[model]\nsource = "vsc-hvdc-link"\n{line}\n')
+    with pytest.raises(InputError):
+        checked(copy.deepcopy(study), "study.toml")
+    assert not _accepts("study", study)
+
+
+def _misspelt(table: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The table once with each of its keys, at any depth, misspelt."""
+    for key, value in table.items():
+        yield {f"{k}x" if k == key else k: v for k, v in table.items()}
+        if isinstance(value, dict):
+            yield from ({**table, key: inner} for inner in _misspelt(value))
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            yield from ({**table, key: [inner, *value[1:]]} for inner in _misspelt(value[0]))
