@@ -120,7 +120,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         if n in data["parameters_refitted"] and data["augmented_model"]
     ]
     lines += [f"Parameters, refitted without and with it: {', '.join(moved)}."] if moved else []
-    return [*lines, *data["notes"]]
+    told = "Next: `hvdc-ident letter STUDY` writes one page on this for the model's owner."
+    return [*lines, *data["notes"], *([told] if data["augmented_model"] else [])]
 
 
 def verdict(data: Mapping[str, Any]) -> str:

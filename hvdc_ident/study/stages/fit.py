@@ -143,7 +143,10 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
     lines += _conditions(data)
     lines += response_lines(data.get("responses", ()), "fitted")
-    return lines + _searched(data)
+    lines += _searched(data)
+    if data["estimates"] and not judged.get("next"):
+        lines.append("Next: `hvdc-ident export STUDY --to FILE` writes the model with these values (.fmu, .mo, .toml).")
+    return lines
 
 
 def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:
