@@ -155,7 +155,7 @@ class Answers:
 
     @cached_property
     def errors(self) -> tuple[Errors, ...]:
-        """The errors by set of values, in the order given, fitted, with what is missing."""
+        """The errors by set of values, in the order given, fitted, with the effect."""
         return tuple(self._errors(name) for name in self.rmse)
 
     @property

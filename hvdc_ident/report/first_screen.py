@@ -10,7 +10,7 @@ from hvdc_ident.report.html import badge, estimate, number, percent, rough, shar
 from hvdc_ident.report.overlay import Sheet
 from hvdc_ident.report.results import Results
 
-WORDS = {"given": "given values", "fitted": "fitted", "effect": "with what is missing"}
+WORDS = {"given": "given values", "fitted": "fitted", "effect": "with the effect"}
 PLACES = 4
 """Likely places that are shown of each finding."""
 ROWS = 9

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 STAGES = {"given": "simulation", "fitted": "fit", "effect": "discrepancy"}
 """Sets of values in the order of a page, with the stage whose CSV files hold the runs with them."""
-WORDS = {"given": "given values", "fitted": "fitted", "effect": "with what is missing"}
+WORDS = {"given": "given values", "fitted": "fitted", "effect": "with the effect"}
 STYLES = {"given": (BEFORE, (0, (5, 2))), "fitted": (AFTER, "-"), "effect": (EFFECT, (0, (1.5, 1.2)))}
 SHARE = 0.995
 """Share of the squared error that a figure's span of time holds where it is cut to the disagreement."""

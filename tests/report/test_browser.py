@@ -81,7 +81,7 @@ FOCUS = """() => {
     width: parseFloat(style.outlineWidth), ratio: 1.05 / (0.2126 * r + 0.7152 * g + 0.0722 * b + 0.05),
     seen: box.width > 0 && box.bottom > 0 && box.top < innerHeight };
 }"""
-ELSEWHERE = ("Measured frequency responses", "Global sensitivity")
+ELSEWHERE = ("The truth", "Measured frequency responses", "Global sensitivity")
 """Sections of what this study does not ask for."""
 CONTROLS = "a[href], button, input, summary, select, textarea"
 
@@ -191,9 +191,11 @@ def test_the_measure_finds_faint_text(page: Any) -> None:
 def test_every_control_is_reached_by_tab_and_shows_it(page: Any) -> None:
     unfold(page)
     expected, seen = page.locator(CONTROLS).count(), []
-    for _ in range(expected):
+    while len(seen) < expected:
         page.keyboard.press("Tab")
-        seen.append(page.evaluate(FOCUS))
+        focus = page.evaluate(FOCUS)
+        if focus["tag"] != "DIV":  # a table that is wider than its place, which arrow keys scroll
+            seen.append(focus)
     assert expected >= 5 and {s["tag"] for s in seen} == {"A", "BUTTON", "INPUT", "SUMMARY"}
     assert len({s["name"] for s in seen}) == expected
     for s in seen:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "augmented": "with what is missing"}
+MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "augmented": "with the effect"}
 MOST = 12
 SHOWN = 5e-3
 """A smaller share of the gap is none."""

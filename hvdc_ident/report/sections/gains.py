@@ -44,10 +44,10 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
             ]
         )
     header = ["parameter", "given", "fitted", "95 % interval", "change", "refitted by the diagnosis"]
-    header += ["with what is missing", "95 % interval", "change", "unit"]
+    header += ["with the effect", "95 % interval", "change", "unit"]
     told = (
-        "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With what "
-        "is missing: the same with the finding in the model; these are the values that count.</p>"
+        "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
+        "effect: the same with the finding in the model; these are the values that count.</p>"
     )
     return table(header, rows, words=(0, 9)) + (told if refitted else "") + _notes(fit)
 

@@ -9,7 +9,7 @@ from hvdc_ident.report.answers import Answers
 from hvdc_ident.report.html import folded, number, share, table, text
 from hvdc_ident.report.results import Results, Section
 
-NAMES = {"given": "RMSE, given values", "fitted": "RMSE, fitted", "effect": "RMSE, with what is missing"}
+NAMES = {"given": "RMSE, given values", "fitted": "RMSE, fitted", "effect": "RMSE, with the effect"}
 
 
 def _render(results: Results) -> str:
