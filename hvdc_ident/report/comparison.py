@@ -34,7 +34,9 @@ def comparison_page(
         "Verdicts": _verdicts(data["verdicts"]),
         "What the model lacks": _findings(data["findings"]),
     }
-    body = "\n".join(f"<section>\n<h2>{title}</h2>\n{part}\n</section>" for title, part in parts.items() if part)
+    body = "\n".join(
+        f"<section class='tile'>\n<h2>{title}</h2>\n{part}\n</section>" for title, part in parts.items() if part
+    )
     names = [str(r["study"]) for r in runs]
     title = f"{names[0]} and {names[1]}" if names[0] != names[1] else f"{names[0]}, twice"
     return document(title, "two results side by side", body)

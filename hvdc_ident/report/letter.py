@@ -60,7 +60,7 @@ def write_letter(folder: Path) -> Path:
     heading = results.get(STAGE) or results.heading
     title = f"Model {heading.get('model', '')}: what the recordings say"
     letter = letter_of(results)
-    return write_text(folder / FILE, document(title, letter_body(letter)))
+    return write_text(folder / FILE, document(title, text(str(heading.get("study", ""))), letter_body(letter)))
 
 
 def _missed(results: Results, found: dict[str, Any]) -> str:

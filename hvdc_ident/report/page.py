@@ -41,23 +41,21 @@ def page(folder: Path) -> str:
     parts = [(s, body) for s in sections() if (body := s.render(results))]
     contents = "".join(f"<li><a href='#{_anchor(s)}'>{text(s.title)}</a></li>" for s, _ in parts)
     folds = "\n".join(_folded(s, body, opened=not first) for s, body in parts)
-    body = (
-        f"{_header(results)}\n{first}\n<nav aria-label='Contents'><h2>Contents</h2><ol>{contents}</ol></nav>\n{folds}"
-    )
+    body = f"{first}\n<nav aria-label='Contents'><h2>Contents</h2><ol>{contents}</ol></nav>\n{folds}"
     # The first file read is the study's, and the page's reader stands beside it as well as anywhere.
     body = with_study(body, text(next(iter(results.heading.get("sources") or {}), "STUDY")))
-    return document(f"Study {results.heading.get('study', '')}", body)
+    return document(f"Study {results.heading.get('study', '')}", _compared(results), body)
 
 
-def _header(results: Results) -> str:
-    """The title, and what was compared with what."""
+def _compared(results: Results) -> str:
+    """What was compared with what, as HTML."""
     heading, experiments = results.heading, results.experiments
     held_out = sum(1 for e in experiments.values() if e.get("role") == "holdout")
     kept = f", {held_out} of them held out" if held_out else ""
     words = [f"model <strong>{text(heading.get('model', ''))}</strong>"]
     words += [f"{len(experiments)} recording{'s' if len(experiments) > 1 else ''}{kept}"] if experiments else []
     words += [text(heading.get("software", ""))]
-    return f"<header><h1>Study {text(heading.get('study', ''))}</h1><p>{' · '.join(words)}</p></header>"
+    return " · ".join(words)
 
 
 def _anchor(section: Section) -> str:
@@ -72,13 +70,14 @@ def _folded(section: Section, body: str, *, opened: bool) -> str:
     return f"<details class='{kind}'{state}>{heading}\n<div id='{_anchor(section)}'>{body}</div></details>"
 
 
-def document(title: str, body: str) -> str:
-    """Return a whole page of a title and a body of HTML, its figures numbered, with the script and the policy that it needs."""
+def document(title: str, subtitle: str, body: str) -> str:
+    """Return a whole page with its figures numbered, and the script and the policy that it needs. subtitle, body: HTML."""
     numbers = count(1)
     body = re.sub("<figcaption>", lambda _: f"<figcaption><b>Figure {next(numbers)}.</b> ", body)
     code, allowed = script(body)
     return _template().render(
         title=title,
+        subtitle=Markup(subtitle),
         policy=Markup("; ".join(part for part in (POLICY, allowed) if part)),
         style=Markup(asset("page.css")),
         body=Markup(body),
