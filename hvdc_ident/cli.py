@@ -26,6 +26,8 @@ from hvdc_ident.command import (
     StudyFile,
     Work,
     command,
+    echo,
+    open_address,
     open_page,
     option,
     pasteable,
@@ -298,34 +300,6 @@ def report(
         open_page(page)
 
 
-def compare(
-    *,
-    first: Annotated[
-        Path, typer.Argument(metavar="RUN", help="A folder of results, or a study with results.", show_default=False)
-    ],
-    second: Annotated[Path, typer.Argument(metavar="RUN", help="The other one.", show_default=False)],
-    out: Annotated[Path | None, option("--out", "DIR", "Folder to write the page compare.html into.")] = None,
-    open_: Open = False,
-    console: Console,
-) -> None:
-    """Compare two results: values and how far apart they are, gaps, verdicts, findings, inputs."""
-    from hvdc_ident.files import write_text
-    from hvdc_ident.study.comparison import compare_runs
-
-    if open_ and out is None:
-        raise InputError(
-            "--open has no page to open", where="the command line", hint="--out DIR, which writes the page"
-        )
-    found = compare_runs(first, second)
-    console.print_json(found.to_dict())
-    console.say(*found.lines)
-    if out is not None:
-        page = write_text(out / "compare.html", found.page)
-        console.say(f"page: {page}")
-        if open_:
-            open_page(page)
-
-
 def export(
     *,
     study: StudyFile,
@@ -452,15 +426,43 @@ def _catalogue(kind: str, lines: dict[str, str], console: Console) -> None:
         typer.echo(f"{name:<{width}}  {text}")
 
 
+def workbench(
+    *,
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="STUDY|MODEL",
+            help="A study, a shipped model, a card or an FMU; default vsc-hvdc-link.",
+            show_default=False,
+        ),
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", metavar="N", help="Port to listen at; 0 is any that is free.", min=0, max=65535)
+    ] = 0,
+    host: Annotated[str, option("--host", "NAME", "Address to listen at.", show_default=True)] = "127.0.0.1",
+    quiet_browser: Annotated[bool, typer.Option("--no-open", help="Print the address, and open no browser.")] = False,
+    trust: Annotated[bool, typer.Option("--trust", help="Run the code of a model that is a Python file.")] = False,
+) -> None:
+    """Open the workbench in the browser, where a model answers while a slider moves. Ctrl-C ends it."""
+    from hvdc_ident.app import serve
+
+    def ready(address: str) -> None:
+        echo(f"workbench: {address}\nCtrl-C ends it.")
+        if not quiet_browser:
+            open_address(address)
+
+    serve(source, host=host, port=port, trust=trust, ready=ready)
+
+
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "new": new,
     "check": check,
     "run": run_,
     **{stage.name: _stage_command(stage) for stage in stages()},
+    "app": workbench,
     "letter": letter,
     "report": report,
-    "compare": compare,
     "export": export,
     "convert": convert,
     "models": models,

@@ -65,9 +65,13 @@ def echo(text: str, *, err: bool = False) -> None:
 
 def open_page(page: Path) -> None:
     """Open a page in the browser; where there is none, say on stderr where the page is."""
+    open_address(page.resolve().as_uri())
+
+
+def open_address(address: str) -> None:
+    """Open an address in the browser; where there is none, say so on stderr."""
     import webbrowser
 
-    address = page.resolve().as_uri()
     try:
         if webbrowser.get().open(address):
             return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 import tomllib
 import types
 import typing
@@ -78,13 +77,12 @@ def checked(table: dict[str, Any], where: str) -> StudyFile:
 
 def _refuse_other_kinds(path: Path) -> None:
     """Raise StudyError for an FMU and for a file of waveforms; a *.txt is one where its signals can be listed."""
-    ending, typed = path.suffix.lower(), shlex.quote(str(path))
+    ending = path.suffix.lower()
     if ending == ".fmu":
-        what, hint = "an FMU", f"`hvdc-ident check {typed}` lists its variables; a study names it in [model] source"
+        what, hint = "an FMU", f"`hvdc-ident check {path.name}` lists its variables; a study names it in [model] source"
     elif any(ending in f.SUFFIXES for f in formats().values()) and (ending != ".txt" or _lists_signals(path)):
-        convert = f"`hvdc-ident convert {typed} --list ''` lists its signals"
-        made = f"`hvdc-ident new DIR --from {typed} --model MODEL` writes a study of it"
-        what, hint = "a file of waveforms", f"{convert}; {made}"
+        convert = f"`hvdc-ident convert {path.name} --list ''` lists its signals"
+        what, hint = "a file of waveforms", f"{convert}; a study names it in data of an [[experiment]]"
     else:
         return
     raise StudyError(
@@ -144,11 +142,11 @@ def _first(error: ValidationError, table: dict[str, Any], where: str) -> StudyEr
         what = "a value that does not fit" if kind == "finite_number" else "a value of the wrong kind"
         return StudyError(what, where=place, expected=EXPECTED[kind], got=got)
     if kind == "value_error":
-        text, _, hint = str(problem["ctx"]["error"]).partition(". Try: ")
+        text = str(problem["ctx"]["error"])
         key, _, rest = text.partition(": ")
         if rest and key.isidentifier() and key != loc[-1]:
-            return StudyError(rest, where=f"{place}.{key}" if loc else f"{where}, {key}", hint=hint)
-        return StudyError(rest if key == loc[-1] else text, where=place, hint=hint)
+            return StudyError(rest, where=f"{place}.{key}" if loc else f"{where}, {key}")
+        return StudyError(rest if key == loc[-1] else text, where=place)
     expected, got = _wanted(kind, problem.get("ctx", {}), got)
     return StudyError("a value that does not fit", where=place, expected=expected, got=got)
 

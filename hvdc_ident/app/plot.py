@@ -1,0 +1,103 @@
+"""Curves on the page: grids with one abscissa and one cursor, drawn on canvas by uPlot, whose files come with the package.
+
+Single columns of numbers are replaced, not figures: one curve of a thousand points takes a millisecond, where a whole
+figure of ECharts or plotly takes ten and more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from nicegui import ui
+
+from hvdc_ident.data import Array
+
+NOW, GIVEN, RECORDED = "#2f7ed8", "#8a8f98", "#d9822b"
+"""Colours, each of a contrast of 3 and more on the white and on the dark page."""
+MOST = 4000
+"""Rows that are drawn as they are: a screen has fewer columns than half of them."""
+ASSETS = Path(__file__).parent / "static" / "uplot"
+HEAD = """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
+<style>.plot .u-legend { font: 11px system-ui, sans-serif; margin: 0; text-align: left; padding-left: 58px; }
+.plot .u-legend th { font-weight: 400; } .plot .u-legend .u-marker { border-width: 2px; width: .8em; height: .8em; }
+.plot .u-legend .u-series > * { padding: 0 2px; } .plot .u-value { min-width: 5.5em; }</style>"""
+"""What a page with plots has in its head; the server offers the folder `ASSETS` as /assets."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One curve of a grid. mark: drawn as points, not as a line."""
+
+    name: str
+    color: str
+    dashed: bool = False
+    mark: Literal["", "dot", "ring", "cross"] = ""
+    size: int = 7
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One picture of a plot: its ordinate's title, with the unit, and its curves."""
+
+    title: str
+    curves: tuple[Curve, ...]
+
+
+class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
+    """Grids one above the other. log: of the abscissa. plane: both axes are looked into, by dragging a rectangle."""
+
+    def __init__(
+        self, grids: Sequence[Grid], x_title: str, height: int, label: str, *, log: bool = False, plane: bool = False
+    ) -> None:
+        """Build the plot without data. height: px. label: what is shown, for those who cannot see it."""
+        super().__init__()
+        self._props.update(
+            grids=[asdict(g) for g in grids], xtitle=x_title, height=height, label=label, log=log, plane=plane
+        )
+
+    def put(self, grid: int, column: int, values: Array) -> None:
+        """Replace the values of one column (0: the abscissa) of a grid: (n,), thinned as the others were."""
+        self.run_method("put", grid, column, _short(values))
+
+    def whole(self, grid: int, columns: Sequence[Array]) -> None:
+        """Replace all columns of a grid, the abscissa first: (n,) each."""
+        self.run_method("whole", grid, [_short(c) for c in columns])
+
+
+def _short(values: Array) -> list[float | None]:
+    """Return the values in half the digits, which is more than a screen shows; None where there is no number."""
+    short = values.astype(np.float32).tolist()
+    return short if np.isfinite(values).all() else [v if np.isfinite(v) else None for v in short]
+
+
+def thinned(x: Array, *ys: Array) -> list[Array]:
+    """Return x and curves over it as they are drawn, (n,) each: of every stretch of many rows the least and the largest value.
+
+    No peak is lost. x: rising.
+    """
+    if x.size <= MOST:
+        return [x, *ys]
+    edges = np.linspace(0, x.size, MOST // 2 + 1).astype(int)[:-1]
+    middle = (edges + np.append(edges[1:], x.size)) // 2
+    drawn = [np.column_stack([x[edges], x[middle]]).ravel()]
+    for y in ys:
+        drawn.append(np.column_stack([np.fmin.reduceat(y, edges), np.fmax.reduceat(y, edges)]).ravel())
+    return drawn
+
+
+def scattered(*sets: Array) -> list[Array]:
+    """Return complex numbers of several sets as columns of a plane: the real parts, rising, then by set the imaginary parts.
+
+    Where a set has no point it is nan.
+    """
+    x = np.concatenate([s.real for s in sets])
+    columns = []
+    for k in range(len(sets)):
+        own = np.concatenate([s.imag if n == k else np.full(s.size, np.nan) for n, s in enumerate(sets)])
+        columns.append(own)
+    order = np.argsort(x, kind="stable")
+    return [x[order], *(c[order] for c in columns)]

@@ -1,0 +1,121 @@
+"""The workbench's server: on this machine alone, at an address with a token, until Ctrl-C."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import secrets
+import socket
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+
+from hvdc_ident.app.desk import Desk, opened
+from hvdc_ident.app.guard import LOOPBACK, Guard
+from hvdc_ident.errors import InputError
+
+
+@dataclass(frozen=True)
+class Tab:
+    """A tab of the page: its place in the order, its title, and a function that builds it for a desk inside NiceGUI's context."""
+
+    order: int
+    title: str
+    build: Callable[[Desk], None]
+
+
+def serve(
+    source: str | None = None,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    trust: bool = False,
+    ready: Callable[[str], None] = print,
+) -> None:
+    """Serve the workbench until it is interrupted.
+
+    source: a study file, a shipped model, a card or an FMU (default: the phasor link). port: 0 for any that is free. trust:
+    whether a model that is Python code may be run. ready: called with the address, token included, when the server listens.
+
+    Raises InputError for a source that cannot be opened, a port that is taken, and where the extra `app` is not installed.
+    """
+    desk = opened(source, trust=trust)
+    with tempfile.TemporaryDirectory() as folder:
+        # The framework keeps files of its own in the working folder otherwise; the workbench has nothing for them.
+        os.environ.setdefault("NICEGUI_STORAGE_PATH", folder)
+        try:
+            import uvicorn
+            from fastapi import FastAPI
+            from fastapi.staticfiles import StaticFiles
+            from nicegui import ui
+
+            from hvdc_ident.app.plot import ASSETS
+        except ImportError as error:
+            raise InputError(
+                "the workbench's framework is not installed",
+                where="hvdc-ident app",
+                got=str(error),
+                hint="pip install 'hvdc_ident[app]'",
+            ) from None
+        listening = _listening(host, port)
+        token = secrets.token_urlsafe(24)
+        outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+        outer.mount("/assets", StaticFiles(directory=ASSETS))
+        ui.run_with(
+            outer, root=lambda: _page(desk), title=f"{desk.title} · hvdc-ident", dark=None, show_welcome_message=False
+        )
+        here = (*LOOPBACK, host)
+        server = uvicorn.Server(
+            uvicorn.Config(Guard(outer, token, here), log_level="warning", timeout_graceful_shutdown=1)
+        )
+        ready(f"http://{host}:{listening.getsockname()[1]}/?token={token}")
+        with suppress(KeyboardInterrupt):  # the way in which it is meant to end
+            server.run(sockets=[listening])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    found = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((host, port))
+        found.listen()  # who opens the address at once waits, and is not refused
+    except OSError as error:
+        found.close()
+        raise InputError(
+            "the server cannot listen there",
+            where=f"{host}, port {port}",
+            got=error.strerror or str(error),
+            hint="--port 0 takes any that is free",
+        ) from None
+    return found
+
+
+@cache
+def tabs() -> tuple[Tab, ...]:
+    """Return every tab, in order, found by walking `tabs/`."""
+    from hvdc_ident.app import tabs as folder
+
+    found = [importlib.import_module(f"{folder.__name__}.{m.name}").TAB for m in pkgutil.iter_modules(folder.__path__)]
+    return tuple(sorted(found, key=lambda t: t.order))
+
+
+def _page(desk: Desk) -> None:
+    """Build the page for a browser that has come."""
+    from nicegui import ui
+
+    from hvdc_ident.app.plot import HEAD
+
+    ui.add_head_html(HEAD)
+    ui.colors(primary="#1f5fa8")
+    with ui.header().classes("items-center q-py-none"):
+        ui.label(desk.title).classes("text-subtitle1 text-bold")
+        with ui.tabs().props("dense") as bar:
+            for tab in tabs():
+                ui.tab(tab.title)
+    with ui.tab_panels(bar, value=tabs()[0].title).classes("w-full"):
+        for tab in tabs():
+            with ui.tab_panel(tab.title).classes("q-pa-sm"):
+                tab.build(desk)

@@ -1,0 +1,163 @@
+"""Settings of the workbench, as values: a model with numbers, courses of its inputs, and what is looked at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+import hvdc_ident as hi
+from hvdc_ident.data import Array, Experiment, SignalLike
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize import LinearModel
+from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.simulate import Simulation
+
+Kind = Literal["constant", "step", "ramp", "multisine"]
+KINDS: tuple[Kind, ...] = ("constant", "step", "ramp", "multisine")
+
+
+@dataclass(frozen=True)
+class Course:
+    """An input over time. level: before the event; size: by how much it moves (of a multisine its amplitude), both in the
+    input's unit; at: the event, s; length: of a ramp, s, and of a multisine its longest period."""
+
+    kind: Kind = "constant"
+    level: float = 0.0
+    size: float = 0.0
+    at: float = 0.1
+    length: float = 0.2
+
+    def signal(self, end: float) -> SignalLike:
+        """Return the signal up to an end, s, for `hvdc_ident.simulate`."""
+        if self.kind == "step":
+            return hi.step(self.level, self.level + self.size, at=self.at)
+        if self.kind == "ramp":
+            return hi.ramp(self.level, self.level + self.size, start=self.at, end=self.at + max(self.length, 1e-9))
+        if self.kind == "multisine":
+            tones = [k / self.length for k in (1, 2, 5, 10)]
+            return hi.multisine(self.level, self.size, tones, start=self.at, end=end)
+        return self.level
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the tab Explore shows the answers of.
+
+    model: with effects, if any. values: of its parameters, where they differ from the model's, in their units. courses: of
+    its inputs. end: of the run, s, with so many rows. outputs: whose waveforms are shown. channel: input and output of the
+    frequency response. opened: the signal at which the loop is opened for it instead; "" for none. record: an experiment of
+    the study in place of the courses.
+    """
+
+    model: AnyModel
+    values: FrozenMap[float] = field(default_factory=FrozenMap)
+    courses: FrozenMap[Course] = field(default_factory=FrozenMap)
+    end: float = 1.0
+    rows: int = 1001
+    outputs: tuple[str, ...] = ()
+    channel: tuple[str, str] = ("", "")
+    opened: str = ""
+    record: Experiment | None = None
+
+    @classmethod
+    def of(cls, model: AnyModel, record: Experiment | None = None) -> Setting:
+        """Return the setting that a model begins with: a step of its first input by 2 % of its level, or of 0.02."""
+        inputs = {n: Course(level=i.value) for n, i in model.inputs.items()}
+        first = next(iter(inputs), "")
+        if first:
+            inputs[first] = replace(inputs[first], kind="step", size=0.02 * (abs(inputs[first].level) or 1.0))
+        outputs = tuple(record.outputs if record else model.outputs)
+        end = float(record.time[-1]) if record else 1.0
+        return cls(
+            model, courses=FrozenMap(inputs), end=end, outputs=outputs[:3], channel=(first, outputs[0]), record=record
+        )
+
+    @property
+    def time(self) -> Array:
+        """The instants of the run, (rows,), s."""
+        return self.record.time if self.record else np.linspace(0.0, self.end, self.rows)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The values of all parameters."""
+        return {**self.model.values, **self.values}
+
+    def recorded(self, output: str) -> Array:
+        """Return what the record has of an output, (rows,); nan where it has nothing."""
+        if self.record is None or self.record.measured is None or output not in self.record.outputs:
+            return np.full(self.time.size, np.nan)
+        return self.record.measured[output]
+
+    def with_value(self, name: str, value: float) -> Setting:
+        """Return the setting with another value of a parameter."""
+        return replace(self, values=self.values | {name: value})
+
+    def with_course(self, name: str, course: Course) -> Setting:
+        """Return the setting with another course of an input."""
+        return replace(self, courses=self.courses | {name: course})
+
+    def run(self, sensitivities: tuple[str, ...] = ()) -> Simulation:
+        """Return the waveforms of the chosen outputs. Raises as `hvdc_ident.simulate`."""
+        own = {n: v for n, v in self.values.items() if n in self.model.parameters}
+        if self.record is not None:
+            return hi.simulate(self.model, self.record, own, sensitivities, outputs=self.outputs)
+        signals = {n: c.signal(self.end) for n, c in self.courses.items()}
+        return hi.simulate(self.model, self.time, own, sensitivities, inputs=signals, outputs=self.outputs)
+
+    def point(self) -> hi.OperatingPoint:
+        """Return the operating point of the inputs before any event. Raises as `hvdc_ident.find_operating_point`."""
+        levels = {n: c.level for n, c in self.courses.items()}
+        if self.record is not None:
+            levels |= {n: float(s(float(self.time[0]))) for n, s in self.record.inputs.items()}
+        own = {n: v for n, v in self.values.items() if n in self.model.parameters}
+        return hi.find_operating_point(self.model, levels, parameters=own)
+
+    def linear(self, point: hi.OperatingPoint) -> LinearModel:
+        """Return the linear model of the chosen channel, or of the opened loop. Raises as `hvdc_ident.linearize` and `loop`."""
+        if self.opened and isinstance(self.model, Model):
+            return hi.loop(self.model, self.opened, point).open
+        return hi.linearize(self.model, point, inputs=self.channel[0], outputs=self.channel[1])
+
+    def margins(self, point: hi.OperatingPoint) -> str:
+        """Return the margins of the opened loop in words; "" where none is opened."""
+        return str(hi.margins(self.linear(point))) if self.opened else ""
+
+    def poles(self, point: hi.OperatingPoint) -> Array:
+        """Return the poles of the closed model, (n,), rad/s."""
+        return hi.linearize(self.model, point, inputs=self.channel[0], outputs=self.channel[1]).poles()
+
+
+def with_effect(setting: Setting, use: Mapping[str, object]) -> Setting:
+    """Return the setting whose model has one more effect; its sizes are parameters from then on.
+
+    use: as `hvdc_ident.apply_effects` takes it. Raises ModelError or UnknownNameError for one that does not fit.
+    """
+    return replace(setting, model=hi.apply_effects(setting.model, [dict(use)]))
+
+
+def span_of(model: AnyModel, name: str, stated: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Return the ends of a parameter's slider: as a study states them, else the model's bounds, else a factor of 5 about its value."""
+    if name in stated:
+        return stated[name]
+    q = model.parameters[name]
+    value = q.value
+    low, high = sorted((value / 5.0, value * 5.0)) if value else (-1.0, 1.0)
+    low = q.min if math.isfinite(q.min) and (q.min > low or not value) else low
+    high = q.max if math.isfinite(q.max) and (q.max < high or not value) else high
+    return (low, high) if low < high else (value - 1.0, value + 1.0)
+
+
+def equations_of(model: AnyModel) -> Model | None:
+    """Return the model where it has equations, so that a loop can be opened and poles followed; None for an FMU."""
+    return model if isinstance(model, Model) else None
+
+
+def near(poles: Array) -> Array:
+    """Return the poles that a picture shows: those within 30 times the slowest; faster ones would press them into a line."""
+    sizes = np.abs(poles)
+    slowest = np.min(sizes, where=sizes > 0, initial=np.inf)
+    return np.asarray(poles[sizes <= 30.0 * slowest])

@@ -1,0 +1,88 @@
+"""What the tab Explore asks of the package, against the same asked by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hvdc_ident as hi
+from hvdc_ident.app.desk import opened
+from hvdc_ident.app.setting import Course, Setting, near, span_of, with_effect
+from hvdc_ident.errors import InputError
+
+LINK = hi.load_model("vsc-hvdc-link")
+
+
+def test_a_setting_runs_the_model_with_its_values_and_courses() -> None:
+    setting = Setting.of(LINK).with_value("KIVDC", 900.0).with_course("Pref2", Course("ramp", 0.4, 0.1, 0.2, 0.3))
+    ran = setting.run()
+    steps = {"Vdcref1": hi.step(1.0, 1.02, at=0.1), "Pref2": hi.ramp(0.4, 0.5, start=0.2, end=0.5)}
+    expected = hi.simulate(LINK, np.linspace(0.0, 1.0, 1001), {"KIVDC": 900.0}, inputs=steps)
+    for name in setting.outputs:
+        np.testing.assert_allclose(ran[name], expected[name], rtol=1e-9, atol=1e-12)
+
+
+def test_the_linear_model_stands_at_the_levels_before_the_event() -> None:
+    setting = Setting.of(LINK).with_course("Pref2", Course("step", 0.5, 0.2)).with_value("KPVDC", 30.0)
+    point = setting.point()
+    assert point.outputs["P2"] == pytest.approx(0.5, abs=1e-9)
+    expected = hi.linearize(LINK, hi.find_operating_point(LINK, {"Pref2": 0.5}, parameters={"KPVDC": 30.0}))
+    np.testing.assert_allclose(np.sort_complex(setting.poles(point)), np.sort_complex(expected.poles()), rtol=1e-8)
+
+
+def test_the_margins_are_those_of_the_opened_loop() -> None:
+    setting = Setting.of(LINK)
+    assert setting.margins(setting.point()) == ""
+    opened_at = replace(setting, opened="Irorder1")
+    assert opened_at.margins(setting.point()) == str(hi.margins(hi.loop(LINK, "Irorder1", setting.point())))
+
+
+def test_an_effect_brings_its_size_as_a_parameter() -> None:
+    setting = with_effect(Setting.of(LINK), {"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}})
+    (name,) = set(setting.model.parameters) - set(LINK.parameters)
+    slower = setting.with_value(name, 0.05)
+    change = [np.abs(s.run()["Irorder1"] - Setting.of(LINK).run()["Irorder1"]).max() for s in (setting, slower)]
+    assert 0 < change[0] < change[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "stated", "expected"),
+    [("KIVDC", {}, (146.94, 3673.5)), ("KPQ", {}, (-1.0, 1.0)), ("KIVDC", {"KIVDC": (250.0, 1500.0)}, (250.0, 1500.0))],
+)
+def test_a_slider_spans_what_the_study_states_or_a_factor_of_five(
+    name: str, stated: dict[str, tuple[float, float]], expected: tuple[float, float]
+) -> None:
+    low, high = span_of(LINK, name, stated)
+    if name == "KPQ":  # 0 with a lower bound of 0
+        assert (low, high) == (0.0, 1.0)
+    else:
+        assert (low, high) == pytest.approx(expected)
+
+
+def test_poles_far_from_the_slowest_are_left_out_of_the_picture() -> None:
+    poles = np.array([-1.0, -2.0 + 3.0j, -2.0 - 3.0j, -4e4, 0.0])
+    assert near(poles).tolist() == [-1.0, -2.0 + 3.0j, -2.0 - 3.0j, 0.0]
+    assert near(np.empty(0, complex)).size == 0
+
+
+def test_a_card_a_study_and_a_shipped_model_are_opened(tmp_path: Path) -> None:
+    card = tmp_path / "motor.toml"
+    card.write_text(
+        'schema = 1\nname = "motor"\n[parameters]\nb = {value = 0.5}\n[inputs]\nv = {value = 0.0}\n[states]\nw = {derivative = "v - b*w"}\n'
+        '[outputs]\nw = "w"\n',
+        "utf-8",
+    )
+    assert list(opened(str(card)).model.parameters) == ["b"] and opened(str(card)).study is None
+    assert opened().model.name == "vsc-hvdc-link" and opened("vsc-hvdc-avm").model.name == "vsc-hvdc-avm"
+    study = tmp_path / "study.toml"
+    study.write_text(
+        f'schema = 1\nname = "s"\n[model]\nsource = "{card.name}"\n[parameters]\nb = {{start = 0.4, min = 0.1, max = 2}}\n',
+        "utf-8",
+    )
+    desk = opened(str(study))
+    assert desk.study is not None and desk.spans["b"] == (0.1, 2.0)
+    with pytest.raises(InputError):
+        opened(str(tmp_path / "nothing.toml"))
