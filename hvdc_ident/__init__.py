@@ -7,6 +7,7 @@
     hi.sweep        errors over a range of parameters            hi.sensitivities   exact derivatives of everything
     hi.identify     what the data tell about the parameters      hi.fit         the estimates, with intervals
     hi.diagnose     what the model lacks                         hi.export      to an FMU, Modelica, MATLAB, CSV
+    hi.compare_runs two results side by side
 
 Each takes a model (`hi.Model`, a shipped name, a path), data (`hi.Experiment`, a table, a study) or a whole study.
 """
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
     from hvdc_ident.parameters import Input, Parameter
     from hvdc_ident.sensitivity import SweepResult, linear_sensitivities, morris, sobol
     from hvdc_ident.simulate import Simulation
+    from hvdc_ident.study.comparison import RunComparison, compare_runs
     from hvdc_ident.study.study import Study, load_study
 
     __version__: str
@@ -88,6 +90,7 @@ __all__ = [
     "OperatingPoint",
     "Parameter",
     "Port",
+    "RunComparison",
     "Simulation",
     "Study",
     "SweepResult",
@@ -98,6 +101,7 @@ __all__ = [
     "bode",
     "check",
     "compare",
+    "compare_runs",
     "continuation",
     "diagnose",
     "export",
@@ -156,6 +160,7 @@ _imported = offered(
         "parameters": "Input Parameter",
         "sensitivity": "SweepResult linear_sensitivities morris sobol",
         "simulate": "Simulation",
+        "study.comparison": "RunComparison compare_runs",
         "study.study": "Study load_study",
     },
 )

@@ -300,6 +300,34 @@ def report(
         open_page(page)
 
 
+def compare(
+    *,
+    first: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A folder of results, or a study with results.", show_default=False)
+    ],
+    second: Annotated[Path, typer.Argument(metavar="RUN", help="The other one.", show_default=False)],
+    out: Annotated[Path | None, option("--out", "DIR", "Folder to write the page compare.html into.")] = None,
+    open_: Open = False,
+    console: Console,
+) -> None:
+    """Compare two results: values and how far apart they are, gaps, verdicts, findings, inputs."""
+    from hvdc_ident.files import write_text
+    from hvdc_ident.study.comparison import compare_runs
+
+    if open_ and out is None:
+        raise InputError(
+            "--open has no page to open", where="the command line", hint="--out DIR, which writes the page"
+        )
+    found = compare_runs(first, second)
+    console.print_json(found.to_dict())
+    console.say(*found.lines)
+    if out is not None:
+        page = write_text(out / "compare.html", found.page)
+        console.say(f"page: {page}")
+        if open_:
+            open_page(page)
+
+
 def export(
     *,
     study: StudyFile,
@@ -463,6 +491,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "app": workbench,
     "letter": letter,
     "report": report,
+    "compare": compare,
     "export": export,
     "convert": convert,
     "models": models,

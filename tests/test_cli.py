@@ -354,10 +354,14 @@ def test_a_refused_option_says_why_and_what_to_try(study: Path, words: tuple[str
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("step.csv", "time,u\n0,1\n1,2\n", ("a file of waveforms, not a study", "hvdc-ident convert step.csv --list")),
-        ("step.txt", "time u\n0 1\n1 2\n", ("a file of waveforms, not a study", "hvdc-ident convert step.txt --list")),
-        ("step.mat", "\0\1\2", ("a file of waveforms, not a study", "hvdc-ident convert step.mat --list")),
-        ("plant.fmu", "PK", ("this is an FMU, not a study", "hvdc-ident check plant.fmu")),
+        ("step.csv", "time,u\n0,1\n1,2\n", ("a file of waveforms, not a study", "hvdc-ident convert {} --list")),
+        (
+            "step.txt",
+            "time u\n0 1\n1 2\n",
+            ("a file of waveforms, not a study", "hvdc-ident new DIR --from {} --model"),
+        ),
+        ("step.mat", "\0\1\2", ("a file of waveforms, not a study", "hvdc-ident convert {} --list")),
+        ("plant.fmu", "PK", ("this is an FMU, not a study", "hvdc-ident check {}`")),
         ("study.txt", "[model", ("not valid TOML", "hvdc-ident new DIR")),
     ],
 )
@@ -366,7 +370,21 @@ def test_a_file_that_is_no_study_is_called_by_its_kind(
 ) -> None:
     (tmp_path / name).write_text(content)
     refused = call("run", tmp_path / name)
-    assert refused.exit_code == 2 and all(w in refused.stderr for w in words)
+    assert refused.exit_code == 2 and all(w.format(tmp_path / name) in refused.stderr for w in words)
+
+
+def test_a_study_that_is_not_there_is_looked_for_beside(study: Path) -> None:
+    refused = call("check", study.with_name("studi.toml"))
+    assert refused.exit_code == 2 and said(refused).endswith(f"no such study file. Try: {study}?")
+
+
+def test_two_names_of_one_key_say_which_to_keep(study: Path) -> None:
+    study.write_text(STUDY + "[diagnose]\ntolerance = {y = 0.1}\nmaterial = {y = 0.1}\n")
+    refused = call("check", study)
+    assert refused.exit_code == 2
+    assert said(refused).endswith(
+        "diagnose.material: it is the earlier name of tolerance, which is given too. Try: tolerance alone"
+    )
 
 
 def test_only_the_nearest_names_are_suggested() -> None:

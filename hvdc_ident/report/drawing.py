@@ -1,12 +1,11 @@
-"""Figures as SVG text inside the page, thinned to what can be seen, and those that zoom with what they need.
+"""Figures as SVG text inside the page: thinned to what can be seen, in the page's colours, some of them with what zooms them.
 
-A page that has no figure that zooms carries none of that.
+Colours of a figure are names of the page's style sheet, so that one drawing serves light, dark and paper.
 """
 
 from __future__ import annotations
 
 import base64
-import gzip
 import hashlib
 import io
 import json
@@ -21,16 +20,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
-from hvdc_ident.report.html import text
+from hvdc_ident.report.html import captioned, text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LINE, _DIGITS = re.compile(r' d="[^"]*"'), re.compile(r"(?<=\.\d)\d+")  # tenths of a point are seen at most
-POINTS = 700
+POINTS = 500
+"""Points of a curve that are drawn: two for each point of the widest figure's axis are more than can be told apart."""
 WIDEST = 8.4
 """rem on the page for an inch of a figure: one of 7.4 inches fills it."""
-MEASURED, BEFORE, AFTER, MARK = "#222222", "#d08020", "#1f5fa8", "#999999"
+MEASURED, BEFORE, AFTER, EFFECT, MARK = "#222222", "#d08020", "#1f5fa8", "#1d7f4e", "#999999"
+"""Colours of the recording, of the model with the given values, fitted, and with what it lacks; and of lines that mark."""
+NAMED = {
+    MEASURED: "measured",
+    BEFORE: "given",
+    AFTER: "fitted",
+    EFFECT: "effect",
+    MARK: "mark",
+    "#000000": "ink",
+    "#ffffff": "paper",
+    "#e4e4e4": "grid",
+    "#dddddd": "grid",
+    "#cccccc": "grid",
+    "#c4c4c4": "mark",
+    "#b0b0b0": "mark",
+}
+"""Names in the style sheet of the colours that change with the page's ground; the others are seen on either."""
 
 
 def figure(width: float, height: float, margins: Mapping[str, float] | None = None) -> Figure:
@@ -62,10 +77,61 @@ def svg(fig: Figure, label: str) -> str:
     stream = io.StringIO()
     with matplotlib.rc_context(style):  # `savefig` would draw everything twice
         FigureCanvasSVG(fig).print_svg(stream, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    drawn = _LINE.sub(lambda line: _DIGITS.sub("", line[0]), stream.getvalue())
     widest = f"{WIDEST * fig.get_figwidth():.1f}rem"  # a narrow figure is not blown up to the page's width
     opening = f'<svg role="img" aria-label="{text(label)}" style="max-width: {widest}"'
-    return drawn[drawn.index("<svg") :].replace("<svg", opening, 1)
+    drawn = stream.getvalue()
+    return _compact(drawn[drawn.index("<svg") :]).replace("<svg", opening, 1)
+
+
+_TAG = re.compile(r"<[^>]*>")
+_PATH = re.compile(r' d="([^"]*)"')
+_STEP = re.compile(r"([MLz])(?: ([-\d.]+) ([-\d.]+))?")
+_COLOUR = re.compile("|".join(NAMED))
+_DIGITS = re.compile(r"(?<=\.\d)\d+")
+_NEEDLESS = re.compile(
+    r' id="(?:figure|patch|axes|matplotlib|xtick|ytick|line2d|text|legend|\w*Collection)[\w.]*"'
+    r'| transform="rotate\(-0[^"]*\)"| xmlns(?::xlink)?="[^"]*"| ?font-family: [^;"]*;?',
+)
+
+
+def _compact(drawn: str) -> str:
+    """The same drawing in fewer bytes, with the colours of the page: tenths of a point, no names that nothing refers to."""
+    drawn = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", drawn, count=1, flags=re.DOTALL)
+    drawn = re.sub(r">\s+<", "><", _TAG.sub(lambda found: _compact_tag(found[0]), drawn))
+    while "<g></g>" in drawn:
+        drawn = drawn.replace("<g></g>", "")
+    return drawn
+
+
+def _compact_tag(tag: str) -> str:
+    tag = _PATH.sub(lambda found: f' d="{_short(found[1])}"', tag)
+    tag = _DIGITS.sub("", _NEEDLESS.sub("", tag)).replace("xlink:href", "href")
+    return _COLOUR.sub(lambda found: f"var(--{NAMED[found[0]]})", tag)
+
+
+def _short(path: str) -> str:
+    """A path of straight lines with steps in place of points; any other path as it is."""
+    if "C" in path or "Q" in path:
+        return " ".join(path.split())
+    parts: list[str] = []
+    x = y = 0
+    for letter, right, down in _STEP.findall(path):
+        if letter == "z":
+            parts.append("z")
+            continue
+        to = round(10 * float(right)), round(10 * float(down))
+        if letter == "M":
+            parts.append(f"M{to[0] / 10:g} {to[1] / 10:g}")
+        elif to != (x, y) or len(parts) == 1:
+            parts.append(f"l{(to[0] - x) / 10:g} {(to[1] - y) / 10:g}")
+        x, y = to
+    return "".join(parts).replace("l0.", "l.").replace(" 0.", " .").replace("-0.", "-.")
+
+
+def on_paper(page: str) -> str:
+    """The page with plain colours in its figures, for a program that does not read the names of a style sheet there."""
+    plain = {name: colour for colour, name in reversed(NAMED.items())}
+    return re.sub(r"var\(--(\w+)\)", lambda found: plain.get(found[1], found[0]), page)
 
 
 def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
@@ -105,9 +171,14 @@ class PlottedCurve:
 
 
 def zoomable(
-    drawn: str, label: str, columns: Mapping[str, Array], curves: Sequence[PlottedCurve], titles: tuple[str, str, str]
+    drawn: str,
+    label: str,
+    caption: str,
+    columns: Mapping[str, Array],
+    curves: Sequence[PlottedCurve],
+    titles: tuple[str, str, str],
 ) -> str:
-    """A `<figure>` with the drawing, which a button turns into an interactive one of the same curves.
+    """A `<figure>` with the drawing and its caption, which a button turns into an interactive one of the same curves.
 
     columns: of one length; `x` is the abscissa of all. titles: of the abscissa, the figure and the strip below it.
     """
@@ -115,34 +186,27 @@ def zoomable(
         "columns": {
             name: base64.b64encode(values.astype("<f4").tobytes()).decode() for name, values in columns.items()
         },
-        "curves": [asdict(curve) | {"name": text(curve.name)} for curve in curves],
+        "curves": [asdict(curve) | {"name": text(curve.name), "color": _named(curve.color)} for curve in curves],
         "titles": [text(title) for title in titles],
     }
     script = f'<script type="application/json">{json.dumps(data)}</script>'
-    return f'<figure data-zoom="{text(label)}">{drawn}{script}</figure>'
+    return captioned(drawn + script, caption, f' data-zoom="{text(label)}"')
 
 
-def scripts(body: str) -> tuple[str, str, str]:
-    """Return the page's script and the drawing library that this body needs, and the policy that allows them alone.
+def _named(colour: str) -> str:
+    return f"var(--{NAMED[colour]})" if colour in NAMED else colour
 
-    Each is "" where the body needs none.
-    """
-    zooms, moves = "data-zoom=" in body, "data-sizes=" in body
-    if not (zooms or moves):
-        return "", "", ""
+
+def script(body: str) -> tuple[str, str]:
+    """Return the page's script and the policy that allows it alone; both "" where nothing in the body needs it."""
+    if "data-zoom=" not in body and "data-sizes=" not in body:
+        return "", ""
     code = asset("page.js")
     mark = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
-    return code, _library() if zooms else "", f"script-src 'sha256-{mark}' blob:"
+    return code, f"script-src 'sha256-{mark}'"
 
 
 @cache
 def asset(name: str) -> str:
     """Return the text of a file in `templates/`."""
     return resources.files("hvdc_ident.report").joinpath("templates", name).read_text(encoding="utf-8")
-
-
-@cache
-def _library() -> str:
-    """plotly.js, compressed, as text."""
-    code = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
-    return base64.b64encode(gzip.compress(code, 6, mtime=0)).decode()

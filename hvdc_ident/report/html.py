@@ -1,4 +1,4 @@
-"""Pieces of a page: escaped text, numbers as people read them, tables."""
+"""Pieces of a page: escaped text, numbers as people read them, tables, figures with captions, parts that unfold."""
 
 from __future__ import annotations
 
@@ -24,11 +24,66 @@ def number(value: Any, digits: int = 4) -> str:
     return shown.replace("-", "−")
 
 
+def rough(value: Any, digits: int = 2) -> str:
+    """A number with exactly so many significant digits, zeros at its end too; a dash where there is none."""
+    if not isinstance(value, int | float) or not math.isfinite(value) or not 1e-4 <= abs(value) < 10.0**digits:
+        return number(value, digits)
+    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """A share of 1 in whole per cent; one that is nearly nothing, or nearly all, is said so."""
+    return "< 1 %" if 0 < share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 - 1e-9 else f"{100 * share:.0f} %"
+
+
+def decimals(low: float, high: float) -> int:
+    """Return the decimals that show two digits of half an interval's width: at least 0, at most 6."""
+    half = 0.5 * abs(high - low)
+    return min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0 and math.isfinite(half) else 6
+
+
+def estimate(value: Any, interval: Sequence[float | None] | None) -> tuple[str, str]:
+    """Return a value and its 95 % interval as text, with the digits that the interval leaves; a dash where there is none."""
+    low, high = interval or (None, None)
+    if not all(isinstance(v, int | float) and math.isfinite(v) for v in (value, low, high)) or not 0 < abs(value) < 1e6:
+        ends = [number(v, 3) if v is not None else "" for v in (low, high)]
+        one_sided = f"below {ends[1]}" if low is None else f"above {ends[0]}" if high is None else " … ".join(ends)
+        return number(value), one_sided if interval and (low, high) != (None, None) else "–"
+    assert low is not None and high is not None
+    places = decimals(low, high)
+    if abs(value) < 10.0 ** (1 - places) or places == 6:
+        return number(value), f"{number(low, 4)} … {number(high, 4)}"
+    shown = [f"{v:.{places}f}".replace("-", "−") for v in (value, low, high)]
+    return shown[0], f"{shown[1]} … {shown[2]}"
+
+
 def share(after: Any, before: Any) -> str:
     """The change from before to after in per cent; a dash where it cannot be told."""
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in (after, before)) or not before:
         return "–"
     return f"{100.0 * (after / before - 1.0):+.1f} %".replace("-", "−")
+
+
+def captioned(drawing: str, caption: str, attributes: str = "") -> str:
+    """Return a `<figure>` of a drawing and its caption, both HTML; the page numbers the figures. attributes: of the figure."""
+    return f"<figure{attributes}>{drawing}<figcaption>{caption}</figcaption></figure>"
+
+
+def folded(summary: str, body: str, about: str = "", *, printed: bool = False) -> str:
+    """Return a part that opens on demand, "" without a body. summary, about: its line and one sentence on it, as HTML.
+
+    printed: whether it is printed open even where the reader left it closed; others are printed as their line.
+    """
+    if not body:
+        return ""
+    more = f"<span class='about'>{about}</span>" if about else ""
+    kind = " class='printed'" if printed else ""
+    return f"<details{kind}><summary>{summary}{more}</summary>{body}</details>"
+
+
+def badge(passed: bool | None) -> str:
+    """Return the word PASS or FAIL, which no colour is needed to tell; a dash where nothing was judged."""
+    return "–" if passed is None else f"<b class='{'pass' if passed else 'fail'}'>{'PASS' if passed else 'FAIL'}</b>"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> str:

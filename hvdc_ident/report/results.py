@@ -59,13 +59,39 @@ class Results:
         """Role, event, window, recording and status of every experiment, by its name."""
         return {**(self.get("simulation").get("experiments") or {}), **(self.get("fit").get("experiments") or {})}
 
+    def noise(self, experiment: str, output: str) -> float | None:
+        """The standard deviation of a recorded output's noise, in its unit, given or from the rows before the event; else None."""
+        for stage in ("fit", "simulation"):
+            note = ((self.get(stage).get("noise") or {}).get(experiment) or {}).get(output) or {}
+            if note.get("source") in ("given", "estimated") and note.get("std"):
+                return float(note["std"])
+        return None
+
+    def outputs_of(self, experiment: str) -> list[str]:
+        """The recorded outputs of an experiment of which a run of the model is at hand."""
+        names: list[str] = []
+        for stage in ("fit", "simulation"):
+            table = self.table(f"{stage}.{experiment}.csv")
+            columns = table.names if table is not None else ()
+            names += [n for n in columns if f"{n}.measured" in columns]
+        return list(dict.fromkeys(names))
+
     @property
     def heading(self) -> dict[str, Any]:
         """Schema, study, model, software, seed and sources, from the last stage of the chain that has them."""
         return self.get("run") or self.get("fit") or next(iter(self.stages.values()))
 
+    @cached_property
+    def _tables(self) -> dict[str, Trajectory | None]:
+        return {}
+
     def table(self, name: str) -> Trajectory | None:
         """A table of numbers whose first column is the time; None where the file is not there or no such table."""
+        if name not in self._tables:
+            self._tables[name] = self._read(name)
+        return self._tables[name]
+
+    def _read(self, name: str) -> Trajectory | None:
         path = self.folder / name
         if path.parent.resolve() != self.folder.resolve() or not path.is_file():
             return None
@@ -91,8 +117,14 @@ def _filled(line: str) -> str:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: its place, its heading, and its HTML from the results (empty: the part is left out)."""
+    """A part of the page that opens on demand.
+
+    order: its place. title: its heading. about: one sentence on what it shows, which stands beside the heading. render: its
+    HTML from the results (empty: the part is left out). printed: whether a print shows it; of the others it has the heading.
+    """
 
     order: int
     title: str
+    about: str
     render: Callable[[Results], str]
+    printed: bool = False

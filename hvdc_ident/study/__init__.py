@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
+    from hvdc_ident.study.comparison import RunComparison, compare_runs
     from hvdc_ident.study.examples import (
         Campaign,
         Noise,
@@ -24,6 +25,7 @@ else:
     __getattr__ = offered(
         __name__,
         {
+            "comparison": "RunComparison compare_runs",
             "examples": "Campaign Noise experiments recorded write_demo write_starter write_waveforms",
             "executors": "LocalPool open_executor",
             "fitting": "problem_of",
@@ -38,11 +40,13 @@ __all__ = [
     "Campaign",
     "LocalPool",
     "Noise",
+    "RunComparison",
     "Stage",
     "StageOptions",
     "StageResult",
     "Study",
     "Summary",
+    "compare_runs",
     "experiments",
     "load_study",
     "open_executor",

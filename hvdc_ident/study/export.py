@@ -15,8 +15,8 @@ from xml.sax.saxutils import quoteattr
 from hvdc_ident.errors import ComputationError, StudyError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, read_card
+from hvdc_ident.report.letter import STAGE, write_letter
 from hvdc_ident.report.results import Results
-from hvdc_ident.report.sections.letter import STAGE, write_letter
 from hvdc_ident.study.pipeline import Done, have_stage
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.frequency_data import with_responses
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
+from hvdc_ident.fit.residual import compared_rows
 from hvdc_ident.fit.windowed_errors import tolerance, windowed_errors
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.model import Model
@@ -22,6 +24,7 @@ from hvdc_ident.study.schema import FitTable
 from hvdc_ident.study.study import priors
 
 if TYPE_CHECKING:
+    from hvdc_ident.data import Experiment, Trajectory
     from hvdc_ident.executor import Executor, Progress
     from hvdc_ident.study.study import Study
 
@@ -134,12 +137,40 @@ def curves_of(problem: Problem, result: FitResult) -> dict[str, dict[str, Curve]
     return curves(final, result, held_out_nuisances(final, result))
 
 
+def curves_of_run(experiment: Experiment, run: Trajectory) -> dict[str, Curve]:
+    """Return the recorded outputs of an experiment beside those of a run at its times; those without a compared row are left out."""
+    measured = experiment.measured
+    assert measured is not None
+    return {
+        o: Curve(
+            run[o], measured[o], compared_rows(experiment, o), float(experiment.noise.get(o) or np.nan), None, None
+        )
+        for o in experiment.outputs
+        if np.isfinite(measured[o][experiment.compared]).any()
+    }
+
+
 def errors_in_windows(study: Study, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
-    """The errors before, during and after the event, with the tolerance profile the study names."""
-    profile = tolerance(asked_of(study).tolerance, study.path.parent)
+    """The errors before, during and after the event, with the tolerance profile; its `named` says whether the study names it."""
+    asked = asked_of(study)
+    profile = tolerance(asked.tolerance, study.path.parent)
     units = {n: o.unit for n, o in study.model.outputs.items()}
     recorded = {e.name: found[e.name] for e in study.experiments if e.name in found}
-    return windowed_errors(recorded, study.experiments, profile, units)
+    table = windowed_errors(recorded, study.experiments, profile, units)
+    return {**table, "profile": {**table["profile"], "named": "tolerance" in asked.model_fields_set}}
+
+
+def curves_csv(experiment: Experiment, found: Mapping[str, Curve]) -> str:
+    """CSV text: time, then for each measured output OUTPUT, OUTPUT.measured and the ends of the 95 % band of a sample.
+
+    The columns OUTPUT.low and OUTPUT.high are left out where no estimate has a standard deviation.
+    """
+    columns = {"time": experiment.time}
+    for output, c in found.items():
+        columns |= {output: c.model, f"{output}.measured": c.measured}
+        if c.band is not None:
+            columns |= {f"{output}.low": c.model - c.band, f"{output}.high": c.model + c.band}
+    return csv_columns(columns)
 
 
 def derived(study: Study, result: FitResult) -> dict[str, dict[str, Any]]:

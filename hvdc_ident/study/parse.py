@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import tomllib
 import types
 import typing
@@ -77,12 +78,13 @@ def checked(table: dict[str, Any], where: str) -> StudyFile:
 
 def _refuse_other_kinds(path: Path) -> None:
     """Raise StudyError for an FMU and for a file of waveforms; a *.txt is one where its signals can be listed."""
-    ending = path.suffix.lower()
+    ending, typed = path.suffix.lower(), shlex.quote(str(path))
     if ending == ".fmu":
-        what, hint = "an FMU", f"`hvdc-ident check {path.name}` lists its variables; a study names it in [model] source"
+        what, hint = "an FMU", f"`hvdc-ident check {typed}` lists its variables; a study names it in [model] source"
     elif any(ending in f.SUFFIXES for f in formats().values()) and (ending != ".txt" or _lists_signals(path)):
-        convert = f"`hvdc-ident convert {path.name} --list ''` lists its signals"
-        what, hint = "a file of waveforms", f"{convert}; a study names it in data of an [[experiment]]"
+        convert = f"`hvdc-ident convert {typed} --list ''` lists its signals"
+        made = f"`hvdc-ident new DIR --from {typed} --model MODEL` writes a study of it"
+        what, hint = "a file of waveforms", f"{convert}; {made}"
     else:
         return
     raise StudyError(
@@ -142,11 +144,11 @@ def _first(error: ValidationError, table: dict[str, Any], where: str) -> StudyEr
         what = "a value that does not fit" if kind == "finite_number" else "a value of the wrong kind"
         return StudyError(what, where=place, expected=EXPECTED[kind], got=got)
     if kind == "value_error":
-        text = str(problem["ctx"]["error"])
+        text, _, hint = str(problem["ctx"]["error"]).partition(". Try: ")
         key, _, rest = text.partition(": ")
         if rest and key.isidentifier() and key != loc[-1]:
-            return StudyError(rest, where=f"{place}.{key}" if loc else f"{where}, {key}")
-        return StudyError(rest if key == loc[-1] else text, where=place)
+            return StudyError(rest, where=f"{place}.{key}" if loc else f"{where}, {key}", hint=hint)
+        return StudyError(rest if key == loc[-1] else text, where=place, hint=hint)
     expected, got = _wanted(kind, problem.get("ctx", {}), got)
     return StudyError("a value that does not fit", where=place, expected=expected, got=got)
 

@@ -524,7 +524,7 @@ class DiagnoseTable(TomlTable):
     @model_validator(mode="after")
     def _one_name(self) -> DiagnoseTable:
         if self.tolerance and self.material:
-            raise ValueError("material: it is the earlier name of tolerance; give one of them")
+            raise ValueError("material: it is the earlier name of tolerance, which is given too. Try: tolerance alone")
         return self
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.effects import apply_effects
-from hvdc_ident.errors import StudyError, located, require_known, unknown_name
+from hvdc_ident.errors import StudyError, located, nearest, require_known, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
 from hvdc_ident.fit import FitParameter
@@ -176,7 +176,9 @@ def _read(file: Path) -> bytes:
     try:
         return file.read_bytes()
     except FileNotFoundError:
-        hint = "'hvdc-ident new DIR' writes a study to start from"
+        beside = [p.name for p in sorted(file.parent.glob("*.toml"))] if file.parent.is_dir() else []
+        near = [str(file.with_name(n)) for n in nearest(file.name, beside)]
+        hint = f"{' or '.join(near)}?" if near else "'hvdc-ident new DIR' writes a study to start from"
         raise StudyError("no such study file", where=str(file), hint=hint) from None
     except OSError as e:
         raise StudyError(f"the study file cannot be read: {(e.strerror or str(e)).lower()}", where=str(file)) from None

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import InputError
+from hvdc_ident.report.letter import letter_of, write_letter
 from hvdc_ident.report.results import Results
-from hvdc_ident.report.sections.letter import letter_of, write_letter
 
 HEADING = {"schema": 1, "study": "s", "model": "m", "software": "hvdc_ident 0", "seed": 0, "sources": {}}
 
@@ -166,13 +166,6 @@ def test_a_law_that_was_found_counts_as_an_effect_does_where_it_is_in_the_model(
     less = {**found, "fallback": {"kind": kind}, "augmented_model": None}
     told = " ".join(letter_of(Results(folder_with(tmp_path, less))).sentences)
     assert "cannot be judged" in told and "shrinks" not in told
-
-
-def test_the_page_has_one_curve_to_see_and_a_slider_for_the_others(tmp_path: Path) -> None:
-    text = write_letter(folder_with(tmp_path, diagnosis())).read_text("utf-8")
-    assert text.count('class="size"') == 4 and text.count('style="display: none"') == 2
-    assert 'type="range"' in text and "plotly" not in text.split("<script>")[0]
-    assert len(text) < 200_000
 
 
 def test_without_a_diagnosis_there_is_no_letter(tmp_path: Path) -> None:

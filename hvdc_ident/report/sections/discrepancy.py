@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg
-from hvdc_ident.report.html import number, share, table, text
+from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
+from hvdc_ident.report.html import captioned, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, span
+from hvdc_ident.text import form_of, listed, span
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "augmented": "with the effect"}
 MOST = 12
 SHOWN = 5e-3
 """A smaller share of the gap is none."""
@@ -29,20 +31,25 @@ def _render(results: Results) -> str:
     found = results.get("discrepancy")
     if not found.get("verdict"):
         return ""
-    units = results.units
-    parts = [
-        _lead(found),
-        _effects(found),
-        _findings(found),
-        _curve(found),
-        _sets(found),
-        _gap(found, units),
-        _gains(found),
-        _where(found),
-        _candidates(found),
-    ]
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
-    return "".join(parts) + notes
+    compared = "For specialists: what else was tried, and how far behind it is on the scale of the Bayesian information criterion (BIC)."
+    return "".join(
+        [
+            _lead(found),
+            _effects(found),
+            _findings(found),
+            _advice(found),
+            _curve(found),
+            _gap(found),
+            _slider(found.get("sizes")),
+            folded(
+                "Where model and recordings differ", _where(found), "Signals, times, frequencies and levels of the gap."
+            ),
+            folded("Frequency responses", _responses(found), "Of model and recording, from the inputs that moved."),
+            folded("Hypotheses compared", _sets(found) + _candidates(found), compared),
+            notes,
+        ]
+    )
 
 
 def _lead(found: dict[str, Any]) -> str:
@@ -56,7 +63,10 @@ def _curve(found: dict[str, Any]) -> str:
     if not other.get("curve"):
         return ""
     name = f"what is added to {other['at']} over {other['curve']['over']}"
-    return f"<figure>{svg(hidden_curve(other['at'], other['curve']), name)}</figure>"
+    return captioned(
+        svg(hidden_curve(other["at"], other["curve"]), name),
+        f"{text(name[:1].upper() + name[1:])}, with its 95 % band.",
+    )
 
 
 def _effects(found: dict[str, Any]) -> str:
@@ -79,11 +89,11 @@ def _findings(found: dict[str, Any]) -> str:
     for f in found.get("findings") or []:
         delay = f.get("equivalent_delay") or {}
         likely = f["places"][:PLACES]
-        where = "; ".join(f"{', '.join(p['at'])} ({p['probability']:.0%})" for p in likely)
+        where = "; ".join(f"{', '.join(p['at'])} ({percent(p['probability'])})" for p in likely)
         where += f"; and {len(f['places']) - PLACES} more" if len(f["places"]) > PLACES else ""
         value = delay.get("value")
         late = "" if value is None else number(1e3 * value, 3)
-        rows.append([text(", ".join(f["same_as"])), text(f"{f['probability']:.0%}"), text(where), late])
+        rows.append([text(", ".join(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
     if not rows or (len(rows) == 1 and len(found["findings"][0]["places"]) < 2):
         return ""
     return "<h3>What may be missing, and where</h3>" + table(
@@ -110,58 +120,82 @@ def _sets(found: dict[str, Any]) -> str:
             + table(["effect", "at", "from", "late, ms", "behind the best, BIC"], rows, words=(0, 1, 2))
             + more
         )
+    return "".join(parts)
+
+
+def _advice(found: dict[str, Any]) -> str:
     advice = (found.get("separating_experiment") or {}).get("text")
-    told = f"<p><strong>What to measure.</strong> {text(advice.rstrip('.'))}.</p>" if advice else ""
-    return "".join(parts) + told
+    return f"<p><strong>What to measure.</strong> {text(advice.rstrip('.'))}.</p>" if advice else ""
 
 
-def _gap(found: dict[str, Any], units: dict[str, Any]) -> str:
+def _gap(found: dict[str, Any]) -> str:
+    """Figure of the pooled residual before and after, and a sentence on the held-out recordings."""
     gap = found.get("gap") or {}
     if not gap.get("pooled"):
         return ""
     picture = svg(gap_bars(gap["pooled"]), "residual of the three models in noise units")
-    rows = []
-    for part in ("fit", "holdout"):
-        for output, line in (gap.get("refitted") or {}).get(part, {}).items():
-            for experiment in line:
-                values = [
-                    ((gap.get(m) or {}).get(part, {}).get(output) or {}).get(experiment)
-                    for m in ("nominal", "refitted", "augmented")
-                ]
-                floor = (gap.get("noise_floor") or {}).get(output)
-                errors = [number(v, 3) for v in (*values, floor)]
-                role = "held out" if part == "holdout" else part
-                rows.append([text(output), text(experiment), role, *errors, text(units.get(output, ""))])
-    header = ["output", "experiment", "role", "given gains", "refitted", "with effect", "noise", "unit"]
+    caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
     shrink = gap.get("shrink_holdout")
     line = (
-        f"<p>Held out, the gap shrinks by {100 * shrink:.1f} %.</p>"
+        f"<p>Held out, the gap shrinks by {100 * shrink:.0f} %.</p>"
         if shrink is not None and (found.get("augmented_model") or found.get("effects"))
         else ""
     )
-    frequency = [c for c in found.get("bode") or [] if c.get("omega")]
-    second = svg(bode(frequency), "frequency responses of model and record") if frequency else ""
-    listed = table(header, rows, words=(0, 1, 2, 7))
     note = "<p class='small'>Rows on a jump of an input are left out here: no recorder tells which side they show.</p>"
-    told = f"<h3>Before and after (RMSE)</h3><figure>{picture}</figure>{line}{listed}{note}"
-    return f"{told}<figure>{second}</figure>" if second else told
+    return captioned(picture, caption) + line + note
 
 
-def _gains(found: dict[str, Any]) -> str:
-    before, middle, after = (found.get(f"parameters_{k}") or {} for k in ("before", "refitted", "after"))
-    if not after:
+def _responses(found: dict[str, Any]) -> str:
+    channels = [c for c in found.get("bode") or [] if c.get("omega")]
+    if not channels:
         return ""
-    rows = [
-        [
-            text(n),
-            number(before.get(n), 5),
-            number(middle.get(n), 5),
-            number(after[n], 5),
-            share(after[n], middle.get(n)),
-        ]
-        for n in after
-    ]
-    return "<h3>How the parameters move</h3>" + table(["parameter", "given", "refitted", "with effect", "change"], rows)
+    drawn = svg(bode(channels), "frequency responses of model and record")
+    return captioned(drawn, "Frequency responses of recording and model, gain above phase.")
+
+
+def _slider(sizes: dict[str, Any] | None) -> str:
+    """The curves at several sizes of the effect in one drawing, of which a slider shows one."""
+    if not sizes or not sizes.get("curves"):
+        return ""
+    chosen = sizes.get("chosen") or 0
+    data = json.dumps({"labels": sizes["labels"]}).replace("<", "\\u003c")
+    label = f"size of the effect, {sizes['effect']} at {listed(sizes['at'])}"
+    caption = f"{text(sizes['output'])} in {text(sizes['experiment'])} with another size of the effect; below, recorded less simulated."
+    return (
+        f'<div data-sizes="1" class="screen">{captioned(_at_sizes(sizes, chosen), caption)}<p class="small"><label>{text(label)}: '
+        f'<input type="range" hidden min="0" max="{len(sizes["curves"]) - 1}" value="{chosen}" aria-label="{text(label)}">'
+        f"</label> <output>{text(sizes['labels'][chosen])}</output></p>"
+        f'<script type="application/json">{data}</script></div>'
+    )
+
+
+def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
+    """The drawing: recorded and simulated above, what is left below; the curves of one size are shown."""
+    time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
+    fig = figure(7.4, 3.6)
+    top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+    top.plot(*visible(time, measured), color=MEASURED, linewidth=1.0, label="recorded")
+    for k, curve in enumerate(sizes["curves"]):
+        values = np.asarray(curve, dtype=float)
+        for axes, shown in ((top, values), (strip, measured - values)):
+            label = "model" if k == chosen and axes is top else None
+            (line,) = axes.plot(*visible(time, shown), color=EFFECT, linewidth=1.3, label=label)
+            line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
+    unit = sizes.get("output_unit") or ""
+    top.set_ylabel(f"{sizes['output']}, {unit}" if unit else str(sizes["output"]), fontsize=8)
+    strip.set_ylabel(f"error, {unit}" if unit else "error", fontsize=8)
+    strip.set_xlabel("time, s", fontsize=8)
+    for axes in (top, strip):
+        axes.grid(True, color="#e4e4e4", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+    top.legend(frameon=False, fontsize=8)
+    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
+    for k in range(len(sizes["curves"])):
+        hidden = "" if k == chosen else ' style="display: none"'
+        for place in ("top", "strip"):
+            drawn = drawn.replace(f'<g id="size-{k}-{place}">', f'<g class="size" data-k="{k}"{hidden}>', 1)
+    return drawn
 
 
 def _where(found: dict[str, Any]) -> str:
@@ -186,7 +220,7 @@ def _where(found: dict[str, Any]) -> str:
         parts.append(f"What is left is {rest}.")
     if not parts:
         return ""
-    return "<h3>Where model and data differ</h3><p>" + " ".join(parts) + "</p>"
+    return "<p>" + " ".join(parts) + "</p>"
 
 
 def _shares(found: dict[str, float] | None) -> str:
@@ -219,21 +253,23 @@ def _candidates(found: dict[str, Any]) -> str:
 
 def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
     """The pooled residual of given gains, refitted and augmented model, on fitted and on held-out data."""
-    fig = figure(7.4, 2.8, {"left": 0.1, "right": 0.99, "bottom": 0.1, "top": 0.97})
+    fig = figure(7.4, 2.1, {"left": 0.08, "right": 0.99, "bottom": 0.13, "top": 0.97})
     axes = fig.subplots()
-    names = [n for n in ("nominal", "refitted", "augmented") if n in pooled]
-    for k, (part, label, colour) in enumerate((("fit", "fitted", AFTER), ("holdout", "held out", BEFORE))):
+    names = [n for n in MODELS if n in pooled]
+    for k, (part, label, colour) in enumerate(
+        (("fit", "fitted recordings", "#5f7386"), ("holdout", "held-out recordings", "#9fb0c0"))
+    ):
         values = [pooled[n].get(part) for n in names]
         axes.bar(
             np.arange(len(names)) + (k - 0.5) * 0.38, [v or np.nan for v in values], 0.38, label=label, color=colour
         )
     axes.axhline(1.0, color=MEASURED, linestyle=":", linewidth=1.0, label="noise")
     axes.set_yscale("log")
-    axes.set_xticks(
-        range(len(names)), [{"nominal": "given gains", "augmented": "with effect"}.get(n, n) for n in names]
-    )
-    axes.set_ylabel("residual, in noise units")
-    axes.legend(fontsize="small")
+    axes.set_xticks(range(len(names)), [MODELS[n] for n in names], fontsize=8)
+    axes.set_ylabel("residual, in noise units", fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=8, frameon=False)
     return fig
 
 
@@ -297,4 +333,10 @@ def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
         axes.minorticks_off()  # over three decades nobody reads them, and they take half of the time to draw
 
 
-SECTION = Section(order=25, title="What the model lacks", render=_render)
+SECTION = Section(
+    order=30,
+    title="What the model lacks",
+    about="The diagnosis: what is missing, how likely, where, and how much of the gap it closes.",
+    render=_render,
+    printed=True,
+)

@@ -1,10 +1,11 @@
-"""The table of gains: given value, estimate, spread, interval, and why some are held."""
+"""The parameters: every value by its name, the outcome of the fit, and what specialists ask of its estimates."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import number, share, table, text
+from hvdc_ident.report.answers import Answers
+from hvdc_ident.report.html import estimate, folded, number, share, table, text
 from hvdc_ident.report.results import Results, Section
 
 
@@ -13,13 +14,61 @@ def _render(results: Results) -> str:
     candidates = fit.get("candidates") or {}
     if not candidates:
         return ""
-    rows = [_row(name, line, fit) for name, line in candidates.items()]
-    header = ["parameter", "given", "fitted", "change", "std", "95 % interval", "bounds", "began at", "unit", "note"]
     held = fit.get("held") or {}
     fixed = [n for n in held if n not in candidates]
-    outcome = _outcome(fit)
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
-    return outcome + table(header, rows, words=(0, 8, 9)) + _weights(fit) + rest + _more(fit)
+    return _outcome(fit) + _by_name(results, fit) + _weights(fit) + rest + _more(fit)
+
+
+def _by_name(results: Results, fit: dict[str, Any]) -> str:
+    """Table of every value that a parameter has, each column with its name."""
+    found, diagnosis = Answers(results), results.get("discrepancy")
+    refitted = diagnosis.get("parameters_refitted") or {} if found.added else {}
+    rows = []
+    for v in found.values:
+        line, own = fit["candidates"][v.name], (fit.get("estimates") or {}).get(v.name) or {}
+        fitted, interval = estimate(v.fitted, own.get("ci95"))
+        after, later = estimate(v.effect, v.interval) if v.effect is not None else ("", "")
+        rows.append(
+            [
+                f"<strong>{text(v.name)}</strong>",
+                number(line.get("given")),
+                fitted if v.fitted is not None else "–",
+                interval if v.fitted is not None else "–",
+                share(v.fitted, line.get("given")) if v.fitted is not None else "",
+                number(refitted.get(v.name)) if v.effect is not None else "",
+                after,
+                later,
+                share(v.effect, line.get("given")) if v.effect is not None else "",
+                text(v.unit),
+            ]
+        )
+    header = ["parameter", "given", "fitted", "95 % interval", "change", "refitted by the diagnosis"]
+    header += ["with the effect", "95 % interval", "change", "unit"]
+    told = (
+        "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
+        "effect: the same with the finding in the model; these are the values that count.</p>"
+    )
+    return table(header, rows, words=(0, 9)) + (told if refitted else "") + _notes(fit)
+
+
+def _notes(fit: dict[str, Any]) -> str:
+    """Why parameters are held, and on what the intervals rest."""
+    notes = {n: _note(n, (fit.get("estimates") or {}).get(n) or {}, fit) for n in fit["candidates"]}
+    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(note)}.</li>" for n, note in notes.items() if note)
+    return f"<ul class='small'>{lines}</ul>" if lines else ""
+
+
+def _note(name: str, own: dict[str, Any], fit: dict[str, Any]) -> str:
+    why = (fit.get("held") or {}).get(name)
+    notes = [f"held: {why}"] if why else []
+    if own.get("method") == "one-sided":
+        notes.append("on a bound, one-sided interval")
+    if own.get("conditional_on"):
+        notes.append(f"with {', '.join(map(str, own['conditional_on']))} as held")
+    if own.get("reason"):
+        notes.append(str(own["reason"]))
+    return "; ".join(notes)
 
 
 STATUS = {
@@ -35,9 +84,8 @@ def _outcome(fit: dict[str, Any]) -> str:
     """Paragraph on the status of the fit."""
     status = str(fit.get("status", ""))
     judged = fit.get("adequacy") or {}
-    said = (
-        f"<p><strong>{text(STATUS.get(status, status))}</strong> ({text(status)}): {text(fit.get('message', ''))}.</p>"
-    )
+    word = "" if status == "converged" else f" ({text(status)})"
+    said = f"<p><strong>{text(STATUS.get(status, status))}</strong>{word}: {text(fit.get('message', ''))}.</p>"
     if judged.get("text"):
         head = "The model does not fit these records" if judged["verdict"] == "does-not-fit" else "On the noise"
         what = f" Next: {text(judged['next'])}." if judged.get("next") else ""
@@ -48,8 +96,20 @@ def _outcome(fit: dict[str, Any]) -> str:
 
 
 def _more(fit: dict[str, Any]) -> str:
-    """Tables of derived quantities, nuisance parameters, correlations and fits one by one."""
-    return _derived(fit) + _nuisances(fit) + _correlation(fit) + _one_by_one(fit)
+    """Derived quantities and nuisances; then, folded, bounds, correlations and fits one by one."""
+    about = "For specialists: bounds, standard deviations, correlations, and each recording fitted alone."
+    special = _searched(fit) + _correlation(fit) + _one_by_one(fit)
+    return _derived(fit) + _nuisances(fit) + folded("How the estimates were found", special, about)
+
+
+def _searched(fit: dict[str, Any]) -> str:
+    """Table of the estimates' standard deviations and of the bounds of the search."""
+    estimates, rows = fit.get("estimates") or {}, []
+    for name, line in fit["candidates"].items():
+        bounds = f"{_end(line.get('min'), '−∞')} … {_end(line.get('max'), '∞')}"
+        std = number((estimates.get(name) or {}).get("std"), 2)
+        rows.append([text(name), std, bounds, number(line.get("start")), text(line.get("unit", ""))])
+    return table(["parameter", "standard deviation", "bounds", "search began at", "unit"], rows, words=(0, 4))
 
 
 def _derived(fit: dict[str, Any]) -> str:
@@ -109,34 +169,6 @@ def _one_by_one(fit: dict[str, Any]) -> str:
     return "<h3>Experiment by experiment</h3>" + table(head, rows, words=(0,)) + told
 
 
-def _row(name: str, line: dict[str, Any], fit: dict[str, Any]) -> list[str]:
-    estimate = (fit.get("estimates") or {}).get(name) or {}
-    why = (fit.get("held") or {}).get(name)
-    value = estimate.get("value", (fit.get("values") or {}).get(name))
-    low, high = estimate.get("ci95") or (None, None)
-    interval = f"{number(low)} … {number(high)}" if estimate.get("ci95") else "–"
-    notes = [f"held: {why}"] if why else []
-    if estimate.get("method") == "one-sided":
-        notes.append("on a bound, one-sided interval")
-    if estimate.get("conditional_on"):
-        notes.append(f"with {', '.join(map(str, estimate['conditional_on']))} as held")
-    if estimate.get("reason"):
-        notes.append(str(estimate["reason"]))
-    bounds = f"{_end(line.get('min'), '−∞')} … {_end(line.get('max'), '∞')}"
-    return [
-        f"<strong>{text(name)}</strong>",
-        number(line.get("given")),
-        f"<strong>{number(value)}</strong>",
-        share(value, line.get("given")),
-        number(estimate.get("std"), 2),
-        interval,
-        bounds,
-        number(line.get("start")) if line.get("start") != line.get("given") else "",
-        text(line.get("unit", "")),
-        text("; ".join(notes)),
-    ]
-
-
 def _end(value: Any, none: str) -> str:
     return none if value is None else number(value)
 
@@ -162,4 +194,10 @@ def _weights(fit: dict[str, Any]) -> str:
     return f"<p class='small'>{' '.join(parts)}</p>"
 
 
-SECTION = Section(order=20, title="Gains", render=_render)
+SECTION = Section(
+    order=10,
+    title="Parameters",
+    about="Every value by its name: given, fitted, and with what the model lacks; intervals, and why some are held.",
+    render=_render,
+    printed=True,
+)

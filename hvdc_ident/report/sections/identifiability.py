@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.axes import draw_intervals, draw_profile
 from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.html import captioned, estimate, folded, number, table, text
 from hvdc_ident.report.results import Results, Section
 from hvdc_ident.text import listed
 
@@ -32,9 +32,22 @@ def _render(results: Results) -> str:
         _lead(found),
         _model(found),
         _verdicts(found, parameters),
-        _pictures(found),
-        _experiments(found),
         _next(found),
+        folded(
+            "Profiles of the cost",
+            _pictures(found),
+            "How fast the fit worsens as one parameter moves and the others follow.",
+        ),
+        folded(
+            "Information by experiment",
+            _experiments(found),
+            "The share of each recording in what is known of a parameter.",
+        ),
+        folded(
+            "Collinearity",
+            _collinearity(parameters),
+            "By how much the other parameters can cancel what one does; 1: not at all.",
+        ),
     ]
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
     return "".join(parts) + notes
@@ -88,24 +101,28 @@ def _verdicts(found: dict[str, Any], parameters: dict[str, Any]) -> str:
         cells = {
             "parameter": f"<strong>{text(name)}</strong>",
             "verdict": text(v.get("verdict", "")),
-            "value": number(v.get("value")),
-            interval: _interval(v.get("ci95")),
-            "experiments drawn anew": _interval(v.get("ci95_experiments")),
+            "value": estimate(v.get("value"), v.get("ci95"))[0],
+            interval: estimate(v.get("value"), v.get("ci95"))[1],
+            "experiments drawn anew": estimate(v.get("value"), v.get("ci95_experiments"))[1],
             "unit": text(v.get("unit", "")),
-            "collinearity": number(v.get("collinearity"), 3),
-            "with": text(v.get("partner") or "–"),
             "why": text(v.get("reason", "")),
         }
         if not drawn_anew:
             del cells["experiments drawn anew"]
         rows.append(cells)
     header = list(rows[0])
-    words = [i for i, h in enumerate(header) if h in ("parameter", "verdict", "unit", "with", "why")]
+    words = [i for i, h in enumerate(header) if h in ("parameter", "verdict", "unit", "why")]
     return table(header, [list(r.values()) for r in rows], words=words)
 
 
-def _interval(ends: list[float | None] | None) -> str:
-    return f"{number(ends[0], 5)} … {number(ends[1], 5)}" if ends else "–"
+def _collinearity(parameters: dict[str, Any]) -> str:
+    """Table of the collinearity index of each parameter, with the one that resembles it most."""
+    rows = [
+        [text(n), number(v.get("collinearity"), 3), text(v.get("partner") or "–")]
+        for n, v in parameters.items()
+        if v.get("collinearity") is not None
+    ]
+    return table(["parameter", "collinearity index", "mostly with"], rows, words=(0, 2)) if rows else ""
 
 
 def _model(found: dict[str, Any]) -> str:
@@ -120,12 +137,21 @@ def _pictures(found: dict[str, Any]) -> str:
     drawn = {n: p for n, p in (found.get("profiles") or {}).items() if len(p.get("values") or []) > 1}
     if not drawn:
         return ""
-    both = found.get("pair")
-    more = svg(pair_map(both, found.get("parameters") or {}), "common profile of two parameters") if both else ""
-    parameters = found.get("parameters") or {}
-    picture = svg(profiles(drawn, parameters), "profiles of the cost by parameter")
-    summed = svg(intervals(parameters), "intervals of the parameters")
-    return f"<h3>Profiles</h3><figure>{summed}</figure><figure>{picture}{more}</figure>"
+    both, parameters = found.get("pair"), found.get("parameters") or {}
+    parts = [
+        captioned(
+            svg(intervals(parameters), "intervals of the parameters"),
+            "95 % interval of each parameter, and its verdict.",
+        ),
+        captioned(
+            svg(profiles(drawn, parameters), "profiles of the cost by parameter"),
+            "Rise of the cost over each parameter; 1 is the 95 % level, dotted lines are the ends of the interval.",
+        ),
+    ]
+    if both:
+        pair = svg(pair_map(both, parameters), "common profile of two parameters")
+        parts.append(captioned(pair, "Rise of the cost over two parameters; 1.56 is their common 95 % region."))
+    return "".join(parts)
 
 
 def _experiments(found: dict[str, Any]) -> str:
@@ -134,7 +160,7 @@ def _experiments(found: dict[str, Any]) -> str:
     if not names:
         return ""
     rows = [[text(e), *(_percent(line["information"].get(n, 0.0)) for n in names)] for e, line in experiments.items()]
-    return "<h3>Share of the information, by experiment</h3>" + table(["experiment", *map(text, names)], rows)
+    return table(["experiment", *map(text, names)], rows)
 
 
 def _percent(share: float) -> str:
@@ -168,7 +194,8 @@ def _next(found: dict[str, Any]) -> str:
         "<p class='small'>Best first, the best of each kind and input. To first order, with noise as in the recordings; of a "
         "signal not recorded so far, as on others of its unit.</p>"
     )
-    return lead + table(header, rows, words=(0, 1)) + note
+    about = "How much each experiment adds: eigenvalues of the information are the squared precision along its weakest direction."
+    return lead + folded("Experiments compared", table(header, rows, words=(0, 1)) + note, about)
 
 
 def _move(m: dict[str, Any]) -> str:
@@ -231,4 +258,9 @@ def pair_map(pair: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]
     return fig
 
 
-SECTION = Section(order=15, title="What the data tell about the parameters", render=_render)
+SECTION = Section(
+    order=50,
+    title="What the recordings determine",
+    about="Which parameters these recordings tell, how well, and what to record to know them better.",
+    render=_render,
+)

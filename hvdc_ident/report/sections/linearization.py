@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.html import captioned, number, table, text
 from hvdc_ident.report.results import Results, Section
 
 NEAREST = 5
@@ -134,7 +134,9 @@ def _bode(given: dict[str, Any], fitted: dict[str, Any] | None) -> str:
     for part in axes:
         part.grid(True, color="#dddddd", linewidth=0.5)
         part.yaxis.set_label_coords(-0.08, 0.5)
-    return f"<figure>{svg(fig, 'Bode diagram of the linear model')}</figure>"
+    return captioned(
+        svg(fig, "Bode diagram of the linear model"), "Bode diagram of the linear model, gain above phase."
+    )
 
 
 def _curves(axes: Any, response: dict[str, Any], label: str, which: int | None) -> int:
@@ -232,7 +234,8 @@ def _ports(data: dict[str, Any]) -> str:
     axes.legend(fontsize="small")
     axes.grid(True, color="#dddddd", linewidth=0.5)
     drawn = svg(fig, "Impedance of the ports over frequency")
-    return f"<h3>Impedance at ports</h3><figure>{drawn}</figure><p>{'; '.join(words)}.</p>"
+    picture = captioned(drawn, "Size of the impedance at each port over frequency.")
+    return f"<h3>Impedance at ports</h3>{picture}<p>{'; '.join(words)}.</p>"
 
 
 def _locus(data: dict[str, Any]) -> str:
@@ -265,7 +268,8 @@ def _locus(data: dict[str, Any]) -> str:
         for x in found["limits"]
     )
     drawn = svg(fig, f"Eigenvalues along {found['parameter']}")
-    return f"<h3>Eigenvalues along a parameter</h3><figure>{drawn}</figure><p>{span}: {limits or 'stability is neither lost nor won'}.</p>"
+    picture = captioned(drawn, f"Eigenvalues along {span}.")
+    return f"<h3>Eigenvalues along a parameter</h3>{picture}<p>{limits or 'Stability is neither lost nor won'}.</p>"
 
 
 def _others(data: dict[str, Any]) -> str:
@@ -303,4 +307,9 @@ def _others(data: dict[str, Any]) -> str:
     return page
 
 
-SECTION = Section(order=25, title="Linear model", render=_render)
+SECTION = Section(
+    order=75,
+    title="Linear model",
+    about="Modes, damping, margins and frequency responses about the operating point.",
+    render=_render,
+)

@@ -1,65 +1,77 @@
-"""The table of RMSE at the given values and after the fit, by output and experiment."""
+"""The errors of every signal, by set of values, and within the windows of the tolerance profile."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import number, share, table, text
+from hvdc_ident.fit.adequacy import MATTERS
+from hvdc_ident.report.answers import Answers
+from hvdc_ident.report.html import folded, number, share, table, text
 from hvdc_ident.report.results import Results, Section
 
-MOST = 36
-"""Windows that are listed openly; more are folded under their count."""
+NAMES = {"given": "RMSE, given values", "fitted": "RMSE, fitted", "effect": "RMSE, with the effect"}
 
 
 def _render(results: Results) -> str:
-    fit, simulation = results.get("fit"), results.get("simulation")
-    after = fit.get("rmse") or {}
-    before = fit.get("rmse_given") or simulation.get("rmse") or {}
-    if not before and not after:
+    found = Answers(results)
+    if not found.rmse:
         return ""
-    roles, units = results.experiments, results.units
-    rows = []
-    for output, line in (after or before).items():
-        for name in line:
-            b, a = (before.get(output) or {}).get(name), (after.get(output) or {}).get(name)
-            noise = (((fit.get("noise") or {}).get(name) or {}).get(output) or {}).get("std")
-            role = "held out" if (roles.get(name) or {}).get("role") == "holdout" else "fit"
-            rows.append(
-                [
-                    text(output),
-                    text(name),
-                    role,
-                    number(b, 3),
-                    number(a, 3),
-                    share(a, b),
-                    number(noise, 2),
-                    text(units.get(output, "")),
-                ]
-            )
-    header = ["output", "experiment", "role", "RMSE, given values", "RMSE, fitted", "change", "noise", "unit"]
-    failed = [(n, e) for n, e in roles.items() if e.get("status") == "failed"]
-    told = "".join(
-        f"<p>Experiment <strong>{text(n)}</strong> could not be simulated: {text(e.get('reason', ''))}</p>"
-        for n, e in failed
+    fit, windows = results.get("fit"), _windows(results)
+    signals = list(dict.fromkeys((o, e) for t in found.rmse.values() for o, line in t.items() for e in line))
+    loud = [s for s in signals if not _on_noise(results, found, s)]
+    rest = [s for s in signals if s not in loud]
+    quiet = (
+        folded(f"{len(rest)} signals on their noise", _table(results, found, rest), "With every set of values.")
+        if rest
+        else ""
     )
-    return table(header, rows, words=(0, 1, 2, 7)) + told + _windows(fit) + _held_out(fit)
+    named = (fit.get("windowed_errors") or {}).get("profile", {}).get("named")
+    parts = [
+        _table(results, found, loud) if loud else "<p>Every signal is on its noise, with every set of values.</p>",
+        quiet,
+    ]
+    return "".join([windows, *parts] if named else [*parts, windows]) + _held_out(fit)
 
 
-def _windows(fit: dict[str, Any]) -> str:
-    """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
-    found = fit.get("windowed_errors") or {}
-    profile, units = found.get("profile") or {}, fit.get("units") or {}
+def _on_noise(results: Results, found: Answers, signal: tuple[str, str]) -> bool:
+    """True where the noise of a signal is known and no set of values leaves more than it."""
+    output, experiment = signal
+    noise = results.noise(experiment, output)
+    errors = [(t.get(output) or {}).get(experiment) for t in found.rmse.values()]
+    return noise is not None and all(e is not None and e**2 <= MATTERS * noise**2 for e in errors)
+
+
+def _table(results: Results, found: Answers, signals: list[tuple[str, str]]) -> str:
+    """Table of the root mean square errors of some signals."""
     rows = []
+    for output, experiment in signals:
+        errors = {n: (t.get(output) or {}).get(experiment) for n, t in found.rmse.items()}
+        role = "held out" if (results.experiments.get(experiment) or {}).get("role") == "holdout" else "fit"
+        cells = [text(output), text(experiment), role, *(number(e, 3) for e in errors.values())]
+        change = share(errors["fitted"], errors.get("given")) if "fitted" in errors else ""
+        noise = results.noise(experiment, output)
+        rows.append([*cells, change, number(noise, 2) if noise else "", text(results.units.get(output, ""))])
+    header = ["output", "experiment", "role", *(NAMES[n] for n in found.rmse), "change by the fit", "noise", "unit"]
+    return table(header, rows, words=(0, 1, 2, len(header) - 1))
+
+
+def _windows(results: Results) -> str:
+    """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
+    found = results.get("fit").get("windowed_errors") or results.get("simulation").get("windowed_errors") or {}
+    profile, units = found.get("profile") or {}, results.units
+    rows: list[list[str]] = []
+    over: list[list[str]] = []
     for output, line in (found.get("errors") or {}).items():
         for name, about in line.items():
             if about.get("event") is None:
                 continue
             for window in ("before", "during", "after"):
                 w = about[window]
-                span = f"{number(w['from'])} … {number(w['to'])}" if w["n"] else "–"
+                span = f"{number(w['from'], 3)} … {number(w['to'], 3)}" if w["n"] else "–"
                 errors = [_error(w, kind) for kind in ("max", "mean", "mean_absolute")]
-                rows.append([text(output), text(name), window, span, *errors, text(units.get(output, ""))])
-    if not rows:
+                row = [text(output), text(name), window, span, *errors, text(units.get(output, ""))]
+                (over if any("<strong>" in e for e in errors) else rows).append(row)
+    if not rows and not over:
         return ""
     end = {a.get("end_from") for line in found["errors"].values() for a in line.values()}
     steps = " A step counts as over where its record has settled." if "settling" in end else ""
@@ -68,13 +80,15 @@ def _windows(fit: dict[str, Any]) -> str:
         f"{text(profile.get('version', ''))}: {text(profile.get('title', ''))}; {text(profile.get('source', ''))}. "
         f"An error above its limit is marked with its limit.{steps} {text(profile.get('notes', ''))}</p>"
     )
-    head = ["output", "experiment", "window", "s", "largest", "mean", "mean absolute", "unit"]
-    listed = table(head, rows, words=(0, 1, 2, 7))
-    if len(rows) > MOST:
-        over = sum("<strong>" in cell for row in rows for cell in row)
-        counted = f"{len(rows)} windows, {over} errors above their limits"
-        listed = f"<details><summary>{counted}</summary>{listed}</details>"
-    return "<h3>Before, during and after the event</h3>" + listed + told
+    head = ["output", "experiment", "window", "from … to, s", "largest", "mean", "mean absolute", "unit"]
+    counted = f"{len(rows) + len(over)} windows, {len(over)} with an error above its limit"
+    above = table(head, over, words=(0, 1, 2, 7)) if over else ""
+    within = (
+        folded(f"{len(rows)} windows within the limits", table(head, rows, words=(0, 1, 2, 7)) + told) if rows else told
+    )
+    if profile.get("named"):
+        return f"<h3>Before, during and after the event: {counted}</h3>{above}{within}"
+    return folded(f"Before, during and after the event: {counted}", above + within)
 
 
 def _error(window: dict[str, Any], kind: str) -> str:
@@ -104,4 +118,10 @@ def _held_out(fit: dict[str, Any]) -> str:
     return "<h3>Held-out experiments</h3>" + table(head, rows, words=(0, 1, 5))
 
 
-SECTION = Section(order=30, title="Error before and after", render=_render)
+SECTION = Section(
+    order=20,
+    title="Errors",
+    about="The error of every signal at the given values and fitted, and within the windows of the tolerance profile.",
+    render=_render,
+    printed=True,
+)

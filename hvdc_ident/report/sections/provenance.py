@@ -43,4 +43,9 @@ def _numbers(results: Results) -> str:
     return f"<p class='saved'>{link} ({ARCHIVE}, {len(stream.getvalue()) / 1e3:.0f} kB)</p><p class='small'>In it: {names}.</p>"
 
 
-SECTION = Section(order=90, title="Provenance", render=_render)
+SECTION = Section(
+    order=90,
+    title="Provenance",
+    about="Software, seed and files with their hashes; every number of this page, to be saved.",
+    render=_render,
+)

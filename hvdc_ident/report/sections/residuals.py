@@ -70,4 +70,9 @@ def _p(value: float | None) -> str:
     return f"<strong>{shown}</strong>" if value < LOW else shown
 
 
-SECTION = Section(order=32, title="What is left over", render=_render)
+SECTION = Section(
+    order=65,
+    title="Residual tests",
+    about="For specialists: whether what the fitted model leaves is white noise.",
+    render=_render,
+)

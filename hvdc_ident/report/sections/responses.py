@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.html import captioned, number, table, text
 from hvdc_ident.report.results import Results, Section
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -84,7 +84,8 @@ def _bode(r: dict[str, Any]) -> str:
     for axes in (gain, phase):
         axes.grid(True, color="#dddddd", linewidth=0.5)
         axes.yaxis.set_label_coords(-0.08, 0.5)
-    return f"<figure>{svg(fig, 'Bode diagram of the measured response ' + r['name'])}</figure>"
+    drawn = svg(fig, "Bode diagram of the measured response " + r["name"])
+    return captioned(drawn, f"{text(r['name'])}: dots measured, lines of the model.")
 
 
 def _errors(r: dict[str, Any]) -> str:
@@ -119,4 +120,10 @@ def _errors(r: dict[str, Any]) -> str:
     return table(header, rows, words=(0, 1)) if rows else ""
 
 
-SECTION = Section(order=26, title="Measured frequency responses", render=_render)
+SECTION = Section(
+    order=45,
+    title="Measured frequency responses",
+    about="Measured impedances and transfer functions beside the model's.",
+    render=_render,
+    printed=True,
+)

@@ -47,4 +47,9 @@ def _row(line: dict[str, Any]) -> list[str]:
     return [text(line["experiment"]), text(line["output"]), *levels, within, noise, text(line["text"])]
 
 
-SECTION = Section(order=15, title="Levels before the event", render=_render)
+SECTION = Section(
+    order=60,
+    title="Levels before the event",
+    about="Whether recordings and model begin at the same levels: a wrong sign, unit or base shows here.",
+    render=_render,
+)

@@ -32,4 +32,9 @@ def _render(results: Results) -> str:
     return head + table(["output", "experiment", "parameter", *columns.values()], rows, words=(0, 1, 2))
 
 
-SECTION = Section(order=27, title="Global sensitivity", render=_render)
+SECTION = Section(
+    order=80,
+    title="Global sensitivity",
+    about="Which parameters matter over their whole ranges.",
+    render=_render,
+)

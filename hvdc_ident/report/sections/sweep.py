@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg
-from hvdc_ident.report.html import number, table, text
+from hvdc_ident.report.html import captioned, number, table, text
 from hvdc_ident.report.results import Results, Section
 
 if TYPE_CHECKING:
@@ -84,11 +84,14 @@ def _figures(
     for unit in dict.fromkeys(str(units.get(o, "")) for o, _ in errors):
         chosen = {f"{o}, {e}": v[::step][order] for (o, e), v in errors.items() if str(units.get(o, "")) == unit}
         fig = sweep_errors(name, str(about.get("unit", "")), values[order], chosen, unit, about.get("base"), curve)
-        drawn.append(f"<figure>{svg(fig, f'RMSE over {name}')}</figure>")
+        label = f"RMSE over {name}"
+        caption = f"Root mean square error over {text(name)}; the dotted line is the given value."
+        drawn.append(captioned(svg(fig, label), caption))
     if points[0].get("poles"):
         poles = np.array([p["poles"] for p in points], dtype=float)
         fig = sweep_poles(name, values, poles[..., 0] + 1j * poles[..., 1])
-        drawn.append(f"<figure>{svg(fig, f'poles over {name}')}</figure>")
+        caption = f"Poles over {text(name)}, those slower than 2000 1/s."
+        drawn.append(captioned(svg(fig, f"poles over {name}"), caption))
     if points[0].get("bode"):
         drawn += _bode(name, values, points, omega)
     return "\n".join(drawn)
@@ -105,7 +108,8 @@ def _bode(name: str, values: Array, points: list[dict[str, Any]], omega: list[fl
         label = f"{output} over {source}"
         responses = (pairs[..., 0] + 1j * pairs[..., 1])[:, rows]
         fig = sweep_bode(name, values[some], np.array(omega)[rows], responses, label)
-        drawn.append(f"<figure>{svg(fig, f'frequency response of {label} over {name}')}</figure>")
+        caption = f"Frequency response of {text(label)} over {text(name)}, gain above phase."
+        drawn.append(captioned(svg(fig, f"frequency response of {label} over {name}"), caption))
     return drawn
 
 
@@ -195,4 +199,9 @@ def sweep_bode(parameter: str, values: Array, omega: Array, response: np.ndarray
     return fig
 
 
-SECTION = Section(order=35, title="Sweep", render=_render)
+SECTION = Section(
+    order=85,
+    title="Sweep",
+    about="The error, the poles or the frequency response over values of a parameter.",
+    render=_render,
+)

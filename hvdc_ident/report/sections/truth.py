@@ -44,4 +44,10 @@ def _missing(truth: dict[str, Any], diagnosis: dict[str, Any]) -> str:
     return lacking + (table(["missing", "delay, ms", "95 % interval, ms", "at, Hz"], rows) + about if rows else "")
 
 
-SECTION = Section(order=12, title="The truth", render=_render)
+SECTION = Section(
+    order=15,
+    title="The truth",
+    about="The values and delays that the recordings were made with, beside those found.",
+    render=_render,
+    printed=True,
+)

@@ -23,8 +23,11 @@ class NothingIdentified(ComputationError):
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.discrepancy.size_curves import size_curves
+    from hvdc_ident.identifiability import gate
     from hvdc_ident.model import Model
+    from hvdc_ident.study.augmented import compared
     from hvdc_ident.study.pipeline import executor_of
+    from hvdc_ident.study.schema import DiagnoseTable
 
     _need(study)
     report = earlier["identify"]
@@ -39,7 +42,10 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         except NothingIdentified as e:
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
-    return StageResult({**found.to_dict(), "sizes": sizes}, found.files)
+    beside, curves = compared(study, found, gate(report, diagnosis=True).fitted)
+    tolerances = (study.settings.diagnose or DiagnoseTable()).tolerances
+    data = {**found.to_dict(), "sizes": sizes, "tolerance": tolerances, **beside}
+    return StageResult(data, {**found.files, **curves})
 
 
 def _need(study: Study) -> None:
@@ -120,7 +126,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         if n in data["parameters_refitted"] and data["augmented_model"]
     ]
     lines += [f"Parameters, refitted without and with it: {', '.join(moved)}."] if moved else []
-    return [*lines, *data["notes"]]
+    told = "Next: `hvdc-ident letter STUDY` writes one page on this for the model's owner."
+    return [*lines, *data["notes"], *([told] if data["augmented_model"] else [])]
 
 
 def verdict(data: Mapping[str, Any]) -> str:

@@ -10,7 +10,6 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 from hvdc_ident.text import figures_of
 
 if TYPE_CHECKING:
-    from hvdc_ident.data import Experiment
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.fit.assessment import Curve
     from hvdc_ident.study.study import Study
@@ -70,6 +69,7 @@ def _files(
 ) -> dict[str, str]:
     """The values to paste, and the waveforms at the estimates; of an experiment that fails there is none."""
     from hvdc_ident.study.export import ssv
+    from hvdc_ident.study.fitting import curves_csv
 
     values = {n: float(result.values[n]) for n in study.candidates if n in result.values}
     units = {n: study.model.parameters[n].unit for n in values}
@@ -79,22 +79,7 @@ def _files(
         "fitted-values.csv": values_csv(values, units, data["estimates"], result.held),
         "fitted-values.ssv": ssv(values, study.name, f"fitted values of study '{study.name}' (fit {result.status})"),
     }
-    return files | {f"fit.{e.name}.csv": _curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
-
-
-def _curves_csv(experiment: Experiment, curves: Mapping[str, Curve]) -> str:
-    """CSV text: time, then for each measured output OUTPUT, OUTPUT.measured and the ends of the 95 % band of a sample.
-
-    The columns OUTPUT.low and OUTPUT.high are left out where no estimate has a standard deviation.
-    """
-    from hvdc_ident.files import csv_columns
-
-    columns = {"time": experiment.time}
-    for output, c in curves.items():
-        columns |= {output: c.model, f"{output}.measured": c.measured}
-        if c.band is not None:
-            columns |= {f"{output}.low": c.model - c.band, f"{output}.high": c.model + c.band}
-    return csv_columns(columns)
+    return files | {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
 
 
 def values_csv(
@@ -143,7 +128,10 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
     lines += _conditions(data)
     lines += response_lines(data.get("responses", ()), "fitted")
-    return lines + _searched(data)
+    lines += _searched(data)
+    if data["estimates"] and not judged.get("next"):
+        lines.append("Next: `hvdc-ident export STUDY --to FILE` writes the model with these values (.fmu, .mo, .toml).")
+    return lines
 
 
 def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:

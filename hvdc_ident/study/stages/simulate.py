@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
@@ -18,6 +19,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
 
     from hvdc_ident.errors import ComputationError
     from hvdc_ident.simulate import simulate
+    from hvdc_ident.study import fitting
     from hvdc_ident.study.checks import at_given, need_experiments
     from hvdc_ident.study.study import candidate_lines
 
@@ -26,6 +28,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     gaps: list[dict[str, Any]] = []
     status: dict[str, dict[str, str]] = {}
     files: dict[str, str] = {}
+    curves = {}
     for done, experiment in enumerate(study.experiments):
         options.progress(done, len(study.experiments), f"experiment '{experiment.name}'")
         try:
@@ -46,6 +49,8 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             gap = _gap(study, experiment, simulated, output) if comparable else None
             table.setdefault(output, {})[experiment.name] = None if gap is None else gap["rmse"]
             gaps += [] if gap is None else [gap]
+        if not ended:
+            curves[experiment.name] = fitting.curves_of_run(experiment, simulated)
         files[f"simulation.{experiment.name}.csv"] = _comparison_csv(experiment, simulated)
     failed = [name for name, s in status.items() if s["status"] != "converged"]
     data = {
@@ -58,6 +63,8 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording, **status[e.name]}
             for e in study.experiments
         },
+        "noise": {e: {o: asdict(n) for o, n in notes.items()} for e, notes in study.noise.items()},
+        "windowed_errors": fitting.errors_in_windows(study, curves),
     }
     return StageResult(data, files, failed=status[failed[0]]["reason"] if failed else "")
 

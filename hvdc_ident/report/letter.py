@@ -6,7 +6,6 @@ was not fitted to, what to record to be sure, and what is attached.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,8 @@ import numpy as np
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
-from hvdc_ident.report.drawing import AFTER, MEASURED, figure, svg, visible_rows
 from hvdc_ident.report.html import text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.results import Results
 from hvdc_ident.text import form_of, listed, span
 
 FILE = "letter.html"
@@ -51,7 +49,7 @@ def letter_body(letter: Letter) -> str:
     """The letter as HTML: its sentences, the figure with its slider, what is attached."""
     told = "".join(f"<p>{text(s)}</p>" for s in letter.sentences)
     attached = f"<p>Attached: {text(', '.join(letter.attached))}.</p>" if letter.attached else ""
-    return f'<div class="letter">{told}{_slider(letter.sizes)}{attached}</div>'
+    return f'<div class="letter">{told}{attached}</div>'
 
 
 def write_letter(folder: Path) -> Path:
@@ -62,7 +60,7 @@ def write_letter(folder: Path) -> Path:
     heading = results.get(STAGE) or results.heading
     title = f"Model {heading.get('model', '')}: what the recordings say"
     letter = letter_of(results)
-    return write_text(folder / FILE, document(title, str(heading.get("study", "")), letter_body(letter)))
+    return write_text(folder / FILE, document(title, text(str(heading.get("study", ""))), letter_body(letter)))
 
 
 def _missed(results: Results, found: dict[str, Any]) -> str:
@@ -224,56 +222,3 @@ def _attached(results: Results, found: dict[str, Any]) -> list[str]:
     card = found.get("augmented_model")
     names = [str(card), Path(str(card)).with_suffix(".fmu").name] if card else []
     return [n for n in names if (results.folder / n).is_file()]
-
-
-def _slider(sizes: dict[str, Any] | None) -> str:
-    """The curves at several sizes in one drawing, of which a slider shows one."""
-    if not sizes or not sizes.get("curves"):
-        return ""
-    chosen = sizes.get("chosen") or 0
-    drawn = _at_sizes(sizes, chosen)
-    data = json.dumps({"labels": sizes["labels"]}).replace("<", "\\u003c")
-    label = f"size of the effect, {sizes['effect']} at {listed(sizes['at'])}"
-    return (
-        f'<div data-sizes="1"><figure>{drawn}</figure><p class="small"><label>{text(label)}: '
-        f'<input type="range" hidden min="0" max="{len(sizes["curves"]) - 1}" value="{chosen}" aria-label="{text(label)}">'
-        f"</label> <output>{text(sizes['labels'][chosen])}</output></p>"
-        f'<script type="application/json">{data}</script></div>'
-    )
-
-
-def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
-    """The drawing: recorded and simulated above, what is left below; the curves of one size are shown."""
-    time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
-    fig = figure(7.4, 3.6)
-    top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    keep = visible_rows(measured, 600)
-    top.plot(time[keep], measured[keep], color=MEASURED, linewidth=1.0, label="recorded")
-    for k, curve in enumerate(sizes["curves"]):
-        values = np.asarray(curve, dtype=float)
-        for axes, shown in ((top, values), (strip, measured - values)):
-            rows = visible_rows(shown, 600)
-            label = "model" if k == chosen and axes is top else None
-            (line,) = axes.plot(time[rows], shown[rows], color=AFTER, linewidth=1.3, label=label)
-            line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
-    unit = sizes.get("output_unit") or ""
-    top.set_ylabel(f"{sizes['output']}, {unit}" if unit else str(sizes["output"]))
-    strip.set_ylabel("left over")
-    strip.set_xlabel("time, s")
-    for axes in (top, strip):
-        axes.grid(True, color="#e4e4e4", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-    top.legend(frameon=False, fontsize=8)
-    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
-    for k in range(len(sizes["curves"])):
-        hidden = "" if k == chosen else ' style="display: none"'
-        for place in ("top", "strip"):
-            drawn = drawn.replace(f'<g id="size-{k}-{place}">', f'<g class="size" data-k="{k}"{hidden}>', 1)
-    return drawn
-
-
-def _render(results: Results) -> str:
-    return letter_body(letter_of(results)) if "verdict" in results.get(STAGE) else ""
-
-
-SECTION = Section(order=1, title="To the owner of the model", render=_render)

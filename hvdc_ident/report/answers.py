@@ -1,0 +1,339 @@
+"""What a folder of results answers: does the model follow, with which values, what does it lack, what is to be recorded next.
+
+The first screen of the report and the letter both show these answers, each in its own words.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.fit.adequacy import MATTERS
+from hvdc_ident.report.overlay import Overlay, overlay_of
+from hvdc_ident.report.results import Results
+from hvdc_ident.text import quantity
+
+Signal = tuple[str, str]
+"""An output and an experiment."""
+Table = Mapping[str, Mapping[str, float | None]]
+
+ADDED = {"term": "formula", "filter": "filter", "curve": "curve"}
+"""Words for what stands in the model in place of an effect of the catalogue."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the model with one set of values.
+
+    name: "given", "fitted" or "effect". rmse, largest: in the worst signal, in its unit; times: rmse over the noise, there.
+    above: signals whose error is above the noise, of `judged`; outside: signals outside the tolerance, of `limited`.
+    """
+
+    name: str
+    rmse: float | None
+    largest: float | None
+    times: float | None
+    above: int
+    judged: int
+    outside: int
+    limited: int
+
+    @property
+    def on_noise(self) -> bool | None:
+        """Whether every signal with a known noise is followed to it; None where none is known."""
+        return self.above == 0 if self.judged else None
+
+    @property
+    def tolerated(self) -> bool | None:
+        """Whether every signal with a tolerance keeps it; None without one."""
+        return self.outside == 0 if self.limited else None
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter: the value that counts with its interval, and the others by name; None where there is none.
+
+    value: that of the model with what it lacks where that was named, else the fitted one. note: why it is held.
+    """
+
+    name: str
+    unit: str
+    given: float | None
+    fitted: float | None
+    effect: float | None
+    interval: tuple[float | None, float | None] | None
+    note: str = ""
+
+    @property
+    def value(self) -> float | None:
+        """The value that counts."""
+        return self.fitted if self.effect is None else self.effect
+
+
+@dataclass(frozen=True)
+class Missing:
+    """One finding: a sentence, its probability, the likely places with theirs, and the delay of a slow signal in words."""
+
+    name: str
+    text: str
+    probability: float
+    places: tuple[tuple[str, float], ...]
+    delay: str = ""
+
+
+class Answers:
+    """The answers of a folder of results; what a study did not ask for is empty."""
+
+    def __init__(self, results: Results) -> None:
+        self.results = results
+        self.fit = results.get("fit")
+        self.diagnosis = results.get("discrepancy")
+
+    @cached_property
+    def rmse(self) -> dict[str, Table]:
+        """Root mean square error by set of values, output and experiment, of the sets that there are."""
+        found: dict[str, Table] = {}
+        if given := self.fit.get("rmse_given") or self.results.get("simulation").get("rmse"):
+            found["given"] = given
+        if self.fitted:
+            found["fitted"] = self.fit.get("rmse") or {}
+        if self.added:
+            found["effect"] = self.diagnosis.get("rmse_after") or _joined(self.diagnosis["gap"].get("augmented") or {})
+        return {n: t for n, t in found.items() if t}
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        """The parameters that a fit estimated; none where it failed."""
+        done = self.fit.get("status") not in (None, "failed", "not-converged")
+        return tuple(self.fit.get("fitted") or ()) if done else ()
+
+    @property
+    def added(self) -> str:
+        """Kind of the addition in the augmented model: "effect", "formula", "filter" or "curve"; empty where nothing was added."""
+        if self.diagnosis.get("effects"):
+            return "effect"
+        kind = (self.diagnosis.get("fallback") or {}).get("kind", "") if self.diagnosis.get("augmented_model") else ""
+        return ADDED.get(kind, "")
+
+    @cached_property
+    def worst(self) -> Signal | None:
+        """The signal with the largest error at the given or the fitted values: over its tolerance, else its noise, else its range."""
+        shares: dict[int, dict[Signal, float]] = {0: {}, 1: {}, 2: {}}
+        for name in [n for n in ("given", "fitted") if n in self.rmse]:
+            for (output, experiment), error in _entries(self.rmse[name]):
+                scales = (self.tolerance.get(output), self.results.noise(experiment, output))
+                for kind, scale in enumerate(scales):
+                    if scale:
+                        shares[kind][output, experiment] = max(
+                            error / scale, shares[kind].get((output, experiment), 0.0)
+                        )
+                if not any(scales) and (swing := self._swing(output, experiment)):
+                    shares[2][output, experiment] = max(error / swing, shares[2].get((output, experiment), 0.0))
+        ranked = next((s for s in shares.values() if s), {})
+        return max(ranked, key=lambda signal: ranked[signal], default=None)
+
+    @property
+    def tolerance(self) -> Mapping[str, float]:
+        """The study's tolerance by output, in its unit."""
+        return self.diagnosis.get("tolerance") or {}
+
+    @cached_property
+    def profile(self) -> Mapping[str, Any]:
+        """The tolerance profile of windows before, during and after the event; empty where no error was held against one."""
+        windowed = self.fit.get("windowed_errors") or self.results.get("simulation").get("windowed_errors") or {}
+        return windowed.get("profile") or {}
+
+    @property
+    def by_tolerance(self) -> bool:
+        """Whether the verdict is against a tolerance that the study names, and not against the noise."""
+        return bool(self.tolerance) or bool(self.profile.get("named"))
+
+    @cached_property
+    def errors(self) -> tuple[Errors, ...]:
+        """The errors by set of values, in the order given, fitted, with the effect."""
+        return tuple(self._errors(name) for name in self.rmse)
+
+    @property
+    def judged(self) -> Errors | None:
+        """The errors that the verdict is about: those of the fitted model where there is one, else of the given one."""
+        plain = [e for e in self.errors if e.name != "effect"]
+        return plain[-1] if plain else None
+
+    @property
+    def follows(self) -> bool | None:
+        """The verdict on the model as it is, fitted where it was; None where neither a tolerance nor a noise is known."""
+        found = self.judged
+        if found is None:
+            return None
+        return found.tolerated if self.by_tolerance and found.tolerated is not None else found.on_noise
+
+    def _errors(self, name: str) -> Errors:
+        table = self.rmse[name]
+        noisy = [(e, s) for (o, x), e in _entries(table) if (s := self.results.noise(x, o))]
+        kept = self._kept(name)
+        rmse = largest = times = None
+        if self.worst is not None:
+            output, experiment = self.worst
+            rmse = (table.get(output) or {}).get(experiment)
+            noise = self.results.noise(experiment, output)
+            times = rmse / noise if rmse is not None and noise else None
+            run = overlay_of(self.results, experiment, output, (name,))
+            largest = None if run is None else float(np.nanmax(np.abs(run.error(name)), initial=0.0))
+        above = sum(e**2 > MATTERS * s**2 for e, s in noisy)
+        return Errors(name, rmse, largest, times, above, len(noisy), sum(not k for k in kept), len(kept))
+
+    def _kept(self, name: str) -> list[bool]:
+        """Of each signal with a tolerance, whether the model keeps it: the study's own, else that of the profile's windows."""
+        if self.tolerance:
+            return [e <= self.tolerance[o] for (o, _), e in _entries(self.rmse[name]) if o in self.tolerance]
+        kept = []
+        for line in self._windows(name).values():
+            for about in line.values():
+                within = [
+                    w for k in ("before", "during", "after") if (w := (about.get(k) or {}).get("within")) is not None
+                ]
+                kept += [all(within)] if within else []
+        return kept
+
+    def _windows(self, name: str) -> Mapping[str, Any]:
+        stage = {"given": "simulation", "fitted": "fit", "effect": "discrepancy"}[name]
+        return (self.results.get(stage).get("windowed_errors") or {}).get("errors") or {}
+
+    def _swing(self, output: str, experiment: str) -> float | None:
+        """Peak-to-peak value of a recorded signal, in its unit; None where its recording is not at hand."""
+        found = overlay_of(self.results, experiment, output)
+        record = None if found is None else found.record[f"{output}.measured"]
+        return None if record is None or not np.isfinite(record).any() else float(np.nanmax(record) - np.nanmin(record))
+
+    @property
+    def overlay(self) -> Overlay | None:
+        """The recording of the worst signal with the model's runs."""
+        if self.worst is None:
+            return None
+        sets = tuple(n for n in ("given", "fitted", "effect") if n in self.rmse)
+        return overlay_of(self.results, self.worst[1], self.worst[0], sets)
+
+    @cached_property
+    def values(self) -> tuple[Value, ...]:
+        """Every candidate with the value that counts."""
+        told = self.results.get("identifiability")
+        lines = self.fit.get("candidates") or told.get("candidates") or {}
+        after = self.diagnosis.get("parameters_after") or {} if self.added else {}
+        estimates, later = self.fit.get("estimates") or {}, self.diagnosis.get("estimates_after") or {}
+        held = self.fit.get("held") or {n: h.get("reason", "") for n, h in (told.get("held") or {}).items()}
+        rows = []
+        for name, line in lines.items():
+            known = name in self.fitted or (name in later and name in after)
+            found = (later if name in after else estimates).get(name) or {}
+            ends = found.get("ci95") if known else None
+            rows.append(
+                Value(
+                    name,
+                    str(line.get("unit") or ""),
+                    line.get("given"),
+                    (self.fit.get("values") or {}).get(name) if name in self.fitted else None,
+                    after.get(name) if name in self.fitted or name in later else None,
+                    (ends[0], ends[1]) if ends else None,
+                    "" if known else str(held.get(name) or ""),
+                )
+            )
+        return tuple(rows)
+
+    @cached_property
+    def missing(self) -> tuple[Missing, ...]:
+        """The findings of the diagnosis, the likeliest first."""
+        own = {
+            (e["effect"], tuple(e["at"]), e.get("from", "")): str(e["text"])
+            for e in self.diagnosis.get("effects") or []
+        }
+        found = []
+        for f in self.diagnosis.get("findings") or []:
+            places = f.get("places") or []
+            first = places[0] if places else {"at": ()}
+            said = own.get((f["effect"], tuple(first["at"]), first.get("from", "")), "")
+            late = f.get("equivalent_delay") or {}
+            parameters = f["effect"] == "parameter"
+            found.append(
+                Missing(
+                    "parameter" if parameters else " or ".join(f["same_as"]),
+                    (said or str(f["text"])).rstrip("."),
+                    float(f["probability"]),
+                    () if parameters else tuple((", ".join(p["at"]), float(p["probability"])) for p in places),
+                    quantity(late["value"], "s", 3) if late.get("value") is not None else "",
+                )
+            )
+        return tuple(found)
+
+    @property
+    def remainder(self) -> str:
+        """Sentence on what is left with the findings in the model; empty where that is noise, or where nothing was found."""
+        left = self.diagnosis.get("remainder") or {}
+        if (
+            not self.missing
+            or not self.added
+            or not left
+            or (left.get("below_tolerance") and not self.diagnosis.get("doubt"))
+        ):
+            return ""
+        share, held = left.get("share"), left.get("held_out")
+        parts = []
+        if (
+            isinstance(share, int | float)
+            and not math.isnan(share)
+            and (left.get("p") or 0.0) < 0.05
+            and share >= 0.005
+        ):
+            at = f"; an unknown input at {left['at']} would explain it" if left.get("at") else ""
+            parts.append(f"{100 * share:.0f} % of the gap is left and is not noise{at}")
+        if isinstance(held, int | float) and held >= 0.005:
+            where = f", most of it in {left['record']}" if left.get("record") else ""
+            times = (
+                f" ({left['record_units']:.3g} times the noise)"
+                if left.get("record") and left.get("record_units")
+                else ""
+            )
+            parts.append(f"on held-out recordings {100 * held:.0f} % is left{where}{times}")
+        return ". ".join(p[:1].upper() + p[1:] for p in parts)
+
+    @property
+    def next(self) -> str:
+        """What to record next: what tells likely effects apart, else what tells the parameters best; empty where none is known."""
+        for advice in (
+            self.diagnosis.get("separating_experiment"),
+            self.results.get("identifiability").get("recommended_experiment"),
+        ):
+            said = str((advice or {}).get("text") or "").strip()
+            if said:
+                return said[:1].upper() + said[1:].rstrip(".") + "."
+        return ""
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """The reason of every stage that failed, by its name."""
+        stages = self.results.get("run").get("stages") or {}
+        found = {n: str(s["failed"]) for n, s in stages.items() if s.get("failed")}
+        for name, data in self.results.stages.items():
+            if data.get("status") == "failed" and data.get("stage") not in found:
+                found[str(data.get("stage") or name)] = str(data.get("message", ""))
+        return found
+
+
+def _entries(table: Table) -> Iterable[tuple[Signal, float]]:
+    for output, line in table.items():
+        for experiment, error in line.items():
+            if error is not None:
+                yield (output, experiment), float(error)
+
+
+def _joined(gap: Mapping[str, Table]) -> dict[str, dict[str, float | None]]:
+    """The errors of fitted and held-out experiments in one table."""
+    found: dict[str, dict[str, float | None]] = {}
+    for part in gap.values():
+        for output, line in part.items():
+            found.setdefault(output, {}).update(line)
+    return found

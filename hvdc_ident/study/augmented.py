@@ -1,0 +1,97 @@
+"""The model with the effects of a diagnosis beside the recordings: its curves, its errors and the intervals of its values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvdc_ident.errors import ComputationError
+from hvdc_ident.files import plain
+from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.adequacy import adequacy
+from hvdc_ident.fit.assessment import Curve
+from hvdc_ident.fit.noise_model import MISFIT, source_of, source_text
+from hvdc_ident.fit.uncertainty import estimates_of, uncertainty
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.simulate import ModelSimulator, simulate
+from hvdc_ident.study import fitting
+
+if TYPE_CHECKING:
+    from hvdc_ident.discrepancy import Diagnosis
+    from hvdc_ident.study.study import Study
+
+
+def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what discrepancy.json says of the augmented model beside the recordings, and a CSV file of its curves by name.
+
+    fitted: the parameters that the diagnosis estimated. The JSON holds `rmse_after`, `windowed_errors` and `estimates_after`, as
+    fit.json does of the fit. Experiments that the model cannot be run on are left out, and so are those with unknowns of their
+    own, whose values a diagnosis does not keep. Nothing is returned where no effect was put in.
+    """
+    if found.augmented is None:
+        return {}, {}
+    curves: dict[str, dict[str, Curve]] = {}
+    files: dict[str, str] = {}
+    for e in study.experiments:
+        if e.nuisance or e.measured is None:
+            continue
+        try:
+            run = simulate(found.augmented, e, found.parameters_after).trajectory
+        except ComputationError:  # its error is missing in `gap` too
+            continue
+        curves[e.name] = fitting.curves_of_run(e, run)
+        files[f"discrepancy.{e.name}.csv"] = fitting.curves_csv(e, curves[e.name])
+    rmse: dict[str, dict[str, float]] = {}
+    for name, line in curves.items():
+        for output, curve in line.items():
+            rmse.setdefault(output, {})[name] = float(np.sqrt(np.mean(curve.misfit**2)))
+    data = {
+        "rmse_after": rmse,
+        "windowed_errors": fitting.errors_in_windows(study, curves),
+        "estimates_after": _estimates(study, found, fitted, curves),
+    }
+    return data, files
+
+
+def _estimates(
+    study: Study, found: Diagnosis, fitted: Sequence[str], curves: Mapping[str, Mapping[str, Curve]]
+) -> dict[str, Any]:
+    """Return the fitted parameters of the augmented model with 95 % intervals, at the values of the diagnosis.
+
+    By the curvature of the cost there, widened for correlated residuals and a misfit above the noise, as those of a fit are;
+    the parameters of the effects are unknowns too. Empty where an experiment has unknowns of its own.
+    """
+    model = found.augmented
+    assert model is not None
+    if any(e.nuisance for e in study.experiments):
+        return {}
+    added = [n for n in model.parameters if n not in study.model.parameters]
+    unknowns = [FitParameter.of(n, model.parameters[n]) for n in (*fitted, *added)]
+    free = tuple(u for u in unknowns if not u.on_bound(u.start))
+    if not any(u.name in fitted for u in free):
+        return {}
+    problem = Problem(ModelSimulator(model), study.experiments, free, weights=FrozenMap(_misfit(study, curves)))
+    try:
+        blocks = problem.blocks(problem.start)
+    except ComputationError:
+        return {}
+    sources = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
+    spans = np.array([u.span for u in problem.unknowns])
+    known = uncertainty(blocks, problem.names, spans, problem.noise_source, None, problem.noise_dof)
+    known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
+    estimates = estimates_of(problem, problem.start, blocks, known, known)
+    return {n: plain(estimates[n]) for n in fitted if n in estimates}
+
+
+def _misfit(study: Study, curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, float]:
+    """Return the standard deviation of the misfit of every output whose noise is not known, over the fitted recordings."""
+    fitted = tuple(e for e in study.experiments if e.role == "fit" and e.outputs)
+    found = {}
+    for output in dict.fromkeys(o for e in fitted for o in e.outputs):
+        if source_of(fitted, output) == MISFIT:
+            parts = [line[output].misfit for e in fitted if output in (line := curves.get(e.name, {}))]
+            if parts:
+                found[output] = float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+    return found
