@@ -7,7 +7,7 @@
     hi.sweep        errors over a range of parameters            hi.sensitivities   exact derivatives of everything
     hi.identify     what the data tell about the parameters      hi.fit         the estimates, with intervals
     hi.diagnose     what the model lacks                         hi.export      to an FMU, Modelica, MATLAB, CSV
-    hi.compare_runs two results side by side
+    hi.compare_runs two results side by side                     hi.new_study   a study of recordings and a model
 
 Each takes a model (`hi.Model`, a shipped name, a path), data (`hi.Experiment`, a table, a study) or a whole study.
 """
@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from hvdc_ident.sensitivity import SweepResult, linear_sensitivities, morris, sobol
     from hvdc_ident.simulate import Simulation
     from hvdc_ident.study.comparison import RunComparison, compare_runs
+    from hvdc_ident.study.new_study import new_study
     from hvdc_ident.study.study import Study, load_study
 
     __version__: str
@@ -122,6 +123,7 @@ __all__ = [
     "morris",
     "multisine",
     "ncf_margin",
+    "new_study",
     "nu_gap",
     "one_sided",
     "plant_and_controller",
@@ -161,6 +163,7 @@ _imported = offered(
         "sensitivity": "SweepResult linear_sensitivities morris sobol",
         "simulate": "Simulation",
         "study.comparison": "RunComparison compare_runs",
+        "study.new_study": "new_study",
         "study.study": "Study load_study",
     },
 )

@@ -91,9 +91,33 @@ def new(
     folder: Annotated[
         Path, typer.Argument(metavar="DIR", help="Folder to make; it must not hold a study.", show_default=False)
     ],
+    recordings: Annotated[
+        list[Path] | None,
+        option("--from", "FILE", "A recording to make an experiment of, of any waveform format; may be repeated."),
+    ] = None,
+    model: Annotated[str | None, option("--model", "MODEL", "With --from: a shipped model, or a path.")] = None,
     console: Console,
+    access: Access,
 ) -> None:
-    """Write a commented study, with data, to start from."""
+    """Write a commented study to start from: an example with data, or one of recordings and a model.
+
+    With --from and --model, columns are mapped to the model's inputs and outputs by name and unit.
+    """
+    if (recordings is None) != (model is None):
+        raise InputError(
+            "--from and --model go together",
+            where="the command line",
+            expected="recordings and their model, or neither for an example",
+            got="--from alone" if recordings else "--model alone",
+            hint="--from recording.csv --model card.toml; `hvdc-ident models` lists the shipped ones",
+        )
+    if recordings and model:
+        from hvdc_ident.study.new_study import new_study
+
+        found = new_study(folder, recordings, model, trust=access.trust, limits=access.limits)
+        console.print_json(found.to_dict())
+        console.say(*found.lines)
+        return
     from hvdc_ident.study.examples import write_starter
 
     path = write_starter(folder)

@@ -132,9 +132,9 @@ def write_card(model: Model) -> str:
 
     Raises ExpressionError with the place for an expression that the card's grammar has no words for.
     """
-    lines = [f"schema = {SCHEMA}", f"name = {_string(model.name)}"]
+    lines = [f"schema = {SCHEMA}", f"name = {toml_string(model.name)}"]
     if model.description:
-        lines.append(f"description = {_string(model.description)}")
+        lines.append(f"description = {toml_string(model.description)}")
     for section in SECTIONS:
         items: Mapping[str, Any] = getattr(model, section)
         place = f"model '{model.name}', {SECTIONS[section][2]}"
@@ -145,7 +145,7 @@ def write_card(model: Model) -> str:
             lines += ["", f"[{section}]"]
             for name, item in items.items():
                 written = _item(item, section, f"{place} '{name}'")
-                lines.append(f"{_key(name)} = {written}")
+                lines.append(f"{toml_key(name)} = {written}")
     return "\n".join(lines) + "\n"
 
 
@@ -155,17 +155,17 @@ def save_card(model: Model, path: str | Path) -> Path:
 
 
 def _parameterisation(name: str, item: Parameterisation, place: str) -> Iterator[str]:
-    head = f"parameterisations.{_key(name)}"
+    head = f"parameterisations.{toml_key(name)}"
     yield from ("", f"[{head}]")
     if item.description:
-        yield f"description = {_string(item.description)}"
+        yield f"description = {toml_string(item.description)}"
     yield from ("", f"[{head}.parameters]")
     for new, parameter in item.parameters.items():
-        yield f"{_key(new)} = {_item(parameter, 'parameters', place)}"
+        yield f"{toml_key(new)} = {_item(parameter, 'parameters', place)}"
     yield from ("", f"[{head}.replaces]")
     for replaced, expression in item.replaces.items():
         text = _value(expression, f"{place}, replaced '{replaced}'")
-        yield f"{_key(replaced)} = {text}"
+        yield f"{toml_key(replaced)} = {text}"
 
 
 def _item(item: Any, section: str, place: str) -> str:
@@ -182,12 +182,12 @@ def _is_given(field: Field[Any], value: Any) -> bool:
 
 def _value(value: Any, place: str) -> str:
     if isinstance(value, str):
-        return _string(value)
+        return toml_string(value)
     if isinstance(value, float):
         return _float(value)
     if isinstance(value, sp.Expr):
         try:
-            return _string(to_text(value))
+            return toml_string(to_text(value))
         except ExpressionError as e:
             raise e.at(place) from None
     raise ModelError("the value cannot be written to a card", where=place, got=type(value).__name__)
@@ -197,11 +197,11 @@ def _float(value: float) -> str:
     return ("inf" if value > 0 else "-inf") if math.isinf(value) else repr(value)
 
 
-def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else _string(name)
+def toml_key(name: str) -> str:
+    return name if _BARE.fullmatch(name) else toml_string(name)
 
 
-def _string(text: str) -> str:
+def toml_string(text: str) -> str:
     return '"' + "".join(_ESCAPES.get(c) or (c if _is_plain(c) else f"\\u{ord(c):04x}") for c in text) + '"'
 
 

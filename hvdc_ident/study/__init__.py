@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     )
     from hvdc_ident.study.executors import LocalPool, open_executor
     from hvdc_ident.study.fitting import problem_of
+    from hvdc_ident.study.new_study import NewStudy, new_study
     from hvdc_ident.study.pipeline import run_all, run_stage
     from hvdc_ident.study.stages import Stage, StageOptions, StageResult
     from hvdc_ident.study.study import Study, load_study
@@ -29,6 +30,7 @@ else:
             "examples": "Campaign Noise experiments recorded write_demo write_starter write_waveforms",
             "executors": "LocalPool open_executor",
             "fitting": "problem_of",
+            "new_study": "NewStudy new_study",
             "pipeline": "run_all run_stage",
             "stages": "Stage StageOptions StageResult",
             "study": "Study load_study",
@@ -39,6 +41,7 @@ else:
 __all__ = [
     "Campaign",
     "LocalPool",
+    "NewStudy",
     "Noise",
     "RunComparison",
     "Stage",
@@ -49,6 +52,7 @@ __all__ = [
     "compare_runs",
     "experiments",
     "load_study",
+    "new_study",
     "open_executor",
     "problem_of",
     "recorded",

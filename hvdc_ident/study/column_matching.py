@@ -1,0 +1,226 @@
+"""Which column of a recording is which signal of a model: by name, else by unit and level before the event.
+
+A name matches exactly, or but for case and punctuation. What is left is compared by unit and level, and only where a signal
+and a column are each other's only candidates is one mapped for that reason, which is told: many signals of a per-unit model
+rest at 1 or at 0, so a level alone is no evidence, and a wrong column gives a wrong fit without a word. All else is proposed.
+A column whose unit can be converted only with a rated base is proposed with the base that the levels suggest, and not mapped.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, conversion, noise_estimate
+from hvdc_ident.model import AnyModel
+from hvdc_ident.text import quantity
+
+Kind = Literal["input", "output"]
+SHOWN = 3
+"""Signals that are proposed for one column, those of the nearest level."""
+NEAR = math.sqrt(2.0)
+"""Largest factor between two levels of one quantity: the smallest between two ways of counting it, peak and rms."""
+CERTAIN = 3.0
+"""Standard deviations of the noise within which two levels are the same."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A signal of the model that a column may be: its unit, and its level before the event, None where it is not known."""
+
+    name: str
+    kind: Kind
+    unit: str
+    level: float | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a recording: its unit, its level before the event and the noise about it, in that unit.
+
+    gaps: rows in which it is not recorded. quiet: whether the level is a mean of rows before an event, not the first row.
+    """
+
+    name: str
+    unit: str
+    level: float | None
+    noise: float
+    gaps: int
+    quiet: bool = True
+
+    @property
+    def place(self) -> str:
+        """Where the level is read, in words."""
+        return "before the event" if self.quiet else "in the first row"
+
+    def converted(self, unit: str) -> tuple[float, float] | None:
+        """Return scale and offset to another unit, None where there is no conversion; the same where a unit is not stated."""
+        return conversion(self.unit, unit) if self.unit and unit else (1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Match:
+    """A column that is taken for a signal, or may be: the reason in words. base: rated base to be stated, in the column's unit."""
+
+    target: Target
+    column: Column
+    reason: str
+    base: float | None = None
+
+
+@dataclass(frozen=True)
+class Matching:
+    """The columns of a recording by signal. mapped: what is used. proposed: candidates for other signals, the nearest first.
+
+    unused: names of columns that are neither. missing: signals for which there is not even a candidate.
+    """
+
+    mapped: tuple[Match, ...]
+    proposed: tuple[Match, ...]
+    unused: tuple[str, ...]
+    missing: tuple[Target, ...]
+
+
+def columns_of(record: Trajectory, event: float | None) -> tuple[Column, ...]:
+    """Return the columns of a recording that hold numbers. event: s; without one the first row tells the level."""
+    found = []
+    for name, unit in zip(record.names, record.units, strict=True):
+        values = record[name]
+        if not np.isnan(values).all():
+            level, noise, quiet = _rest(record.time, values, event)
+            found.append(Column(name, unit, level, noise, int(np.isnan(values).sum()), quiet))
+    return tuple(found)
+
+
+def targets_of(model: AnyModel, levels: Mapping[str, float]) -> tuple[Target, ...]:
+    """Return the inputs and outputs of a model. levels: before the event, by name, as far as they are known."""
+    inputs = [Target(n, "input", i.unit, levels.get(n, i.value)) for n, i in model.inputs.items()]
+    return (*inputs, *(Target(n, "output", o.unit, levels.get(n)) for n, o in model.outputs.items()))
+
+
+def match_names(columns: Sequence[Column], targets: Sequence[Target]) -> dict[str, Match]:
+    """Return by signal the column of its name, exactly, else but for case and punctuation where only one has it.
+
+    Where the units need a base, or an input has gaps, there is a match too: `usable` tells.
+    """
+    found: dict[str, Match] = {}
+    by_name = {c.name: c for c in columns}
+    for target in targets:
+        if target.name in by_name:
+            found[target.name] = Match(target, by_name[target.name], "the same name")
+    taken = {m.column.name for m in found.values()}
+    for target in (t for t in targets if t.name not in found):
+        alike = [c for c in columns if c.name not in taken and _bare(c.name) == _bare(target.name)]
+        others = [t for t in targets if t.name not in found and _bare(t.name) == _bare(target.name)]
+        if len(alike) == 1 and len(others) == 1:
+            found[target.name] = Match(target, alike[0], "the same name but for case and punctuation")
+    return found
+
+
+def matching(columns: Sequence[Column], targets: Sequence[Target]) -> Matching:
+    """Return the columns by signal. The targets' levels are those of the model at the inputs that names map."""
+    named = match_names(columns, targets)
+    mapped = [m for m in named.values() if usable(m)]
+    proposed = [_with_base(m) for m in named.values() if not usable(m)]
+    taken = {m.column.name for m in named.values()}
+    free = [c for c in columns if c.name not in taken]
+    pairs = {c.name: [m for t in targets if t.name not in named and (m := _candidate(t, c))] for c in free}
+    wanted = [m.target.name for matches in pairs.values() for m in matches]
+    for matches in pairs.values():
+        only = len(matches) == 1 and wanted.count(matches[0].target.name) == 1
+        if only and matches[0].column.unit and matches[0].target.unit and _is_near(matches[0]):
+            mapped.append(matches[0])
+        else:
+            proposed += sorted(matches, key=_far)[:SHOWN]
+    named_columns = {m.column.name for m in (*mapped, *proposed)}
+    known = {m.target.name for m in (*mapped, *proposed)}
+    return Matching(
+        tuple(mapped),
+        tuple(proposed),
+        tuple(c.name for c in columns if c.name not in named_columns),
+        tuple(t for t in targets if t.name not in known),
+    )
+
+
+def usable(match: Match) -> bool:
+    """Return whether a column can be used as it is: its unit converts to the signal's, and an input has no gaps."""
+    converts = match.column.converted(match.target.unit) is not None
+    return converts and not (match.target.kind == "input" and match.column.gaps)
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"[\W_]+", "", name.casefold())
+
+
+def _rest(time: Array, values: Array, event: float | None) -> tuple[float | None, float, bool]:
+    """The mean before the event, the noise about it, and True; without quiet rows the first value, no noise, and False."""
+    known = np.isfinite(values)
+    before = known & (time < event) if event is not None else np.zeros(time.size, dtype=bool)
+    if int(before.sum()) < FEWEST_QUIET:
+        return (float(values[known][0]) if known.any() else None), 0.0, False
+    return float(values[before].mean()), float(noise_estimate(time, values, event)), True
+
+
+def _candidate(target: Target, column: Column) -> Match | None:
+    """A column that may be a signal: of a unit that converts to the signal's, or of no stated unit and at the signal's level."""
+    by = column.converted(target.unit)
+    if by is None or (target.kind == "input" and column.gaps):
+        return None
+    stated = bool(column.unit and target.unit)
+    reason = f"its unit {column.unit}" if stated else "its level, for no unit is stated"
+    if stated and column.unit != target.unit:
+        reason += f", converted to {target.unit}"
+    if column.level is not None and target.level is not None:
+        reads = quantity(by[0] * column.level + by[1], target.unit)
+        reason += f"; it reads {reads} {column.place}, the model is at {quantity(target.level, target.unit)}"
+    match = Match(target, column, reason)
+    return match if stated or _is_near(match) else None
+
+
+def _levels(match: Match) -> tuple[float, float, float] | None:
+    """Recorded level, model's level and the noise, in the model's unit; None where one is not known."""
+    by = match.column.converted(match.target.unit)
+    if by is None or match.column.level is None or match.target.level is None:
+        return None
+    return by[0] * match.column.level + by[1], match.target.level, abs(by[0]) * match.column.noise
+
+
+def _is_near(match: Match) -> bool:
+    """Return whether both levels are known and those of one quantity: within the noise, or by less than a way of counting."""
+    known = _levels(match)
+    if known is None:
+        return False
+    recorded, level, noise = known
+    same = abs(recorded - level) <= CERTAIN * noise or recorded == level
+    return same or (recorded * level > 0.0 and abs(math.log(recorded / level)) < math.log(NEAR))
+
+
+def _far(match: Match) -> float:
+    """How far the levels are apart, over the larger one; those that are not known last."""
+    known = _levels(match)
+    if known is None:
+        return math.inf
+    size = max(abs(known[0]), abs(known[1]))
+    return abs(known[0] - known[1]) / size if size else 0.0
+
+
+def _with_base(match: Match) -> Match:
+    """Return a match of names that cannot be used, with the reason, and the base that its levels suggest."""
+    column, target = match.column, match.target
+    if column.converted(target.unit) is not None:
+        return Match(
+            target,
+            column,
+            f"{match.reason}, but not recorded in {column.gaps} row{'s' if column.gaps > 1 else ''}, and an input is needed all along",
+        )
+    reason = f"{match.reason}, but in {column.unit}, which converts to {target.unit} only with a rated base"
+    if column.level is None or not target.level or column.level * target.level <= 0.0:
+        return Match(target, column, reason)
+    base = float(f"{column.level / target.level:.3g}")
+    levels = f"{quantity(column.level, column.unit)} {column.place}, {quantity(target.level, target.unit)} in the model"
+    return Match(target, column, f"{reason}: {levels}", base)

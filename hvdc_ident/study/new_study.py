@@ -1,0 +1,336 @@
+"""A study from recordings and a model: columns mapped to signals, and what could not be mapped said with its candidates."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hvdc_ident.data import Experiment, Trajectory, event_time, input_signal, scaled
+from hvdc_ident.display import Shown
+from hvdc_ident.errors import ComputationError, InputError, located
+from hvdc_ident.files import write_text
+from hvdc_ident.formats import read_waveforms
+from hvdc_ident.model import AnyModel
+from hvdc_ident.model.card import toml_key, toml_string
+from hvdc_ident.models import is_shipped, load_model
+from hvdc_ident.study import schema
+from hvdc_ident.study.column_matching import (
+    Match,
+    Matching,
+    Target,
+    columns_of,
+    match_names,
+    matching,
+    targets_of,
+    usable,
+)
+from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
+from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
+from hvdc_ident.text import listed, quantity
+
+MOST_LISTED = 40
+"""Parameters and columns that a comment lists."""
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """One recording of a new study: its experiment's name, its file, its columns, and what was found in it as `check` finds it.
+
+    levels: why the model's levels are not known; empty where they are. experiment: None where no output is mapped.
+    """
+
+    name: str
+    source: Path
+    data: str
+    columns: Matching
+    levels: str
+    experiment: Experiment | None
+    noise: Mapping[str, NoiseNote]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NewStudy(Shown):
+    """A study that was written. path: its file. model: of the study. recordings: one for each experiment."""
+
+    path: Path
+    model: AnyModel
+    recordings: tuple[Mapped, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return by experiment which column is which signal, the candidates of the others, and what is not used."""
+        experiments = {}
+        for r in self.recordings:
+            e = r.experiment
+            experiments[r.name] = {
+                "data": r.data,
+                "mapped": {m.target.name: _about(m) for m in r.columns.mapped},
+                "proposed": [{"signal": m.target.name, **_about(m), "base": m.base} for m in r.columns.proposed],
+                "missing": [t.name for t in r.columns.missing],
+                "unused": list(r.columns.unused),
+                "event": e.event if e else None,
+                "noise": {o: n.std for o, n in r.noise.items()},
+            }
+        return {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
+
+    @property
+    def lines(self) -> list[str]:
+        """The screen as lines, which are as long as they are."""
+        found: list[str] = []
+        for block in self._screen():
+            found += [*str(block).splitlines(), ""] if str(block) else []
+        return found[:-1]
+
+    def _screen(self) -> Iterator[str]:
+        number = len(self.recordings)
+        yield f"{self.path} is written: model {self.model.name}, {number} experiment{'s' if number > 1 else ''}"
+        for r in self.recordings:
+            yield _found(r)
+            used = [
+                f"{m.target.kind} {m.target.name} = column {m.column.name}: {_unit_words(m)}" for m in r.columns.mapped
+            ]
+            yield "\n".join([*used, *_open_lines(r)])
+        proposed = any(r.columns.proposed for r in self.recordings)
+        first = f"take out the # before the candidates that are right in {self.path}, then " if proposed else ""
+        yield f"Next: {first}hvdc-ident check {self.path}"
+
+
+def new_study(
+    folder: str | Path,
+    recordings: str | Path | Sequence[str | Path],
+    model: str | Path,
+    *,
+    trust: bool = False,
+    limits: Mapping[str, float] | None = None,
+) -> NewStudy:
+    """Write a study of recordings and a model into a folder, and return what was mapped and what was not.
+
+    recordings: files of any known waveform format, one experiment each. model: a shipped name, or the path of a card, an
+    FMU or a Python file (trust: it may run). limits: of an FMU. The study refers to the files where they are.
+
+    Columns are mapped to inputs and outputs by name, exactly or but for case and punctuation; units are converted. Where a
+    signal and a column are each other's only candidates by unit, and the levels before the event agree, they are mapped too.
+    Everything else is a comment in the study with its candidates. Raises InputError where the folder holds a study, or a file or
+    the model cannot be used.
+
+    >>> import tempfile, numpy as np, hvdc_ident as hi
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     data = Path(folder, "step.csv")
+    ...     _ = data.write_text("time [s],PREF_2 [pu],P2 [pu],spare [kV]\\\\n0,0.4,0.4,1\\\\n0.1,0.5,0.42,1\\\\n0.2,0.5,0.45,1\\\\n")
+    ...     found = hi.new_study(Path(folder, "study"), data, "vsc-hvdc-link")
+    ...     study = hi.load_study(found.path)
+    >>> [(m.target.name, m.column.name) for m in found.recordings[0].columns.mapped], study.experiments[0].outputs
+    ([('Pref2', 'PREF_2'), ('P2', 'P2')], ('P2',))
+    """
+    path = Path(folder) / "study.toml"
+    if path.exists():
+        raise InputError("the folder already holds a study", where=str(path), hint="a new folder")
+    files = [Path(recordings)] if isinstance(recordings, str | Path) else [Path(r) for r in recordings]
+    if not files:
+        raise InputError("no recording", where=str(folder), expected="at least one file of waveforms")
+    with located("model"):
+        plant = load_model(model, trust=trust, limits=dict(limits) if limits else None)
+    names = _names(files)
+    mapped = tuple(_mapped(path.parent, file, name, plant) for file, name in zip(files, names, strict=True))
+    source = str(model) if is_shipped(str(model)) else _relative(Path(model), path.parent)
+    write_schemas(path.parent)
+    write_text(path, "\n".join(_study_text(path, source, plant, mapped)) + "\n")
+    return NewStudy(path, plant, mapped)
+
+
+def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
+    record = read_waveforms(file)
+    named = match_names(columns_of(record, None), targets_of(model, {}))
+    moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
+    event = event_time({m.target.name: input_signal(record.time, _values(record, m)) for m in moved})
+    inputs = [m for m in moved if usable(m)]
+    levels, why = _levels(model, {m.target.name: float(_values(record, m)[0]) for m in inputs})
+    found = matching(columns_of(record, event), targets_of(model, levels))
+    data = _relative(file, folder)
+    by_kind = {
+        kind: {m.target.name: m.column.name for m in found.mapped if m.target.kind == kind}
+        for kind in ("input", "output")
+    }
+    if not by_kind["output"]:
+        return Mapped(name, file, data, found, why, None, {})
+    table = schema.ExperimentTable(name=name, data=file.name, inputs=by_kind["input"], outputs=by_kind["output"])
+    (experiment,), notes = read_experiments([table], model, Recordings(file.parent), str(file))
+    return Mapped(name, file, data, found, why, experiment, notes[name])
+
+
+def _values(record: Trajectory, match: Match) -> Any:
+    """The values of a column in the signal's unit."""
+    scale, offset = match.column.converted(match.target.unit) or (1.0, 0.0)
+    return scaled(record[match.column.name], scale) + offset
+
+
+def _levels(model: AnyModel, inputs: Mapping[str, float]) -> tuple[dict[str, float], str]:
+    """The model's inputs and outputs in the steady state of these inputs, and why they are not known."""
+    from hvdc_ident.linearize import find_operating_point
+
+    try:
+        point = find_operating_point(model, dict(inputs))
+    except (InputError, ComputationError) as error:
+        return dict(inputs), f"the model's levels before the event are not known: {error}"
+    return {**point.inputs, **point.outputs}, ""
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Names of the experiments: those of the files, with what no file name takes left out, each once."""
+    names: list[str] = []
+    for file in files:
+        stem = re.sub(r"[^\w .+-]", "-", file.stem).lstrip(" .+-")[:80] or "recording"
+        name, number = stem, 2
+        while name.lower() in (n.lower() for n in names):
+            name, number = f"{stem}-{number}", number + 1
+        names.append(name)
+    return names
+
+
+def _relative(file: Path, folder: Path) -> str:
+    """The path of a file as seen from the study's folder; the absolute one where there is no way, as between drives."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return file.resolve().as_posix()
+
+
+def _about(match: Match) -> dict[str, str]:
+    return {"column": match.column.name, "kind": match.target.kind, "reason": match.reason}
+
+
+def _found(r: Mapped) -> str:
+    """What was found in a recording, as `check` finds it."""
+    e = r.experiment
+    if e is None:
+        return f"{r.name}: no output could be mapped; the study has the candidates as comments, and the experiment too"
+    event = f"event at {e.event:g} s" if e.event is not None else "no event found"
+    return f"{r.name}: {e.time.size} rows, {e.time[0]:g} to {e.time[-1]:g} s, {event}; noise {_noise(r)}"
+
+
+def _noise(r: Mapped) -> str:
+    units = {m.target.name: m.target.unit for m in r.columns.mapped}
+    return ", ".join(
+        f"{o} {quantity(n.std, units.get(o, ''), 3)} (before the event)"
+        if n.source == "estimated"
+        else f"{o} from the fit"
+        for o, n in r.noise.items()
+    )
+
+
+def _open_lines(r: Mapped) -> Iterator[str]:
+    """What could not be mapped, in lines."""
+    if r.levels:
+        yield r.levels
+    for name, matches in _by_column(r.columns.proposed).items():
+        may_be = "; ".join(f"{m.target.kind} {m.target.name} ({m.reason}{_base_words(m)})" for m in matches)
+        yield f"column {name} is not mapped; candidates: {may_be}"
+    inputs = [t for t in r.columns.missing if t.kind == "input"]
+    if inputs:
+        yield f"inputs without a column keep their values: {', '.join(_value(t) for t in inputs)}"
+    outputs = [t.name for t in r.columns.missing if t.kind == "output"]
+    if outputs:
+        yield f"outputs without a column: {', '.join(outputs[:MOST_LISTED])}{_more(outputs)}"
+    if r.columns.unused:
+        yield f"columns not used: {', '.join(r.columns.unused[:MOST_LISTED])}{_more(r.columns.unused)}"
+
+
+def _more(names: Sequence[Any]) -> str:
+    return f" and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+
+
+def _value(target: Target) -> str:
+    return f"{target.name} = {quantity(target.level or 0.0, target.unit)}"
+
+
+def _by_column(matches: Iterable[Match]) -> dict[str, list[Match]]:
+    groups: dict[str, list[Match]] = {}
+    for m in matches:
+        groups.setdefault(m.column.name, []).append(m)
+    return groups
+
+
+def _base_words(match: Match) -> str:
+    return "" if match.base is None else f": base = {match.base:g} {match.column.unit}?"
+
+
+def _study_text(path: Path, source: str, model: AnyModel, recordings: Sequence[Mapped]) -> Iterator[str]:
+    yield SCHEMA_LINE
+    yield f"# A study of {listed(_comment(r.source.name) for r in recordings)}, written by `hvdc-ident new --from`."
+    yield "# Read it from top to bottom, take out the # before what is right, then: hvdc-ident check study.toml"
+    yield from ("schema = 1", f"name = {toml_string(path.parent.resolve().name or 'study')}", "")
+    yield from ("[model]", f"source = {toml_string(source)}", "")
+    yield "# What may be estimated: take out the # of some parameters, and narrow their bounds."
+    yield "[parameters]"
+    for name, p in list(model.parameters.items())[:MOST_LISTED]:
+        bounds = "" if math.isinf(p.min) and math.isinf(p.max) else f"within [{p.min:g}, {p.max:g}]"
+        about = ", ".join(t for t in (p.unit, bounds, p.description) if t)
+        yield f"# {toml_key(name)} = {{start = {p.value!r}}}" + (f"   # {_comment(about)}" if about else "")
+    more = len(model.parameters) - MOST_LISTED
+    yield from [f"# and {more} more parameters of the model"] if more > 0 else []
+    for r in recordings:
+        yield from ("", *_experiment_text(r))
+    yield ""
+    yield "# The stages. A stage runs if its table is in this file; `simulate` always runs."
+    yield from ("# [fit]            # needs some [parameters]", "# [diagnose]       # what the model lacks")
+
+
+def _experiment_text(r: Mapped) -> Iterator[str]:
+    """The lines of one experiment; all of them comments where no output is mapped, as none may be without."""
+    mark = "" if r.experiment is not None else "# "
+    yield f"# {_found(r)}"
+    yield f"{mark}[[experiment]]"
+    yield f"{mark}name = {toml_string(r.name)}"
+    yield f"{mark}data = {toml_string(r.data)}"
+    yield '# role = "holdout"   # not fitted: validates the estimates'
+    if r.experiment is not None and r.experiment.event is not None:
+        yield f"# event = {r.experiment.event!r}   # s, as found from the inputs"
+    if r.levels:
+        yield f"# {_comment(r.levels)}"
+    bases: list[Match] = []
+    for kind in ("input", "output"):
+        mapped = [m for m in r.columns.mapped if m.target.kind == kind]
+        proposed = [m for m in r.columns.proposed if m.target.kind == kind]
+        missing = [t for t in r.columns.missing if t.kind == kind]
+        yield from (
+            "",
+            f"{mark if mapped or kind == 'output' else '# '}[experiment.{kind}s]   # signal of the model = column",
+        )
+        for m in mapped:
+            yield f"{mark}{toml_key(m.target.name)} = {toml_string(m.column.name)}   # {_comment(_unit_words(m))}"
+        for m in proposed:
+            yield f"# {toml_key(m.target.name)} = {toml_string(m.column.name)}   # {_comment(m.reason)}"
+        if missing:
+            shown = ", ".join(_value(t) if kind == "input" else t.name for t in missing[:MOST_LISTED])
+            at = ", at the model's values" if kind == "input" else ""
+            yield f"# without a column{at}: {_comment(shown)}{_more(missing)}"
+        bases += [m for m in proposed if m.column.converted(m.target.unit) is None]
+    if bases:
+        yield from ("", "# [experiment.columns]   # with the lines above: recorded / base = value in the model")
+        for m in bases:
+            base = "..." if m.base is None else repr(m.base)
+            yield f"# {toml_key(m.target.name)} = {{unit = {toml_string(m.column.unit)}, base = {base}}}"
+    if r.columns.unused:
+        yield f"# columns not used: {_comment(', '.join(r.columns.unused[:MOST_LISTED]))}{_more(r.columns.unused)}"
+
+
+def _unit_words(match: Match) -> str:
+    """The reason of a mapping, and what becomes of the unit."""
+    unit, wanted = match.column.unit, match.target.unit
+    if not unit:
+        return f"{match.reason}; the file states no unit: taken as {wanted}" if wanted else match.reason
+    return (
+        match.reason
+        if unit == wanted or not wanted or "converted" in match.reason
+        else f"{match.reason}; {unit} is converted to {wanted}"
+    )
+
+
+def _comment(text: str) -> str:
+    """Text that stays on the line of a comment, without control characters."""
+    return "".join(c if c.isprintable() else " " for c in text)
