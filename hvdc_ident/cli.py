@@ -290,6 +290,10 @@ def letter(
         page, done = write(loaded, out or loaded.folder, work.options(console, progress))
     console.print_json({"schema": 1, "file": page.as_posix(), "verdict": done.data.get("verdict")})
     console.say(f"letter: {page}")
+    if loaded.settings.letter is None:
+        console.say(
+            "It names no author, addressee or plant: [letter] in the study takes author, to, plant, version, date."
+        )
     if open_:
         open_page(page)
 

@@ -98,12 +98,16 @@ class Answers:
     def rmse(self) -> dict[str, Table]:
         """Root mean square error by set of values, output and experiment, of the sets that there are."""
         found: dict[str, Table] = {}
-        if given := self.fit.get("rmse_given") or self.results.get("simulation").get("rmse"):
-            found["given"] = given
+        gap = self.diagnosis.get("gap") or {}
+        found["given"] = (
+            self.fit.get("rmse_given")
+            or self.results.get("simulation").get("rmse")
+            or _joined(gap.get("nominal") or {})
+        )
         if self.fitted:
             found["fitted"] = self.fit.get("rmse") or {}
         if self.added:
-            found["effect"] = self.diagnosis.get("rmse_after") or _joined(self.diagnosis["gap"].get("augmented") or {})
+            found["effect"] = self.diagnosis.get("rmse_after") or _joined(gap.get("augmented") or {})
         return {n: t for n, t in found.items() if t}
 
     @property
@@ -126,7 +130,7 @@ class Answers:
         shares: dict[int, dict[Signal, float]] = {0: {}, 1: {}, 2: {}}
         for name in [n for n in ("given", "fitted") if n in self.rmse]:
             for (output, experiment), error in _entries(self.rmse[name]):
-                scales = (self.tolerance.get(output), self.results.noise(experiment, output))
+                scales = (self.tolerance.get(output), self.noise((output, experiment)))
                 for kind, scale in enumerate(scales):
                     if scale:
                         shares[kind][output, experiment] = max(
@@ -136,6 +140,18 @@ class Answers:
                     shares[2][output, experiment] = max(error / swing, shares[2].get((output, experiment), 0.0))
         ranked = next((s for s in shares.values() if s), {})
         return max(ranked, key=lambda signal: ranked[signal], default=None)
+
+    def noise(self, signal: Signal) -> float | None:
+        """The standard deviation of a signal's noise, in its unit; None where it is not known."""
+        output, experiment = signal
+        floor = (self.diagnosis.get("gap") or {}).get("noise_floor") or {}
+        return self.results.noise(experiment, output) or (None if self.fit else floor.get(output))
+
+    def interval(self, name: str, stage: str) -> tuple[float | None, float | None] | None:
+        """The 95 % interval of a parameter as the fit or the diagnosis ("discrepancy") found it."""
+        estimates = self.fit.get("estimates") if stage == "fit" else self.diagnosis.get("estimates_after")
+        ends = ((estimates or {}).get(name) or {}).get("ci95")
+        return (ends[0], ends[1]) if ends else None
 
     @property
     def tolerance(self) -> Mapping[str, float]:
@@ -174,13 +190,13 @@ class Answers:
 
     def _errors(self, name: str) -> Errors:
         table = self.rmse[name]
-        noisy = [(e, s) for (o, x), e in _entries(table) if (s := self.results.noise(x, o))]
+        noisy = [(e, s) for (o, x), e in _entries(table) if (s := self.noise((o, x)))]
         kept = self._kept(name)
         rmse = largest = times = None
         if self.worst is not None:
             output, experiment = self.worst
             rmse = (table.get(output) or {}).get(experiment)
-            noise = self.results.noise(experiment, output)
+            noise = self.noise(self.worst)
             times = rmse / noise if rmse is not None and noise else None
             run = overlay_of(self.results, experiment, output, (name,))
             largest = None if run is None else float(np.nanmax(np.abs(run.error(name)), initial=0.0))
@@ -224,21 +240,21 @@ class Answers:
         told = self.results.get("identifiability")
         lines = self.fit.get("candidates") or told.get("candidates") or {}
         after = self.diagnosis.get("parameters_after") or {} if self.added else {}
-        estimates, later = self.fit.get("estimates") or {}, self.diagnosis.get("estimates_after") or {}
+        lines = lines or {n: {"given": g} for n, g in (self.diagnosis.get("parameters_before") or {}).items()}
+        later = self.diagnosis.get("estimates_after") or {}
         held = self.fit.get("held") or {n: h.get("reason", "") for n, h in (told.get("held") or {}).items()}
         rows = []
         for name, line in lines.items():
             known = name in self.fitted or (name in later and name in after)
-            found = (later if name in after else estimates).get(name) or {}
-            ends = found.get("ci95") if known else None
+            ends = self.interval(name, "discrepancy" if name in after else "fit") if known else None
             rows.append(
                 Value(
                     name,
                     str(line.get("unit") or ""),
                     line.get("given"),
                     (self.fit.get("values") or {}).get(name) if name in self.fitted else None,
-                    after.get(name) if name in self.fitted or name in later else None,
-                    (ends[0], ends[1]) if ends else None,
+                    after.get(name) if name in self.fitted or name in later or not self.fit else None,
+                    ends,
                     "" if known else str(held.get(name) or ""),
                 )
             )

@@ -56,7 +56,7 @@ def _verdict(found: Answers) -> str:
         return "<p class='answer'>No recording was compared with the model.</p>"
     output, experiment = found.worst
     unit = str(found.results.units.get(output, ""))
-    noise = found.results.noise(experiment, output)
+    noise = found.noise(found.worst)
     in_unit = f", {text(unit)}" if unit else ""
     limit = "study’s tolerance" if found.tolerance else "windows"
     rows = [

@@ -1,7 +1,8 @@
-"""The letter: one page to the owner of a model, made from the results alone, and the first part of the report's page.
+"""The letter: one printed page to the owner of a model, made from the results alone.
 
-What is missed, what that is consistent with, whether the gains are to blame, what adding the effect gains on data it
-was not fitted to, what to record to be sure, and what is attached.
+Who writes to whom about which model; whether it follows the recordings; the values given, fitted and with what it lacks; what
+that is and what it does to the gains; what the owner is asked to confirm; what to record to be sure; and a figure of before
+and after.
 """
 
 from __future__ import annotations
@@ -10,25 +11,62 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
-from hvdc_ident.report.html import text
+from hvdc_ident.report.answers import Answers, Errors
+from hvdc_ident.report.html import badge, estimate, number, table, text
+from hvdc_ident.report.overlay import Sheet, overlay_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.text import form_of, listed, span
+from hvdc_ident.text import form_of, listed, quantity, span
 
 FILE = "letter.html"
 STAGE = "discrepancy"
+MOVED = 0.02
+"""Share of the given value from which on a fitted value is said to differ from it."""
+RIVALS = 3
+"""Effects and places that are told beside the one in the model."""
+ASKED = {
+    "backlash": "the play of the mechanism",
+    "deadband": "the width of the dead band",
+    "delay": "the dead time of sampling, computation and communication",
+    "gain": "the scaling",
+    "inner-loop": "the bandwidth and damping of the inner control loop",
+    "lag": "the time constant of the filter or transducer",
+    "lead-lag": "the two time constants of the lead-lag",
+    "limit": "the limit",
+    "offset": "the offset",
+    "quantisation": "the resolution of the measurement",
+    "rate-limit": "the limit of the rate of change",
+    "sample-hold": "the sampling time",
+    "saturation": "the level of saturation",
+    "second-order": "the natural frequency and damping of the filter or transducer",
+    "window-mean": "the length of the averaging window",
+}
+"""What a model's owner knows of an effect; of one that is not listed its name is asked for."""
+
+
+@dataclass(frozen=True)
+class Letterhead:
+    """Who writes to whom about what; "" where a study does not say.
+
+    author, to: with what belongs to an address. plant: what was recorded. version: of the model. date: as it is to be printed.
+    """
+
+    author: str = ""
+    to: str = ""
+    plant: str = ""
+    version: str = ""
+    date: str = ""
 
 
 @dataclass(frozen=True)
 class Letter:
-    """The letter's sentences, in order, as plain text, and the curves of its slider, if any."""
+    """The letter's sentences, in order, as plain text; the request, and the names of the files that go with it."""
 
     sentences: tuple[str, ...]
+    request: str
+    following: str
     attached: tuple[str, ...]
-    sizes: dict[str, Any] | None
 
 
 def letter_of(results: Results) -> Letter:
@@ -41,74 +79,164 @@ def letter_of(results: Results) -> Letter:
             expected=f"{STAGE}.json",
             hint="hvdc-ident diagnose STUDY",
         )
-    sentences = (_missed(results, found), _consistent(found), _gains(found), _gained(found), _next(found))
-    return Letter(tuple(s for s in sentences if s), tuple(_attached(results, found)), found.get("sizes"))
+    answers = Answers(results)
+    sentences = (_missed(answers), _consistent(found), _gains(answers), _gained(found))
+    return Letter(tuple(s for s in sentences if s), _request(answers), _next(found), tuple(_attached(results, found)))
 
 
-def letter_body(letter: Letter) -> str:
-    """The letter as HTML: its sentences, the figure with its slider, what is attached."""
-    told = "".join(f"<p>{text(s)}</p>" for s in letter.sentences)
-    attached = f"<p>Attached: {text(', '.join(letter.attached))}.</p>" if letter.attached else ""
-    return f'<div class="letter">{told}{attached}</div>'
-
-
-def write_letter(folder: Path) -> Path:
+def write_letter(folder: Path, head: Letterhead = Letterhead()) -> Path:
     """The path of letter.html in a folder of results, written from what the folder holds."""
     from hvdc_ident.report.page import document
 
     results = Results(folder)
     heading = results.get(STAGE) or results.heading
-    title = f"Model {heading.get('model', '')}: what the recordings say"
     letter = letter_of(results)
-    return write_text(folder / FILE, document(title, text(str(heading.get("study", ""))), letter_body(letter)))
+    title = f"Model {heading.get('model', '')}: what the recordings say"
+    return write_text(
+        folder / FILE, document(title, text(head.date), f"<main class='letter'>{_body(results, letter, head)}</main>")
+    )
 
 
-def _missed(results: Results, found: dict[str, Any]) -> str:
-    """Sentence on the largest error of the model with its nominal gains: as a share of the signal's swing or, where no record
-    of it is at hand, as a multiple of its noise."""
-    gap = found.get("gap") or {}
-    noise = gap.get("noise_floor") or {}
-    missed = [
-        (output, experiment, rmse)
-        for line in (gap.get("nominal") or {}).values()
-        for output, errors in line.items()
-        for experiment, rmse in errors.items()
-        if rmse is not None and rmse >= 2.0 * (noise.get(output) or 0.0)  # less than that is noise
-    ]
-    if not missed:
-        return "With the gains it came with, your model follows every recorded signal to within twice its noise."
-    shares = [(m[2] / swing, m) for m in missed if (swing := _swing(results, *m[:2]))]
-    times = [(m[2] / floor, m) for m in missed if (floor := noise.get(m[0]))]
-    most, (output, experiment, rmse) = max(shares or times or [(m[2], m) for m in missed])
-    how = ""
-    if shares:
-        how = f"by {100 * most:.2g} % of all that it does there "
-    elif times:
-        how = f"by {most:.3g} times its noise "
+def _body(results: Results, letter: Letter, head: Letterhead) -> str:
+    """The letter as HTML."""
+    answers = Answers(results)
+    missed, *rest = letter.sentences
+    told = "".join(f"<p>{text(s)}</p>" for s in rest)
+    attached = f"<p class='small'>Attached: {text(', '.join(letter.attached))}.</p>" if letter.attached else ""
     return (
-        f"With the gains it came with, your model misses {output} in experiment '{experiment}' {how}(RMSE {rmse:.3g} "
-        f"{results.units.get(output, '')}), more than any other recorded signal."
-    ).replace(" )", ")")
+        f"{_head(results, head)}<p>{badge(_passed(answers))} {text(missed)}</p>{_values(answers)}{told}"
+        f"<p><strong>{text(letter.request)}</strong></p><p>{text(letter.following)}</p>{_figure(answers)}{attached}"
+    )
 
 
-def _swing(results: Results, output: str, experiment: str) -> float | None:
-    """Peak-to-peak value of a recorded signal in an experiment, in its unit; None where it is not recorded."""
-    for stage in ("simulation", "fit"):
-        table = results.table(f"{stage}.{experiment}.csv")
-        if table is not None and f"{output}.measured" in table:
-            record = table[f"{output}.measured"]
-            return float(np.nanmax(record) - np.nanmin(record))
-    return None
+def _head(results: Results, head: Letterhead) -> str:
+    """Who, to whom, about what: a line each."""
+    heading = results.get(STAGE) or results.heading
+    count = len(results.experiments)
+    recordings = f", {count} recording{'s' if count > 1 else ''}" if count else ""
+    lines = {
+        "To": head.to,
+        "From": head.author,
+        "Plant": head.plant,
+        "Model": " ".join(w for w in (str(heading.get("model", "")), head.version and f"version {head.version}") if w),
+        "Study": f"{heading.get('study', '')}{recordings}; {heading.get('software', '')}",
+    }
+    return "<dl>" + "".join(f"<dt>{name}</dt><dd>{text(said)}</dd>" for name, said in lines.items() if said) + "</dl>"
+
+
+def _given(answers: Answers) -> Errors | None:
+    return next((e for e in answers.errors if e.name == "given"), None)
+
+
+def _passed(answers: Answers) -> bool | None:
+    """The verdict on the model as it was given."""
+    errors = _given(answers)
+    if errors is None:
+        return None
+    return errors.tolerated if answers.by_tolerance and errors.tolerated is not None else errors.on_noise
+
+
+def _missed(answers: Answers) -> str:
+    """Sentences on the largest error of the model with its given values, and in how many signals it is above the noise."""
+    errors = _given(answers)
+    if errors is None or answers.worst is None:
+        return "The model could not be compared with the recordings at its given values."
+    if _passed(answers):
+        kind = (
+            "keeps the tolerance in every recorded signal"
+            if answers.by_tolerance
+            else "follows every recorded signal to its noise"
+        )
+        return f"With the values it came with, your model {kind}."
+    output, experiment = answers.worst
+    unit = str(answers.results.units.get(output, ""))
+    times = f", {errors.times:.2g} times the noise of the recording" if errors.times is not None else ""
+    worst = f"most of all {output} in experiment '{experiment}': its RMSE there is {_plain(errors.rmse, unit)}{times}."
+    if answers.by_tolerance and errors.limited:
+        return f"With the values it came with, your model is outside the tolerance in {errors.outside} of {errors.limited} signals, {worst}"
+    among = f" {errors.above} of {errors.judged} recorded signals" if errors.judged else " the recordings"
+    return f"With the values it came with, your model misses{among}, {worst}{_in_windows(answers, errors)}"
+
+
+def _in_windows(answers: Answers, errors: Errors) -> str:
+    """Clause on the windows of the tolerance profile that stands in where a study names none."""
+    if not errors.limited or not answers.profile:
+        return ""
+    name = str(answers.profile.get("source", "")).split(" (")[0] or str(answers.profile.get("name", ""))
+    if errors.tolerated:
+        return f" In every signal that is less than the windows of {name} allow."
+    return f" In {errors.outside} of {errors.limited} signals that is more than the windows of {name} allow."
+
+
+def _plain(value: float | None, unit: str) -> str:
+    """A number with two digits and its unit, as plain text."""
+    return "unknown" if value is None else f"{value:.2g} {unit}".rstrip()
+
+
+def _values(answers: Answers) -> str:
+    """The one table: each parameter given, fitted and with the effect."""
+    rows = []
+    for v in answers.values or ():
+        fitted = estimate(v.fitted, answers.interval(v.name, "fit"))[0] if v.fitted is not None else ""
+        value, interval = estimate(v.value, v.interval) if v.value is not None else ("", "")
+        effect = value if v.effect is not None else ""
+        rows.append([text(v.name), number(v.given), fitted, effect, interval if v.interval else "", text(v.unit)])
+    if not rows:
+        return ""
+    kind = "with the effect" if any(v.effect is not None for v in answers.values) else "fitted"
+    return table(
+        ["parameter", "given", "fitted", "with the effect", f"95 % interval, {kind}", "unit"], rows, words=(0, 5)
+    )
+
+
+def _figure(answers: Answers) -> str:
+    """The worst signal before and after."""
+    if answers.worst is None:
+        return ""
+    after = "effect" if "effect" in answers.rmse else "fitted"
+    overlay = overlay_of(answers.results, answers.worst[1], answers.worst[0], ("given", after))
+    if overlay is None:
+        return ""
+    caption = f"{text(overlay.output)} in {text(overlay.experiment)}, before and after; below, recorded less simulated."
+    return overlay.figure(Sheet.new(7.4, 2.7, 0.5), caption, overlay.span)
+
+
+def _request(answers: Answers) -> str:
+    """What the owner is asked to confirm."""
+    found = answers.diagnosis
+    asked = []
+    for f in found.get("findings") or []:
+        if f["effect"] == "parameter":
+            sizes = listed(f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in f["parameters"].items())
+            asked.append(f"the values that the recordings ask for: {sizes}")
+            continue
+        sizes = listed(
+            f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in (f.get("parameters") or {}).items()
+        )
+        places = [listed(p["at"]) for p in f.get("places") or []]
+        where = " or ".join(places[:2]) + (f" or one of {len(places) - 2} more places" if len(places) > 2 else "")
+        what = ASKED.get(f["effect"], f"the {f['effect']}")
+        asked.append(f"{what} at {where}, which the model leaves out (here {sizes})" if sizes else f"{what} at {where}")
+    if asked:
+        return f"Please confirm {'; and '.join(asked)}."
+    if found["verdict"] == "unnameable":
+        return "Please tell us which filters, limits and delays of the plant the model leaves out."
+    moved = [
+        v.name for v in answers.values if v.value is not None and v.given and abs(v.value / v.given - 1.0) >= MOVED
+    ]
+    return (
+        f"Please confirm the value{'s' if len(moved) > 1 else ''} of {listed(moved)}: see the table." if moved else ""
+    )
 
 
 def _consistent(found: dict[str, Any]) -> str:
     """Sentences on what the difference is consistent with: the named effect, and those the data cannot tell from it."""
     verdict, effects = found["verdict"], found.get("effects") or []
     if verdict == "no-evidence":
-        return f"Beyond the gains nothing is missing that these recordings could show. {found.get('text', '')}".strip()
+        return f"Beyond its values nothing is missing that these recordings could show. {found.get('text', '')}".strip()
     if not effects:
         return str(found.get("text", ""))
-    told = [" ".join([e["text"].rstrip("."), _interval(e)]).strip() for e in effects]
+    told = [" ".join([_inside(e["text"].rstrip(".")), _interval(e)]).strip() for e in effects]
     first = f"The difference is consistent with this: {'; and '.join(told)}."
     own = [(e["effect"], e["at"], e.get("from", "")) for e in effects]
     rivals = [r for group in found.get("ambiguity") or [] for r in group]
@@ -118,8 +246,8 @@ def _consistent(found: dict[str, Any]) -> str:
         )
     )
     if names:
-        more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-        first = f"{first} The recordings cannot tell it from: {'; '.join(names[:5])}{more}.{_in_common(found)}"
+        more = f" and {len(names) - RIVALS} more" if len(names) > RIVALS else ""
+        first = f"{first} The recordings cannot tell it from: {'; '.join(names[:RIVALS])}{more}.{_in_common(found)}"
     elif found.get("doubt"):
         they = "They" if len(effects) > 1 else "It"
         first += f" {they} may stand for something that none of those tried is: {found['doubt']}."
@@ -128,6 +256,11 @@ def _consistent(found: dict[str, Any]) -> str:
     if not found.get("doubt") and not (found.get("remaining") or {}).get("adequate", True):
         first += " It is not all that is missing: with it the residuals are still not noise."
     return first
+
+
+def _inside(sentence: str) -> str:
+    """A sentence as it goes on after a colon."""
+    return "e" + sentence[1:] if sentence.startswith("Each of ") else sentence
 
 
 def _in_common(found: dict[str, Any]) -> str:
@@ -148,9 +281,14 @@ def _interval(effect: dict[str, Any]) -> str:
     return f"({', '.join(parts)}, 95 %)" if parts else ""
 
 
-def _gains(found: dict[str, Any]) -> str:
-    """Sentences on the gains: how far a fit moves them without the effect, and how far with it."""
+def _gains(answers: Answers) -> str:
+    """Sentences on the gains: how far a fit moves them without the effect, and how far with it.
+
+    The fit is that of the table, and of the diagnosis where none has run.
+    """
+    found = answers.diagnosis
     given, without, after = (found.get(f"parameters_{k}") or {} for k in ("before", "refitted", "after"))
+    without = without | {v.name: v.fitted for v in answers.values if v.fitted is not None}
     moved = {
         n: (without[n] / g - 1.0, after[n] / g - 1.0) for n, g in given.items() if g and n in without and n in after
     }
@@ -165,7 +303,7 @@ def _gains(found: dict[str, Any]) -> str:
             "makes up for what is missing these records do not tell."
         )
     if not what:
-        if abs(alone) < 0.02:
+        if abs(alone) < MOVED:
             return "Your gains are not to blame: a fit leaves them within 2 % of what you gave."
         return f"Your gains are to blame: fitted, {name} moves by {_percent(alone)}, and that closes the gap as far as it closes."
     if abs(with_it) < 0.5 * abs(alone):
@@ -215,6 +353,7 @@ def _next(found: dict[str, Any]) -> str:
         return ""
     several = any(len(group) > 1 for group in found.get("ambiguity") or [])
     start = "To tell them apart" if several else "What would show more"
+    advice = "r" + advice[1:] if advice.startswith("Record ") else advice
     return f"{start}: {advice}" + ("" if advice.endswith(".") else ".")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 from xml.sax.saxutils import quoteattr
@@ -15,9 +16,10 @@ from xml.sax.saxutils import quoteattr
 from hvdc_ident.errors import ComputationError, StudyError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, read_card
-from hvdc_ident.report.letter import STAGE, write_letter
+from hvdc_ident.report.letter import STAGE, Letterhead, write_letter
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.pipeline import Done, have_stage
+from hvdc_ident.study.schema import LetterTable
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
 
@@ -319,7 +321,8 @@ def letter(study: Study, folder: Path, options: StageOptions) -> tuple[Path, Don
     if done.failed:
         raise ComputationError("there is no diagnosis to write a letter about", where="letter", got=done.failed)
     attach(folder)
-    return write_letter(folder), done
+    said = (study.settings.letter or LetterTable()).model_dump()
+    return write_letter(folder, Letterhead(**{**said, "date": said["date"] or date.today().isoformat()})), done
 
 
 def attach(folder: Path) -> Path | None:

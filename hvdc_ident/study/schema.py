@@ -97,6 +97,7 @@ _TEXTS: dict[str, Any] = {"type": "array", "items": _TEXT, "minItems": 1}
 _NAME_OR_NAMES = WithJsonSchema({"anyOf": [_TEXT, _TEXTS]})  # what the validators before the types also take
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Line = Annotated[str, StringConstraints(max_length=300, pattern=r"^[^\x00-\x1f\x7f]*$")]
 FileName = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^\w[\w .+-]*$")]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
@@ -533,6 +534,19 @@ class DiagnoseTable(TomlTable):
         return self.tolerance or self.material
 
 
+class LetterTable(TomlTable):
+    """[letter]: who writes to whom about what, for `hvdc-ident letter`; no result rests on it.
+
+    author, to: with what belongs to an address. plant: what was recorded. version: of the model. date: left out, today.
+    """
+
+    author: Line = ""
+    to: Line = ""
+    plant: Line = ""
+    version: Line = ""
+    date: Line = ""
+
+
 class StudyFile(TomlTable):
     """The whole study file."""
 
@@ -548,3 +562,4 @@ class StudyFile(TomlTable):
     identifiability: IdentifiabilityTable | None = None
     fit: FitTable | None = None
     diagnose: DiagnoseTable | None = None
+    letter: LetterTable | None = None

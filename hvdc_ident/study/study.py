@@ -37,7 +37,8 @@ class Study(Shown):
 
     model: with its parameterisation, effects, [model.values] and given values. candidates: what may be estimated, with
     given value, start and bounds. experiments: in the order of the file. noise: where each output's noise comes from, by experiment.
-    settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study.
+    settings: the study file's tables. sources: sha256 of every file that was read, by its name in the study; that of the study
+    itself is of all but its [letter].
     against: the other model that sweeps are compared with, where they are; compared: that of the linear model.
     responses: the measured frequency responses.
     """
@@ -114,6 +115,16 @@ def candidate_lines(study: Study) -> dict[str, dict[str, Any]]:
     }
 
 
+def without_letter(content: bytes) -> bytes:
+    """The text of a study without its table [letter], on which no result rests: results outlive a change of the addressee."""
+    kept, inside = [], False
+    for line in content.splitlines(keepends=True):
+        if line.lstrip().startswith(b"["):
+            inside = line.split(b"#")[0].strip() == b"[letter]"
+        kept += [] if inside else [line]
+    return b"".join(kept)
+
+
 def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float] | None = None) -> Study:
     """Return the study of a file. trust: whether a model that is Python code may be run.
 
@@ -152,7 +163,7 @@ def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float
         settings=settings,
         sources=FrozenMap(
             {
-                where: digest(content),
+                where: digest(without_letter(content)),
                 **model_sources,
                 **against_sources,
                 **compared_sources,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.report.letter import letter_of, write_letter
+from hvdc_ident.report.letter import Letterhead, letter_of, write_letter
 from hvdc_ident.report.results import Results
+from hvdc_ident.study.study import without_letter
 
 HEADING = {"schema": 1, "study": "s", "model": "m", "software": "hvdc_ident 0", "seed": 0, "sources": {}}
 
@@ -83,20 +85,16 @@ def folder_with(path: Path, found: dict[str, Any]) -> Path:
 def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
     (tmp_path / "augmented-model.toml").touch()
     letter = letter_of(Results(folder_with(tmp_path, diagnosis())))
-    missed, consistent, gains, gained, following = letter.sentences
-    assert "misses P2 in experiment 'step' by 20 %" in missed
+    missed, consistent, gains, gained = letter.sentences
+    assert missed == (
+        "With the values it came with, your model misses 1 of 1 recorded signals, most of all P2 in experiment 'step': its RMSE "
+        "there is 0.02 pu, 20 times the noise of the recording."
+    )
     assert "lag of 1.6 ms" in consistent and "1.4 and 1.8 ms" in consistent and "delay at P2_m" in consistent
     assert "not to blame" in gains and "+5.0 %" in gains and "+0.3 %" in gains
     assert "75 %" in gained and "1.05 times the noise" in gained
-    assert following == "To tell them apart: Record P2 at 1 kHz."
+    assert letter.following == "To tell them apart: record P2 at 1 kHz."
     assert letter.attached == ("augmented-model.toml",)
-
-
-def test_what_is_missed_is_told_in_noise_where_no_course_is_at_hand(tmp_path: Path) -> None:
-    folder = folder_with(tmp_path, diagnosis())
-    (folder / "simulation.step.csv").unlink()
-    missed, *_ = letter_of(Results(folder)).sentences
-    assert "misses P2 in experiment 'step' by 20 times its noise (RMSE 0.02 pu)" in missed
 
 
 def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp_path: Path) -> None:
@@ -173,3 +171,44 @@ def test_without_a_diagnosis_there_is_no_letter(tmp_path: Path) -> None:
     (folder / "discrepancy.json").unlink()
     with pytest.raises(InputError, match="hvdc-ident diagnose"):
         write_letter(folder)
+
+
+def test_the_owner_is_asked_for_what_an_owner_knows(tmp_path: Path) -> None:
+    places = [{"at": ["P2_m"], "probability": 0.7}, {"at": ["Q2_m"], "probability": 0.3}]
+    lag = {"effect": "lag", "same_as": ["lag"], "probability": 1.0, "text": "", "places": places}
+    lag["parameters"] = {"T": {"value": 0.0016, "ci95": None, "unit": "s"}}
+    off = {"effect": "parameter", "same_as": ["parameter"], "probability": 1.0, "text": "", "places": []}
+    off["parameters"] = {"D": {"value": 1.2, "ci95": None, "unit": ""}}
+    asked = letter_of(Results(folder_with(tmp_path, diagnosis(findings=[lag, off])))).request
+    assert asked == (
+        "Please confirm the time constant of the filter or transducer at P2_m or Q2_m, which the model leaves out (here T = 1.6 ms); "
+        "and the values that the recordings ask for: D = 1.2."
+    )
+    nameless = diagnosis(verdict="unnameable", effects=[], ambiguity=[], augmented_model=None)
+    assert "filters, limits and delays" in letter_of(Results(folder_with(tmp_path, nameless))).request
+    fitted = diagnosis(verdict="no-evidence", effects=[], ambiguity=[], augmented_model=None)
+    folder = folder_with(tmp_path, fitted)
+    candidates = {"KIP": {"given": 30.0, "start": 30.0, "min": None, "max": None, "unit": "pu/s"}}
+    fit = {"status": "converged", "fitted": ["KIP"], "candidates": candidates, "values": {"KIP": 31.5}, "estimates": {}}
+    (folder / "fit.json").write_text(json.dumps({**HEADING, **fit}))
+    assert letter_of(Results(folder)).request == "Please confirm the value of KIP: see the table."
+
+
+def test_a_letter_says_who_writes_to_whom_about_what(tmp_path: Path) -> None:
+    head = Letterhead("A. Engineer <TSO>", "Converter Works", "Link North", "3.2", "2026-11-25")
+    page = write_letter(folder_with(tmp_path, diagnosis()), head).read_text("utf-8")
+    assert "<dt>From</dt><dd>A. Engineer &lt;TSO&gt;</dd>" in page and "2026-11-25" in page
+    assert "<dt>Model</dt><dd>m version 3.2</dd>" in page and "<dt>Plant</dt><dd>Link North</dd>" in page
+    assert "<dt>To</dt>" not in write_letter(tmp_path, Letterhead(author="A.")).read_text("utf-8")
+    row = re.search(r"<td>KIP</td>(.*?)</tr>", page)
+    assert row is not None and re.findall(r"<td[^>]*>(.*?)</td>", row[1]) == ["30", "30.1"]
+
+
+@pytest.mark.parametrize(
+    "table", ["", "[letter]\nauthor = 'A'\n", "# it\n [letter] # to whom\nto = 'B'\n[fit]\n", "[letter]\n\n[[x]]\n"]
+)
+def test_no_result_rests_on_the_addressee(table: str) -> None:
+    study = "schema = 1\nname = 's'\n"
+    kept = without_letter((study + table).encode()).decode()
+    assert kept.startswith(study) and "letter" not in kept and "author" not in kept and "to =" not in kept
+    assert ("[fit]" in kept) == ("[fit]" in table) and ("[[x]]" in kept) == ("[[x]]" in table)
