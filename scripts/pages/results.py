@@ -1,0 +1,53 @@
+"""The page on the JSON results: every key of every stage, with its meaning."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from pathlib import Path
+
+
+@cache
+def keys() -> dict[str, dict[str, str]]:
+    """Return the meaning of each key by file ("heading" for what all share)."""
+    return tomllib.loads(Path(__file__).with_name("results.toml").read_text("utf-8"))
+
+
+TITLES = {
+    "simulation": "`simulate`: the model at its given values",
+    "sweep": "`sweep`: errors over values of a parameter",
+    "screening": "`screen`: which parameters matter",
+    "linearization": "`linearize`: the linear model",
+    "identifiability": "`identify`: what the recordings determine",
+    "fit": "`fit`: the estimates",
+    "discrepancy": "`diagnose`: what the model lacks",
+    "run": "`run`: which stages ran",
+}
+
+
+def page() -> str:
+    """Return the page: a table for each file, and for each place in it that is described."""
+    lines = [
+        "# Results",
+        "",
+        "Each stage writes one JSON file into `STUDY-results/`, with every number at full precision; infinity and *unknown* are `null`.",
+        "`hvdc-ident STAGE STUDY --json` prints the same on stdout, and `result.to_dict()` gives it in Python. NAME stands for any name,",
+        "`[]` for any entry of a list.",
+        "",
+        "## Keys of every file {: #heading }",
+        "",
+        *_table(keys()["heading"]),
+        *_inner("heading"),
+    ]
+    for file, title in TITLES.items():
+        lines += [f"## {file}.json {{: #{file} }}", "", f"{title}.", "", *_table(keys()[file]), *_inner(file)]
+    return "\n".join(lines)
+
+
+def _inner(file: str) -> list[str]:
+    places = [k for k in keys() if k.startswith(f"{file}.")]
+    return [line for k in places for line in (f"### `{k.removeprefix(file + '.')}`", "", *_table(keys()[k]))]
+
+
+def _table(entries: dict[str, str]) -> list[str]:
+    return ["| key | meaning |", "|---|---|", *(f"| `{k}` | {v} |" for k, v in entries.items()), ""]
