@@ -155,7 +155,7 @@ def check(
 
     found = Summary.of(access.study(study), seed)
     console.print_json(found.to_dict())
-    console.say(str(found))
+    console.say(*(pasteable(line, study, out, access) for line in str(found).splitlines()))
 
 
 def _check_fmu(

@@ -56,7 +56,7 @@ def folded(text: str, width: int) -> str:
 
 
 def _folded(line: str, width: int) -> str:
-    if len(line) <= width or re.search(r"\S {2,}\S", line):
+    if len(line) <= width or re.search(r"\S {2,}\S.*\S {2,}\S", line):
         return line
     kept = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
     settings = {"break_long_words": False, "break_on_hyphens": False}

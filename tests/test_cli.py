@@ -275,6 +275,7 @@ def test_lines_are_folded_at_words_and_commands_stay_whole() -> None:
     assert folded(text, 200) == text and " ".join(folded(text, 50).split()) == text
     table = "parameter   unit   " + 10 * "0.123   "
     assert folded(table, 40) == table
+    assert folded("k  identifiable: known to 1 % of its value", 30) == "k  identifiable: known to 1 %\n  of its value"
 
 
 @pytest.mark.parametrize("command", ["check", "simulate", "fit", "run"])

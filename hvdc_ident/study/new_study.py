@@ -35,6 +35,8 @@ from hvdc_ident.text import listed, quantity
 
 MOST_LISTED = 40
 """Parameters and columns that a comment lists."""
+COLUMNS_SHOWN = 8
+"""Columns that are not mapped, with their candidates, on the screen; the study has all of them."""
 
 
 @dataclass(frozen=True)
@@ -227,9 +229,12 @@ def _open_lines(r: Mapped) -> Iterator[str]:
     """What could not be mapped, in lines."""
     if r.levels:
         yield r.levels
-    for name, matches in _by_column(r.columns.proposed).items():
+    open_ = _by_column(r.columns.proposed)
+    for name, matches in list(open_.items())[:COLUMNS_SHOWN]:
         may_be = "; ".join(f"{m.target.kind} {m.target.name} ({m.reason}{_base_words(m)})" for m in matches)
         yield f"column {name} is not mapped; candidates: {may_be}"
+    if len(open_) > COLUMNS_SHOWN:
+        yield f"and {len(open_) - COLUMNS_SHOWN} more columns are not mapped; the study has their candidates"
     inputs = [t for t in r.columns.missing if t.kind == "input"]
     if inputs:
         yield f"inputs without a column keep their values: {', '.join(_value(t) for t in inputs)}"

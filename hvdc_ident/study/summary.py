@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from typing import Any
@@ -14,6 +14,7 @@ from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
+from hvdc_ident.text import quantity
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +56,12 @@ class Summary:
             lines.append(f"candidate {name}: from {c['start']:g} within [{c['min']:g}, {c['max']:g}]{unit}; {given}")
         for name, e in found["experiments"].items():
             event = f"event at {e['event']:g} s" if e["event"] is not None else "no event"
-            noise = ", ".join(_noise(o, n) for o, n in e["noise"].items())
+            noise = ", ".join(_noise(o, n, e["units"][o]) for o, n in e["noise"].items())
             start, end = e["time"]
             lines.append(
                 f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
             )
-            lines += [f"experiment {name}: {line}" for line in recording_lines(e["recording"])]
+        lines += _recording_lines({name: recording_lines(e["recording"]) for name, e in found["experiments"].items()})
         lines += found["rest_lines"]
         lines += [f"steady state, {line}" for line in found["steady_state"]]
         for name, r in found["responses"].items():
@@ -73,6 +74,8 @@ class Summary:
                 f"frequencies, {low:.4g} to {high:.4g} Hz; noise {noise}"
             )
         lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
+        if found["stages"]:
+            lines.append("Next: `hvdc-ident run STUDY`")
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -81,14 +84,26 @@ class Summary:
         return f"<pre>{escape(str(self))}</pre>"
 
 
-def _noise(output: str, note: dict[str, Any]) -> str:
+def _recording_lines(notes: Mapping[str, Sequence[str]]) -> list[str]:
+    """The remarks on the recordings; one that several share is told once, with its number."""
+    by_line: dict[str, list[str]] = {}
+    for name, lines in notes.items():
+        for line in lines:
+            by_line.setdefault(line, []).append(name)
+    return [
+        f"experiment {names[0]}: {line}" + (f" (and so in {len(names) - 1} more)" if len(names) > 1 else "")
+        for line, names in by_line.items()
+    ]
+
+
+def _noise(output: str, note: dict[str, Any], unit: str) -> str:
     """The noise of one output, or what stands in for it."""
     if note["source"] == "residual":
         return f"{output} from the residual of the fit (not given, and no quiet rows before an event)"
     if note["source"] == "floor":
-        return f"{output} none above {note['std']:.3g} (before the event; the residual of the fit stands in)"
+        return f"{output} none above {quantity(note['std'], unit, 3)} (before the event; the residual of the fit stands in)"
     how = f"{note['source']}, row by row" if note["by_row"] else note["source"]
-    return f"{output} {note['std']:.3g} ({how})"
+    return f"{output} {quantity(note['std'], unit, 3)} ({how})"
 
 
 def _given_by(study: Study, name: str) -> str:
@@ -110,6 +125,7 @@ def _experiment(e: Experiment, study: Study) -> dict[str, Any]:
         "window": e.window,
         "inputs": [n for n in e.inputs if n not in e.drive],
         "outputs": list(e.outputs),
+        "units": {o: study.model.outputs[o].unit for o in e.outputs},
         "recording": e.recording,
         "noise": {o: asdict(n) for o, n in notes.items()},
     }

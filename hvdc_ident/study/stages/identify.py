@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
+from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
     from hvdc_ident.executor import Executor, Progress
@@ -115,7 +116,9 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         lines.append(f"{name:{width}}  {v['verdict']}: {v['reason']}{beside if v['ci95'] else ''}")
     lines += data["notes"]
     advice = data["recommended_experiment"]
-    return [*lines, f"Measure next: {advice['text']}"] if advice else lines
+    lines += [f"Measure next: {advice['text']}"] if advice else []
+    names = listed(data["identifiable"])
+    return [*lines, f"Next: `hvdc-ident fit STUDY` estimates {names}."] if names else lines
 
 
 def verdict(data: Mapping[str, Any]) -> str:
