@@ -12,7 +12,7 @@ import numpy as np
 import hvdc_ident as hi
 from hvdc_ident.data import Array, Experiment, SignalLike
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize import LinearModel
+from hvdc_ident.linearize import FrequencyResponse, LinearModel
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import Simulation
 
@@ -49,8 +49,8 @@ class Setting:
 
     model: with effects, if any. values: of its parameters, where they differ from the model's, in their units. courses: of
     its inputs. end: of the run, s, with so many rows. outputs: whose waveforms are shown. channel: input and output of the
-    frequency response. opened: the signal at which the loop is opened for it instead; "" for none. record: an experiment of
-    the study in place of the courses.
+    frequency response. opened: the signal at which the loop is opened for it instead; port: at which an impedance is seen
+    instead. record: an experiment of the study in place of the courses.
     """
 
     model: AnyModel
@@ -61,6 +61,7 @@ class Setting:
     outputs: tuple[str, ...] = ()
     channel: tuple[str, str] = ("", "")
     opened: str = ""
+    port: hi.Port | None = None
     record: Experiment | None = None
 
     @classmethod
@@ -121,6 +122,31 @@ class Setting:
         if self.opened and isinstance(self.model, Model):
             return hi.loop(self.model, self.opened, point).open
         return hi.linearize(self.model, point, inputs=self.channel[0], outputs=self.channel[1])
+
+    def response(self, point: hi.OperatingPoint, omega: Array | None = None) -> FrequencyResponse:
+        """Return the response of the channel or the opened loop, or the impedance at the port, in its first axis; (n, 1, 1) or more.
+
+        omega: (n,), rad/s; default, around the poles.
+        """
+        if self.port is not None and isinstance(self.model, Model):
+            if omega is None:
+                omega = hi.bode(self.model, point=point).omega
+            return hi.port_impedance(self.model, self.port, omega, point)
+        return hi.bode(self.linear(point), omega)
+
+    def sensitivities(self) -> dict[str, dict[str, float]]:
+        """Return, by parameter and shown output, the RMS of the derivative times the value. Raises as `hvdc_ident.sensitivities`."""
+        names = [n for n in self.model.parameters if n in self.parameters]
+        own = {n: v for n, v in self.values.items() if n in self.model.parameters}
+        if self.record is not None:
+            found = hi.sensitivities(self.model, self.record, names, values=own)
+        else:
+            signals = {n: c.signal(self.end) for n, c in self.courses.items()}
+            found = hi.sensitivities(self.model, self.time, names, inputs=signals, outputs=self.outputs, values=own)
+        assert found.trajectories is not None  # there is an experiment
+        rms = found.trajectories.norms["rms"].isel(experiment=0)
+        shown = [o for o in self.outputs if o in rms["output"]]
+        return {n: {o: float(rms.sel(parameter=n, output=o)) for o in shown} for n in names}
 
     def margins(self, point: hi.OperatingPoint) -> str:
         """Return the margins of the opened loop in words; "" where none is opened."""

@@ -25,7 +25,8 @@ from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model, Output, fresh, rewritten
 from hvdc_ident.parameters import Input
 
-Names = tuple[str, str] | tuple[str]
+Names = tuple[str, ...] | str
+"""Two names, of d and q, or one of a dc port, which may stand alone."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,9 @@ class Port:
     angle: str = "0"
 
     def __post_init__(self) -> None:
+        for part in ("source", "voltage", "current"):
+            names = getattr(self, part)
+            object.__setattr__(self, part, (names,) if isinstance(names, str) else tuple(names))
         sizes = [len(part) for part in (self.source, self.voltage, self.current)]
         if sizes not in ([1, 1, 1], [2, 2, 2]) or (sizes[0] == 1 and self.angle != "0"):
             raise LinearizationError(

@@ -40,6 +40,22 @@ def test_the_margins_are_those_of_the_opened_loop() -> None:
     assert opened_at.margins(setting.point()) == str(hi.margins(hi.loop(LINK, "Irorder1", setting.point())))
 
 
+def test_an_impedance_is_seen_at_a_port() -> None:
+    dc = hi.Port(source="Iload1", voltage="Vdc1", current="-Iload1")
+    setting = replace(Setting.of(LINK), port=dc)
+    omega = np.array([1.0, 10.0, 100.0])
+    seen = setting.response(setting.point(), omega)
+    np.testing.assert_allclose(seen.values, hi.port_impedance(LINK, dc, omega, setting.point()).values)
+
+
+def test_sensitivities_are_the_derivatives_by_the_parameters() -> None:
+    setting = replace(Setting.of(LINK), outputs=("Irorder1",))
+    found = setting.sensitivities()["KIVDC"]["Irorder1"]
+    h = 1e-4
+    up, down = (setting.with_value("KIVDC", 734.7 * (1 + s * h)).run()["Irorder1"] for s in (1, -1))
+    assert found == pytest.approx(float(np.sqrt(np.mean(((up - down) / (2 * h)) ** 2))), rel=1e-4)
+
+
 def test_an_effect_brings_its_size_as_a_parameter() -> None:
     setting = with_effect(Setting.of(LINK), {"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}})
     (name,) = set(setting.model.parameters) - set(LINK.parameters)

@@ -105,6 +105,13 @@ def test_margins_are_those_of_the_loop_that_is_opened(page: Any) -> None:
     page.wait_for_selector("text=phase 65.26 degrees")
 
 
+def test_sensitivities_stand_in_a_table_once_the_slider_rests(page: Any) -> None:
+    page.get_by_text("Sensitivities of the waveforms").click()
+    row = page.locator("tbody tr", has_text="KIVDC")
+    row.wait_for()
+    assert re.search(r"KIVDC\s+[0-9.]+ pu", row.inner_text())
+
+
 @pytest.mark.parametrize("query", ["", "?token=wrong"])
 def test_a_stranger_gets_nothing(address: str, query: str) -> None:
     own = address.partition("?")[0]

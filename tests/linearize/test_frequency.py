@@ -181,6 +181,7 @@ def test_bands_against_monte_carlo(link):
 def test_dc_impedance_and_admittance(link):
     """At 0 rad/s the voltage control holds Vdc1; far above, the capacitors alone: 1/(s C)."""
     port = Port(("Iload1",), ("Vdc1",), ("-Iload1",))
+    assert Port("Iload1", "Vdc1", "-Iload1") == port
     z = port_impedance(link, port, [1e-4, 3e6])
     assert abs(z.values[0, 0, 0]) < 1e-5
     assert z.values[1, 0, 0] == pytest.approx(1 / (3e6j * 0.2), rel=0.02)

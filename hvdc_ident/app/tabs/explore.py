@@ -29,6 +29,7 @@ REST = 0.25
 """How long a slider has to stand, s, before what takes longer than a frame is computed."""
 FIRST = 8
 """Parameters that stand open where no study says which matter."""
+PARAMETER = "parameter (RMS of the derivative times the value)"
 LOCUS = 41
 """Points of a root locus."""
 
@@ -62,7 +63,7 @@ def answered(setting: Setting, omega: Array | None = None) -> Answer:
     point = part("operating point", setting.point)
     bode = poles = None
     if point is not None:
-        bode = part("frequency response", lambda: hi.bode(setting.linear(point), omega))
+        bode = part("frequency response", lambda: setting.response(point, omega))
         poles = part("poles", lambda: setting.poles(point))
     return Answer(ran, point, bode, NONE if poles is None else poles, trouble)
 
@@ -111,6 +112,9 @@ class Explorer:
                 with ui.row().classes("w-full items-center text-caption"):
                     self._limits = ui.label("").props('aria-live="polite"')
                     self._margins = ui.label("")
+                if equations_of(self._setting.model) is not None:
+                    with ui.expansion("Sensitivities of the waveforms").classes("w-full"):
+                        self._table = ui.table(rows=[], row_key=PARAMETER).props("dense flat").classes("w-full")
         self._build_waves()
         self._ask()
 
@@ -128,15 +132,14 @@ class Explorer:
                 ui.number("up to, s", value=setting.end, min=1e-6, on_change=self._choose_end).props("dense").style(
                     "width: 5rem"
                 )
-            self._choice(
-                "response from", list(model.inputs), setting.channel[0], lambda v: self._choose_channel(v, None)
-            )
-            self._choice("to", list(model.outputs), setting.channel[1], lambda v: self._choose_channel(None, v))
+            from_, to = setting.channel
+            self._choice("response from", list(model.inputs), from_, lambda v: self._look_into(source=v))
+            self._choice("to", list(model.outputs), to, lambda v: self._look_into(output=v))
             if equations_of(model) is not None:
                 opened = ["", *(n for n in model.insertion_points if n in model.signals or n in model.states)]
-                self._choice(
-                    "or loop opened at", opened, "", lambda v: self._set(replace(self._setting, opened=v or ""))
-                )
+                self._choice("or loop opened at", opened, "", lambda v: self._look(opened=v or "", port=None))
+            if ports := self._desk.ports:
+                self._choice("or impedance at", ["", *ports], "", lambda v: self._look(port=ports.get(v), opened=""))
 
     def _choice(
         self, label: str, options: list[str], value: Any, chosen: Callable[[Any], None], *, multiple: bool = False
@@ -148,36 +151,29 @@ class Explorer:
             options, value=value, label=label, multiple=multiple, with_input=not multiple, on_change=changed
         ).props("dense options-dense").style("min-width: 9rem; max-width: 18rem")
 
+    def _look(self, **changes: Any) -> None:
+        """Change what is looked at, of the setting as it is now and of the one as given."""
+        self._given = replace(self._given, **changes)
+        self._shown = 0
+        self._set(replace(self._setting, **changes))
+
+    def _look_into(self, source: str = "", output: str = "") -> None:
+        now = self._setting.channel
+        self._look(channel=(source or now[0], output or now[1]), opened="", port=None)
+
     def _choose_outputs(self, names: list[str]) -> None:
         if names:
-            self._remember()
-            self._setting = replace(self._setting, outputs=tuple(names))
-            self._given = replace(self._given, outputs=tuple(names))
+            self._look(outputs=tuple(names))
             self._build_waves()
-            self._shown = 0
-            self._ask()
 
     def _choose_record(self, name: str) -> None:
         record = next((e for e in (self._desk.study.experiments if self._desk.study else ()) if e.name == name), None)
         if record is not None:
-            self._given = replace(self._given, record=record)
-            self._shown = 0
-            self._set(replace(self._setting, record=record))
+            self._look(record=record)
 
     def _choose_end(self, event: Any) -> None:
         if event.value and event.value > 0:
-            self._given = replace(self._given, end=float(event.value))
-            self._shown = 0
-            self._set(replace(self._setting, end=float(event.value)))
-
-    def _choose_channel(self, source: str | None, output: str | None) -> None:
-        if source == "" or output == "" or (source is None and output is None):
-            return
-        now = self._setting.channel
-        channel = (source or now[0], output or now[1])
-        self._given = replace(self._given, channel=channel, opened="")
-        self._shown = 0
-        self._set(replace(self._setting, channel=channel, opened=""))
+            self._look(end=float(event.value))
 
     def _build_bar(self) -> None:
         with ui.row().classes("w-full items-center"):
@@ -375,7 +371,7 @@ class Explorer:
         self._ringed, self._locus = near(answer.poles), NONE
 
     async def _show_slow(self) -> None:
-        """Show the margins, and the locus of the parameter that was moved."""
+        """Show the margins, the locus of the parameter that was moved, and the sensitivities."""
         setting, name = self._setting, self._moving
 
         def slow() -> tuple[str, Array]:
@@ -398,6 +394,23 @@ class Explorer:
         if found is not None and setting is self._setting:
             self._margins.text, self._locus = found
             self._poles.whole(0, scattered(self._locus, self._ringed, self._now))
+        if equations_of(setting.model) is not None:
+            rows = await run.io_bound(_sensitivity_rows, setting)
+            if rows is not None and setting is self._setting:
+                names = [PARAMETER, *setting.outputs]
+                self._table.columns = [{"name": n, "label": n, "field": n, "align": "left"} for n in names]
+                self._table.rows = rows
+
+
+def _sensitivity_rows(setting: Setting) -> list[dict[str, str]]:
+    """Return the rows of the table of sensitivities, the largest first; none where they cannot be had."""
+    try:
+        found = setting.sensitivities()
+    except HvdcIdentError:
+        return []  # the page says already why the model does not run
+    units = {n: setting.model.outputs[n].unit for n in setting.outputs}
+    order = sorted(found, key=lambda n: -max(found[n].values(), default=0.0))
+    return [{PARAMETER: n, **{o: quantity(v, units[o]) for o, v in found[n].items()}} for n in order]
 
 
 def _gain_and_phase(response: Any) -> tuple[Array, Array]:
