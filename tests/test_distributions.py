@@ -22,7 +22,7 @@ from hvdc_ident.simulate.object_code import folders
 ROOT = Path(__file__).resolve().parents[1]
 KEPT_OUT = shutil.ignore_patterns("__pycache__", ".*", "*-results", "build", "dist", "*.egg-info")
 BUILD = "import sys; from setuptools import build_meta as b; print(getattr(b, sys.argv[1])(sys.argv[2]))"
-DATA = re.compile(r"\.(toml|j2|html|css|js|c|h|json)$|py\.typed$")
+DATA = re.compile(r"\.(toml|j2|html|css|js|c|h)$|(py\.typed|LICENSE)$")
 
 
 @pytest.fixture(scope="module")
@@ -72,11 +72,12 @@ def test_the_metadata_say_what_an_index_shows(built: dict[str, Path]) -> None:
     with zipfile.ZipFile(built["wheel"]) as archive:
         name = next(n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
         data = email.message_from_bytes(archive.read(name))
+    description = bytes(data.get_payload(decode=True)).decode("utf-8")  # type: ignore[arg-type]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     assert data["Version"] == project["version"] and data["Summary"] == project["description"]
     assert data["License-Expression"] == "BSD-3-Clause" and data["Requires-Python"] == ">=3.11"
     assert "Typing :: Typed" in data.get_all("Classifier", [])
-    assert (ROOT / "README.md").read_text("utf-8").strip() == str(data.get_payload()).strip()
+    assert (ROOT / "README.md").read_text("utf-8").strip() == description.strip()
     citation = (ROOT / "CITATION.cff").read_text("utf-8")
     assert f"version: {project['version']}\n" in citation
 

@@ -24,10 +24,10 @@ EXAMPLE = re.compile(r"^### (\S+)\n```python\n(.*?)^```$", re.MULTILINE | re.DOT
 
 KINDS = {
     "Models and inputs": "Model Parameter Input load_model apply_effects step ramp multisine InputSignal",
-    "Data": "Experiment read_waveforms Trajectory load_study Study check",
+    "Data": "Experiment read_waveforms Trajectory load_study Study new_study check",
     "Simulation and sweeps": "simulate Simulation sweep SweepResult sensitivities linear_sensitivities morris sobol",
     "Estimation": "identify IdentifiabilityReport fit FitResult",
-    "Diagnosis": "diagnose Diagnosis",
+    "Diagnosis and comparison": "diagnose Diagnosis compare_runs RunComparison",
     "Operating points": "find_operating_point OperatingPoint point_at continuation",
     "Linear models": "linearize LinearModel bode one_sided symbolic_transfer root_locus balanced",
     "Loops and margins": "loop margins loop_margins plant_and_controller ncf_margin",
