@@ -59,6 +59,7 @@ def explored(
     if number == 1 and _tells(opened, trials):
         if search.options.fallback and not (_noise(search, trials) or search.spent):
             opened = _outside(search, opened, nominal, trials)
+            opened, trials = _in_its_stead(search, opened, trials, field)
         opened, trials = _with_the_others(search, opened, trials, field, taken)
     return opened, tuple(trials)
 
@@ -119,6 +120,30 @@ def _outside(search: SearchContext, opened: Round, nominal: Nominal, trials: Seq
         found = law(search, opened, best)
         return replace(opened, laws=() if found is None else (found,))
     return opened if found is None else replace(opened, laws=(found,))
+
+
+def _in_its_stead(
+    search: SearchContext, opened: Round, trials: list[CandidateFit], field: Sequence[Pick]
+) -> tuple[Round, list[CandidateFit]]:
+    """The trials with every proposal at the place of a form from outside the catalogue, begun with the gains that it came to.
+
+    A form with many parameters finds the place and the gains where a score, taken with biased gains, did not: a filter whose
+    poles and zeros meet is a gain. Where an effect comes near the noise there too, the catalogue lacks nothing.
+    """
+    law = opened.law
+    if law is None or search.spent:
+        return opened, trials
+    k, whole = len(opened.before.problem.free), len(law.refit.problem.free)
+    gains = (*law.refit.theta[:k].tolist(), *law.refit.theta[whole:].tolist())
+    best: dict[int, Pick] = {}
+    for p in field:
+        if opened.candidates[p.candidate].at == law.refit.placed[-1].candidate.at:
+            best.setdefault(p.candidate, replace(p, gains=gains))
+    picks = sorted(best.values(), key=lambda p: -p.score)[:FIELD]
+    trials = best_each([*trials, *refitted(search, opened, picks, "round 1: in the stead of a form", trials)])
+    if all_far(opened.before, trials):
+        return opened, trials
+    return replace(opened, laws=(replace(law, near=False),)), trials
 
 
 def _tells(opened: Round, trials: Sequence[CandidateFit]) -> bool:
