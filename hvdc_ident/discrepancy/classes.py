@@ -164,7 +164,9 @@ def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> 
     for group in groups:
         if len(group) > 1:
             first = group[0]
-            told = advice(first.effect, [(r.effect, r.at) for r in group[1:]], first.at, recorded)
+            # What is the same equation under another name no experiment tells apart.
+            others = [(r.effect, r.at) for r in group[1:] if not r.same_as]
+            told = advice(first.effect, others, first.at, recorded)
             if told:
                 texts.append(told)
     return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}

@@ -89,8 +89,12 @@ def advice(
     if len(wanted) > 1:
         wanted = list(dict.fromkeys(p.removeprefix("outputs.") for p in wanted))
         missing = [p for p in wanted if p not in recorded]
-        record = f"record {listed(missing)} as well, and " if missing else ""
-        parts.append(f"{record}step what acts on one side of {listed(wanted)} and not on the other")
+        if missing:
+            parts.append(
+                f"record {listed(missing)} as well: what is missing sits before the first signal that shows it"
+            )
+        else:
+            parts.append(f"step an input that acts on some of {listed(wanted)} and not on the others")
     return "; ".join(parts)
 
 
