@@ -121,3 +121,13 @@ def test_a_finding_tells_places_and_sources_apart() -> None:
     assert (
         told == "It couples; the records do not tell this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2."
     )
+
+
+def test_what_to_record_next_asks_for_signals_that_are_not_there_and_not_for_other_names_of_one_equation() -> None:
+    lag = [Rival("lag", (at,), 0.0, FrozenMap({"T": 0.03})) for at in ("wm", "w")]
+    told = rated.separating([lag], {"wm"})["text"]
+    assert told.startswith("Record w as well") and "wm" not in told
+    assert rated.separating([lag], {"wm", "w"})["text"].startswith("Step an input that acts on some of wm and w")
+    alike = [Rival("coupling", ("e",), 0.0, FrozenMap({"k": 1.0}), source="w")]
+    alike.append(Rival("droop", ("e",), 0.0, FrozenMap({"k": -1.0}), source="w", refitted=False, same_as="coupling"))
+    assert rated.separating([alike], set()) == {}
