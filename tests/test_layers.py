@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
 errors lazy text executor files processes immutable display data parameters axes expression model effects models formats simulate
-fmu linearize sensitivity fit identifiability discrepancy report study api app command cli
+fmu linearize sensitivity fit identifiability discrepancy report study api app command run_commands cli
 """.split()  # noqa: SIM905 - one list of words, read as such
 
 # Rooms with rooms inside, and the order of those.

@@ -201,7 +201,7 @@ def _is_near(match: Match) -> bool:
 
 
 def _far(match: Match) -> float:
-    """How far the levels are apart, over the larger one; those that are not known last."""
+    """The difference of the levels over the larger one; infinite where one is not known."""
     known = _levels(match)
     if known is None:
         return math.inf

@@ -20,7 +20,7 @@ APART = (
     "apart: the difference over the half-widths of both 95 % intervals together (root of the sum of their squares); "
     "above 1, chance alone does not explain it."
 )
-"""What the unit of a distance is."""
+"""The unit of a distance, in words."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,7 +51,7 @@ class RunComparison(Shown):
 
     @property
     def conclusion(self) -> str:
-        """What the values come to: those that differ beyond their intervals."""
+        """The values that differ beyond their intervals."""
         judged = [v for v in self.data["values"] if v["apart"] is not None]
         beyond = [v["parameter"] for v in judged if v["apart"] > 1.0]
         if beyond:
@@ -85,7 +85,7 @@ class RunComparison(Shown):
 
     @property
     def input_lines(self) -> list[str]:
-        """What went into both: software, model, files, values, in lines."""
+        """The differences in software, model, files and given values, in lines."""
         data = self.data
         lines = [f"{kind}: {a} and {b}" for kind, (a, b) in data["differing"].items()]
         files = data["sources"]
@@ -224,7 +224,7 @@ def _heading(run: Mapping[str, Any]) -> str:
 
 
 def _sources(first: dict[str, str], second: dict[str, str]) -> dict[str, list[str]]:
-    """Which files were read by both and differ, and which by one alone."""
+    """The names of files that both read and that differ, and of those that one alone read."""
     return {
         "differ": [n for n in first if n in second and first[n] != second[n]],
         "first": [n for n in first if n not in second],

@@ -207,7 +207,7 @@ def _about(match: Match) -> dict[str, str]:
 
 
 def _found(r: Mapped) -> str:
-    """What was found in a recording, as `check` finds it."""
+    """The rows, event and noise of a recording, as `check` finds it."""
     e = r.experiment
     if e is None:
         return f"{r.name}: no output could be mapped; the study has the candidates as comments, and the experiment too"
@@ -226,7 +226,7 @@ def _noise(r: Mapped) -> str:
 
 
 def _open_lines(r: Mapped) -> Iterator[str]:
-    """What could not be mapped, in lines."""
+    """Lines on the columns and signals that are not mapped."""
     if r.levels:
         yield r.levels
     open_ = _by_column(r.columns.proposed)

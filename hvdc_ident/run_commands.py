@@ -1,0 +1,147 @@
+"""The commands that run stages: `demo`, `run`, and one for each stage; and the screens they end with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hvdc_ident.command import (
+    Access,
+    Budget,
+    CommandFailed,
+    Console,
+    FitWork,
+    Open,
+    Out,
+    StudyFile,
+    Work,
+    open_page,
+    pasteable,
+    within,
+)
+from hvdc_ident.errors import require_known
+from hvdc_ident.study.stages import Stage, StageOptions
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.pipeline import Done
+    from hvdc_ident.study.study import Study
+
+
+def demo(
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for study, data, results and report.")
+    ] = Path("hvdc-ident-demo"),
+    open_: Open = False,
+    work: Work,
+    console: Console,
+) -> None:
+    """Calibrate the shipped link on recordings made here."""
+    from hvdc_ident.study.demo_truth import truth_lines
+    from hvdc_ident.study.examples import write_demo, write_truth
+    from hvdc_ident.study.study import load_study
+
+    with console.progress() as progress:
+        options = work.options(console, progress)
+        study = load_study(write_demo(out, seed=work.seed, progress=progress))
+        truth = write_truth(out, study, seed=work.seed)
+        done = _run_all(study, out, options)
+    found = {d.stage.name: d.data for d in done if not d.failed}
+    compared = truth_lines(truth, found.get("fit", {}), found.get("diagnose", {}))
+    _tell_run(
+        study, out, done, console, lambda line: pasteable(line, study.path, out, None), truth=compared, opens=open_
+    )
+
+
+def run(
+    *,
+    study: StudyFile,
+    out: Out = None,
+    open_: Open = False,
+    work: Work,
+    console: Console,
+    access: Access,
+) -> None:
+    """Run every stage that the study asks for, then write the report.
+
+    A second run redoes only what changed; after a kill it goes on.
+    """
+    loaded = access.study(study)
+    folder = out or loaded.folder
+    with console.progress() as progress:
+        done = _run_all(loaded, folder, work.options(console, progress))
+    _tell_run(loaded, folder, done, console, lambda line: pasteable(line, study, out, access), opens=open_)
+
+
+def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
+    from hvdc_ident.report.page import write_report
+    from hvdc_ident.study.pipeline import heading_of, run_all, write_run
+
+    done = run_all(study, folder, options)
+    write_run(folder, heading_of(study, options.seed), done)
+    options.progress(0, 1, "report: writing the page")
+    write_report(folder)
+    return done
+
+
+def _tell_run(
+    study: Study,
+    folder: Path,
+    done: list[Done],
+    console: Console,
+    typed: Callable[[str], str],
+    truth: Sequence[str] = (),
+    opens: bool = False,
+) -> None:
+    """Tell how the stages of a run went. typed: returns a line with the commands in it as they are to be typed here.
+
+    truth: lines with the values beside the true ones, in place of the table of values. opens: the report, in the browser.
+    """
+    from hvdc_ident.study.pipeline import heading_of
+    from hvdc_ident.study.run_summary import run_lines
+
+    seed = done[0].data["seed"] if done else 0
+    found = {d.stage.name: d.data for d in done}
+    console.print_json({**heading_of(study, seed), "stages": found, "report": "report.html"})
+    console.say(*map(typed, run_lines(done, truth)))
+    console.say(f"report: {folder / 'report.html'}")
+    if opens:
+        open_page(folder / "report.html")
+    failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
+    if failures:
+        raise CommandFailed("; ".join(failures))
+
+
+def stage_command(stage: Stage) -> Callable[..., None]:
+    """Return the command that runs one stage of a study, and those it builds on, and tells how it went."""
+
+    def one_stage(
+        *, study: StudyFile, out: Out = None, work: Work, budget: Budget = None, console: Console, access: Access
+    ) -> None:
+        from hvdc_ident.study.pipeline import run_stage
+
+        loaded = access.study(study)
+        folder = out or loaded.folder
+        searched = "budget" in stage.takes  # it answers with what it has by then; the others are interrupted
+        with within(None if searched else budget), console.progress() as progress:
+            options = work.options(console, progress)
+            options = replace(options, budget=budget) if searched else options
+            hint = "NAME = {min = ..., max = ...} in [parameters], which makes a parameter a candidate"
+            require_known("candidate", options.force, loaded.candidates, "--force", hint)
+            done = run_stage(loaded, stage.name, folder, options)
+        console.print_json(done.data)
+        console.say(*(f"steady state, {line}" for line in done.data.get("steady_state", ())))
+        lines = () if done.failed or console.json or console.quiet else stage.tell(done.data)
+        console.say(*(pasteable(line, study, out, access) for line in lines))
+        console.say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}")
+        if done.failed:
+            raise CommandFailed(f"{stage.name}: {done.failed}")
+
+    one_stage.__doc__ = stage.summary
+    if "force" in stage.takes:
+        one_stage.__annotations__["work"] = FitWork
+    return one_stage
