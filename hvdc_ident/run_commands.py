@@ -24,7 +24,7 @@ from hvdc_ident.command import (
     within,
 )
 from hvdc_ident.errors import require_known
-from hvdc_ident.study.stages import Stage, StageOptions
+from hvdc_ident.study.stages import Stage
 
 if TYPE_CHECKING:
     from hvdc_ident.study.pipeline import Done
@@ -44,12 +44,13 @@ def demo(
     from hvdc_ident.study.demo_truth import truth_lines
     from hvdc_ident.study.examples import write_demo, write_truth
     from hvdc_ident.study.study import load_study
+    from hvdc_ident.study.whole_run import run_study
 
     with console.progress() as progress:
         options = work.options(console, progress)
         study = load_study(write_demo(out, seed=work.seed, progress=progress))
         truth = write_truth(out, study, seed=work.seed)
-        done = _run_all(study, out, options)
+        done = run_study(study, out, options)
     found = {d.stage.name: d.data for d in done if not d.failed}
     compared = truth_lines(truth, found.get("fit", {}), found.get("diagnose", {}))
     _tell_run(
@@ -70,22 +71,13 @@ def run(
 
     A second run redoes only what changed; after a kill it goes on.
     """
+    from hvdc_ident.study.whole_run import run_study
+
     loaded = access.study(study)
     folder = out or loaded.folder
     with console.progress() as progress:
-        done = _run_all(loaded, folder, work.options(console, progress))
+        done = run_study(loaded, folder, work.options(console, progress))
     _tell_run(loaded, folder, done, console, lambda line: pasteable(line, study, out, access), opens=open_)
-
-
-def _run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
-    from hvdc_ident.report.page import write_report
-    from hvdc_ident.study.pipeline import heading_of, run_all, write_run
-
-    done = run_all(study, folder, options)
-    write_run(folder, heading_of(study, options.seed), done)
-    options.progress(0, 1, "report: writing the page")
-    write_report(folder)
-    return done
 
 
 def _tell_run(
