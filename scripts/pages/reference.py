@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -86,11 +86,13 @@ def model_card() -> str:
 
 
 def _heading(path: str) -> list[str]:
+    """Return the heading of a table as the file writes it: [[...]] where there may be several."""
     if path == "study":
         return ["## Top level {: #top }", ""]
-    parents = path.split(".")
-    depth = "###" if len(parents) > 1 else "##"
-    return [f"{depth} [{path}] {{: #{path.replace('.', '-')} }}", ""]
+    outer, _, own = path.rpartition(".")
+    is_list = any(k.name == own and k.kind == "list of tables" for k in study_keys().get(outer or "study", ()))
+    depth = "###" if outer else "##"
+    return [f"{depth} {f'[[{path}]]' if is_list else f'[{path}]'} {{: #{path.replace('.', '-')} }}", ""]
 
 
 def _table(keys: list[Key], path: str) -> Iterator[str]:
@@ -117,18 +119,19 @@ def _catalogue(entries: Mapping[str, str]) -> Iterator[str]:
 
 def waveform_formats() -> str:
     """Return the page on the waveform formats."""
+    written = [f"{name} ({f.SUFFIXES[0]})" for name, f in formats().items() if hasattr(f, "write")]
     lines = [
         "# Waveform formats",
         "",
         "The format is recognised by the content of a file, not by its ending. `hvdc-ident convert FILE --list TEXT` searches its",
-        "signals, and `--to FILE.csv` writes them as CSV.",
+        f"signals, and `--to FILE` writes them: as {' or '.join(['CSV', *written])}.",
         "",
-        "| format | endings | writes | what it is |",
-        "|---|---|---|---|",
+        "| format | endings | what it is |",
+        "|---|---|---|",
     ]
     for name, f in formats().items():
         endings = ", ".join(f"`{s}`" for s in f.SUFFIXES)
-        lines.append(f"| `{name}` | {endings} | {'yes' if hasattr(f, 'write') else 'no'} | {_cell(f.SUMMARY)} |")
+        lines.append(f"| `{name}` | {endings} | {_cell(f.SUMMARY)} |")
     lines += ["", "In Python: [`read_waveforms`](python.md#read_waveforms).", ""]
     return "\n".join(lines)
 
@@ -178,7 +181,7 @@ def _entry(name: str, thing: Any, example: str) -> Iterator[str]:
     yield ""
     if callable(thing):
         yield from ("```python", signature(name, thing), "```", "")
-        yield from (_prose(inspect.getdoc(thing) or ""), "")
+        yield from (_prose(inspect.getdoc(thing) or "", inspect.signature(thing).parameters), "")
     else:
         yield from ("The version of the installed package, as text.", "")
     if inspect.isclass(thing):
@@ -206,11 +209,17 @@ def signature(name: str, thing: Any) -> str:
     return f"{name}(\n" + "".join(f"    {a},\n" for a in arguments) + f"){arrow}"
 
 
-def _prose(doc: str) -> str:
-    """Return a docstring's paragraphs as HTML: its text is not Markdown. Examples are left to the page's own."""
+def _prose(doc: str, names: Iterable[str]) -> str:
+    """Return a docstring's paragraphs as HTML: its text is not Markdown. Examples are left to the page's own.
+
+    names: of arguments or fields; an explanation of one of them begins a line.
+    """
+    any_name = "|".join(sorted(map(re.escape, names), key=len, reverse=True)) or "(?!)"
+    explained = re.compile(rf"(^|(?<=[.;)]\s))((?:{any_name})(?:, (?:{any_name}))*):(?=\s)")
     paragraphs = [p for p in re.split(r"\n\s*\n", doc) if ">>>" not in p and not p.lstrip().startswith("...")]
-    marked = (re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(p, quote=False)) for p in paragraphs)
-    return '<div class="docstring">' + "".join(f"<p>{p}</p>" for p in marked) + "</div>"
+    marked = (re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(" ".join(p.split()), quote=False)) for p in paragraphs)
+    lines = (re.sub(r"^<br>", "", explained.sub(r"<br><b>\2</b>:", p)) for p in marked)
+    return '<div class="docstring">' + "".join(f"<p>{p}</p>" for p in lines) + "</div>"
 
 
 def _members(kind: type) -> Iterator[str]:
