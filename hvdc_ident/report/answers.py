@@ -238,7 +238,12 @@ class Answers:
     def values(self) -> tuple[Value, ...]:
         """Every candidate with the value that counts."""
         told = self.results.get("identifiability")
-        lines = self.fit.get("candidates") or told.get("candidates") or {}
+        lines = (
+            self.fit.get("candidates")
+            or told.get("candidates")
+            or self.results.get("simulation").get("candidates")
+            or {}
+        )
         after = self.diagnosis.get("parameters_after") or {} if self.added else {}
         lines = lines or {n: {"given": g} for n, g in (self.diagnosis.get("parameters_before") or {}).items()}
         later = self.diagnosis.get("estimates_after") or {}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from hvdc_ident.report.answers import Answers, Errors, Value
-from hvdc_ident.report.html import badge, estimate, number, percent, rough, share, table, text
+from hvdc_ident.report.html import badge, estimate, number, percent, prose, rough, share, table, text
 from hvdc_ident.report.overlay import Sheet
 from hvdc_ident.report.results import Results
 
@@ -38,9 +38,9 @@ def _tile(name: str, title: str, body: str) -> str:
 
 def _warnings(results: Results, found: Answers) -> list[str]:
     """Stages that failed, experiments without a run, and results of an earlier state of the study."""
-    lines = [f"<strong>{text(n)} failed</strong>: {text(why.rstrip('.'))}." for n, why in found.failures.items()]
+    lines = [f"<strong>{text(n)} failed</strong>: {prose(why.rstrip('.'))}." for n, why in found.failures.items()]
     lines += [
-        f"Experiment <strong>{text(n)}</strong> could not be simulated: {text(str(e.get('reason', '')).rstrip('.'))}."
+        f"Experiment <strong>{text(n)}</strong> could not be simulated: {prose(str(e.get('reason', '')).rstrip('.'))}."
         for n, e in results.experiments.items()
         if e.get("status") == "failed"
     ]
@@ -72,7 +72,7 @@ def _verdict(found: Answers) -> str:
     ]
     header = ["", f"RMSE{in_unit}", "× noise", f"peak{in_unit}", "on the noise", f"in the {limit}"]
     worst = f"Worst signal: <strong>{text(output)}</strong> in <strong>{text(experiment)}</strong>"
-    worst += f", noise {number(noise, 2)} {text(unit)}." if noise else ". Its noise is not known."
+    worst += f", noise {f'{number(noise, 2)} {text(unit)}'.strip()}." if noise else ". Its noise is not known."
     return f"<p class='answer'>{_sentence(found, found.judged)}</p><p>{worst}</p>{table(header, rows, words=(0, 4, 5))}{_basis(found)}"
 
 
@@ -89,16 +89,16 @@ def _sentence(found: Answers, judged: Errors) -> str:
     if found.follows:
         return f"{badge(True)} {which} {kind}."
     kind = "does not keep the tolerance" if found.by_tolerance else "does not follow the recordings to their noise"
-    return f"{badge(False)} {which} {kind}."
+    completed = next((e for e in found.errors if e.name == "effect"), None)
+    mended = completed is not None and (completed.tolerated if found.by_tolerance else completed.on_noise)
+    return f"{badge(False)} {which} {kind}{'; with the effect it does' if mended else ''}."
 
 
 def _basis(found: Answers) -> str:
     """One line on what the columns compare with what."""
     parts = []
     if any(e.judged for e in found.errors):
-        parts.append(
-            "On the noise: in no signal has the error more than twice the noise's power. Behind FAIL: the signals that fail."
-        )
+        parts.append("On the noise: the error has at most twice the noise’s power. Behind FAIL: signals that fail.")
     if found.tolerance:
         each = ", ".join(
             f"{text(o)} {number(v)} {text(found.results.units.get(o, ''))}".rstrip() for o, v in found.tolerance.items()
@@ -183,7 +183,9 @@ def _missing(found: Answers) -> str:
         return _undiagnosed(found)
     if not found.missing:
         said = str(diagnosis.get("text", "")).rstrip(".")
-        return f"<p class='answer'><strong>{text(_verdict_word(str(diagnosis['verdict'])))}.</strong> {text(said)}.</p>"
+        return (
+            f"<p class='answer'><strong>{text(_verdict_word(str(diagnosis['verdict'])))}.</strong> {prose(said)}.</p>"
+        )
     parts = []
     for f in found.missing:
         sure = f", <strong>{percent(f.probability)}</strong> likely" if f.name != "parameter" else ""
@@ -224,7 +226,7 @@ def _undiagnosed(found: Answers) -> str:
 
 def _next(found: Answers) -> str:
     if found.next:
-        return f"<p class='answer'>{text(found.next)}</p>"
+        return f"<p class='answer'>{prose(found.next)}</p>"
     if found.follows and all(not v.note for v in found.values):
         return "<p class='answer'>Nothing: the values are determined and the model follows.</p>"
     return "<p class='answer'>No advice yet: <code>hvdc-ident identify STUDY</code> says which recording would tell more.</p>"

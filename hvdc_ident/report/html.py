@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -11,6 +12,11 @@ from typing import Any
 def text(value: Any) -> str:
     """Any value as text that is safe inside a page."""
     return html.escape(str(value), quote=True)
+
+
+def prose(value: Any) -> str:
+    """Text for people as HTML, with what stands between backticks as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text(value))
 
 
 def number(value: Any, digits: int = 4) -> str:
@@ -26,8 +32,10 @@ def number(value: Any, digits: int = 4) -> str:
 
 def rough(value: Any, digits: int = 2) -> str:
     """A number with exactly so many significant digits, zeros at its end too; a dash where there is none."""
-    if not isinstance(value, int | float) or not math.isfinite(value) or not 1e-4 <= abs(value) < 10.0**digits:
+    if not isinstance(value, int | float) or not math.isfinite(value) or not 1e-4 <= abs(value) < 1e6:
         return number(value, digits)
+    if abs(value) >= 10.0**digits:
+        return f"{float(f'{value:.{digits}g}'):.0f}".replace("-", "−")
     return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
 
 
@@ -61,7 +69,8 @@ def share(after: Any, before: Any) -> str:
     """The change from before to after in per cent; a dash where it cannot be told."""
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in (after, before)) or not before:
         return "–"
-    return f"{100.0 * (after / before - 1.0):+.1f} %".replace("-", "−")
+    change = 100.0 * (after / before - 1.0)
+    return "0.0 %" if abs(change) < 0.05 else f"{change:+.1f} %".replace("-", "−")
 
 
 def captioned(drawing: str, caption: str, attributes: str = "") -> str:

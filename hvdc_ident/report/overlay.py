@@ -133,13 +133,13 @@ class Sheet:
     @classmethod
     def new(cls, width: float = 6.4, height: float = 3.4, strip: float = 1.0 / 3.0) -> Sheet:
         """An empty sheet, sizes in inches. strip: height of the errors' axes over that of the signal's."""
-        margins = {"left": 0.72 / width, "right": 1.0 - 0.06 / width, "bottom": 0.42 / height}
+        margins = {"left": 0.72 / width, "right": 1.0 - 0.16 / width, "bottom": 0.42 / height}
         fig = figure(width, height, {**margins, "top": 1.0 - 0.28 / height, "hspace": 0.1})
         top, below = fig.subplots(2, 1, sharex=True, height_ratios=[1.0, strip])
         below.set_xlabel("time, s", fontsize=8)
         for axes in (top, below):
             axes.yaxis.set_label_coords(
-                -0.61 / (width - 0.78), 0.5
+                -0.61 / (width - 0.88), 0.5
             )  # one below the other, however wide the numbers are
             axes.grid(True, color="#e4e4e4", linewidth=0.6)
             axes.spines[["top", "right"]].set_visible(False)
@@ -157,7 +157,7 @@ class Sheet:
             self._line(
                 self.strip, run.time, overlay.error(name), span, color, dashes if name != "given" else "-", 0.9, ""
             )
-            if f"{output}.low" in run and len(overlay.runs) < 3:
+            if f"{output}.low" in run and span is None and len(overlay.runs) < 3:
                 low, high = (run[f"{output}.{end}"] for end in ("low", "high"))
                 kind = "95 % band of a sample"
                 self.top.fill_between(run.time, low, high, color=color, alpha=0.15, linewidth=0, label=kind)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import re
-import shutil
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +17,6 @@ from hvdc_ident.cli import app
 from hvdc_ident.report.page import sections, write_report
 from tests.report.test_letter import diagnosis
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PHONE, DESK = {"width": 390, "height": 800}, {"width": 1200, "height": 900}
 
 STAGES = """
@@ -118,17 +115,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (results / "fit.json").write_text(json.dumps(fit), "utf-8")
     write_report(results)
     return results
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    program = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if program is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is on the path")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
-        yield started
-        started.close()
 
 
 @pytest.fixture
