@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
+from hvdc_ident.study.json_schema import card_keys, study_keys
 
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_BLOCKS = ("index.md", "report.md")
 GUIDES = sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in WITHOUT_BLOCKS)
+TOML = re.compile(r"^ *```toml\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -43,3 +46,10 @@ def _shell(code: str) -> None:
 @pytest.mark.parametrize("name", WITHOUT_BLOCKS)
 def test_a_page_without_blocks_has_none(name: str) -> None:
     assert not BLOCK.findall((ROOT / "docs" / name).read_text("utf-8"))
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda p: p.stem)
+def test_toml_blocks_are_toml_with_keys_that_are_read(page: Path) -> None:
+    known = {k.name for tables in (study_keys(), card_keys()) for keys in tables.values() for k in keys}
+    for block in TOML.findall(page.read_text("utf-8")):
+        assert set(tomllib.loads(block)) <= known, block
