@@ -145,14 +145,21 @@ def new_study(
     return NewStudy(path, plant, mapped)
 
 
-def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
-    record = read_waveforms(file)
+def matched(record: Trajectory, model: AnyModel) -> tuple[Matching, str]:
+    """Return the columns of a recording by signal of a model, and why the model's levels are not known ("" where they are).
+
+    Levels are those before the event that inputs of the signals' names show.
+    """
     named = match_names(columns_of(record, None), targets_of(model, {}))
     moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
     event = event_time({m.target.name: input_signal(record.time, _values(record, m)) for m in moved})
     inputs = [m for m in moved if usable(m)]
     levels, why = _levels(model, {m.target.name: float(_values(record, m)[0]) for m in inputs})
-    found = matching(columns_of(record, event), targets_of(model, levels))
+    return matching(columns_of(record, event), targets_of(model, levels)), why
+
+
+def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
+    found, why = matched(read_waveforms(file), model)
     data = _relative(file, folder)
     by_kind = {
         kind: {m.target.name: m.column.name for m in found.mapped if m.target.kind == kind}

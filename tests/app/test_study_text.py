@@ -1,0 +1,143 @@
+"""An experiment written into a study's text: it reads back, and nothing else of the file changes."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+import pytest
+
+from hvdc_ident.app.study_text import with_experiment
+from hvdc_ident.errors import StudyError
+
+STUDY = """# the study of the spring campaign
+schema = 1 # of the format
+
+[model]
+source = "vsc-hvdc-link"
+
+# what may be estimated
+[parameters]
+KIVDC = {start = 700} # a comment # with two signs
+
+# first recording
+[[experiment]]
+name = "up" # its name
+data = "up.csv"
+inputs = ["Vdcref1"]   # by their own names
+noise = {Vdc1 = 1e-4}  # from the data sheet
+
+[experiment.outputs]
+Vdc1 = "V #1"  # the bus
+Irorder1 = "I"
+
+# second recording
+[[experiment]]
+name = "down"
+data = "down.csv"
+outputs = [
+    "Vdc1", # in two
+    "P2",   # lines
+]
+
+# how it is fitted
+[fit]
+starts = 2
+"""
+
+
+def keys(**changes: Any) -> dict[str, Any]:
+    same = {"inputs": {"Vdcref1": "Vdcref1"}, "outputs": {"Vdc1": "V #1", "Irorder1": "I"}}
+    return {
+        "name": "up",
+        "data": "up.csv",
+        **same,
+        "columns": {},
+        "role": None,
+        "event": None,
+        "window": None,
+        **changes,
+    }
+
+
+def test_what_says_the_same_stays_letter_for_letter() -> None:
+    assert with_experiment(STUDY, "up", keys(), "study.toml") == STUDY
+
+
+def test_only_the_lines_of_what_changed_are_others() -> None:
+    outputs = {"Vdc1": "V2", "P2": "P"}
+    new = with_experiment(STUDY, "up", keys(outputs=outputs, event=0.1, window=[0.0, 0.5]), "study.toml")
+    left, right = set(STUDY.splitlines()), set(new.splitlines())
+    assert left - right == {'Vdc1 = "V #1"  # the bus', 'Irorder1 = "I"'}
+    assert right - left == {'Vdc1 = "V2"  # the bus', 'P2 = "P"', "event = 0.1", "window = [0.0, 0.5]"}
+    experiment = tomllib.loads(new)["experiment"][0]
+    assert experiment["outputs"] == outputs and experiment["noise"] == {"Vdc1": 1e-4} and experiment["event"] == 0.1
+
+
+def test_a_list_of_names_becomes_a_table_and_a_key_goes() -> None:
+    changed = {
+        "name": "down",
+        "data": "down.csv",
+        "outputs": {"Vdc1": "Vdc1", "P2": "P_MW"},
+        "columns": {"P2": {"base": 1000.0}},
+    }
+    new = with_experiment(STUDY, "down", changed, "study.toml")
+    assert tomllib.loads(new)["experiment"][1] == changed
+    assert new.partition("[[experiment]]")[0] == STUDY.partition("[[experiment]]")[0]
+    assert new.endswith("# how it is fitted\n[fit]\nstarts = 2\n")
+    back = with_experiment(new, "down", {**changed, "columns": {}}, "study.toml")
+    assert "columns" not in tomllib.loads(back)["experiment"][1]
+
+
+def test_an_experiment_is_renamed_and_another_added_behind_the_last() -> None:
+    new = with_experiment(STUDY, "up", keys(name="first"), "study.toml")
+    assert new == STUDY.replace('name = "up"', 'name = "first"')
+    added = with_experiment(
+        STUDY, "third", keys(name="third", columns={"Vdc1": {"unit": "kV", "base": 640.0}}), "study.toml"
+    )
+    assert [e["name"] for e in tomllib.loads(added)["experiment"]] == ["up", "down", "third"]
+    assert added.index('"third"') < added.index("# how it is fitted")
+    assert all(line in added.splitlines() for line in STUDY.splitlines())
+
+
+@pytest.mark.parametrize("text", ['schema = 1\n[model]\nsource = "x"', 'schema = 1\n[model]\nsource = "x"\n\n\n', ""])
+def test_the_first_experiment_stands_at_the_end(text: str) -> None:
+    new = with_experiment(text, "up", keys(), "study.toml")
+    assert tomllib.loads(new) == {
+        **tomllib.loads(text),
+        "experiment": [{k: v for k, v in keys().items() if v}],
+    }
+
+
+def test_line_ends_and_the_byte_order_mark_stay() -> None:
+    text = "\ufeff" + STUDY.replace("\n", "\r\n")
+    new = with_experiment(text, "up", keys(event=0.25), "study.toml")
+    assert new.startswith("\ufeff# the study") and "\n" not in new.replace("\r\n", "")
+    assert new.replace("event = 0.25\r\n", "") == text
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        'name = "up"\ndata = "up.csv"\ninputs.Vdcref1 = "Vdcref1"\noutputs.Vdc1 = "V #1"\noutputs.Irorder1 = "I"\n',
+        'name = "up"\ndata = "up.csv"\ninputs = ["Vdcref1"]\noutputs = {Vdc1 = "V #1"}\n[experiment.columns.Vdc1]\nbase = 2.0\n',
+        '"name" = \'up\'\ndata = """\nup.csv"""\ninputs = ["Vdcref1"]\n[ experiment . outputs ]\n"Vdc1" = "V #1"\nIrorder1 = "I"\n',
+        'outputs = ["Vdc1"]\nname = "up"\ndata = "up.csv"\n[[experiment.phases]]\nvoltage = ["a", "b", "c"]\ngives = {V = "v"}\n',
+    ],
+)
+def test_every_layout_of_one_experiment_is_changed(layout: str) -> None:
+    text = f"schema = 1\n[[experiment]]\n{layout}# end\n[fit]\nstarts = 3\n"
+    wanted = keys(outputs={"Vdc1": "other", "P2": 'with "quotes" and # sign'}, columns={"Vdc1": {"base": 3.0}})
+    new = tomllib.loads(with_experiment(text, "up", wanted, "study.toml"))
+    assert new["fit"] == {"starts": 3}
+    found = new["experiment"][0]
+    assert found["outputs"] == wanted["outputs"] and found["columns"] == wanted["columns"]
+    assert found.get("phases") == tomllib.loads(text)["experiment"][0].get("phases")
+
+
+def test_a_layout_that_cannot_be_changed_is_refused() -> None:
+    text = 'schema = 1\nexperiment = [{name = "up", data = "up.csv", outputs = ["Vdc1"]}]\n'
+    with pytest.raises(StudyError, match="as it was"):
+        with_experiment(text, "up", keys(), "study.toml")
+    with pytest.raises(StudyError, match="not valid TOML"):
+        with_experiment("schema = = 1", "up", keys(), "study.toml")
