@@ -1,5 +1,6 @@
 // Curves on canvas, drawn by uPlot: grids one above the other with one abscissa and one cursor, or a plane of points.
-// put(grid, column, values) replaces one column of one grid's data; whole(grid, columns) replaces all of them.
+// put(grid, column, values) replaces one column of one grid's data; whole(grid, columns) replaces all of them, and
+// refine(grid, columns) does so while the same part of the abscissa stays in view. mark(key, at) moves a marker.
 const INK = "#7a8089", FAINT = "rgba(122,128,137,0.22)", FONT = "12px system-ui, sans-serif";
 const axis = (label, side) => ({
   label, side, stroke: INK, font: FONT, labelFont: FONT, labelSize: 16, size: side === 2 ? 26 : 58, gap: 3,
@@ -33,15 +34,18 @@ const crosses = (color) => (u, k) => {
 
 export default {
   template: `<div class="plot" style="position:relative"></div>`,
-  props: { grids: Array, xtitle: String, log: Boolean, plane: Boolean, height: Number, label: String },
+  props: { grids: Array, xtitle: String, log: Boolean, plane: Boolean, height: Number, label: String, markers: Array },
+  emits: ["ready", "marked", "viewed"],
   mounted() {
     this.plots = [];
+    this.at = Object.fromEntries((this.markers || []).map((m) => [m.key, m.at]));
     this.sync = uPlot.sync(this.log ? "frequency" : this.plane ? "plane" : "time");
     this.$el.setAttribute("role", "img");
     this.$el.setAttribute("aria-label", this.label || "");
     this.build();
     this.observer = new ResizeObserver(() => this.fit());
     this.observer.observe(this.$el);
+    this.$emit("ready");  // what was sent to a plot before it stood on the page is lost
   },
   beforeUnmount() {
     this.observer.disconnect();
@@ -61,6 +65,7 @@ export default {
           axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g === last ? undefined : () => [] }, axis(grid.title, 3)],
           cursor: { sync: { key: this.sync.key }, drag: { x: true, y: this.plane } },
           legend: { show: true, live: !this.plane }, focus: { alpha: 1 },
+          hooks: this.markers?.length ? this.marking(g) : {},
         };
         const empty = [[], ...grid.curves.map(() => [])];
         const plot = new uPlot(options, this.data?.[g] ?? empty, this.$el);
@@ -68,6 +73,66 @@ export default {
         return plot;
       });
       this.data = this.plots.map((p) => p.data);
+    },
+    // The markers of one grid: lines over it that follow its scale, are dragged, and answer the arrow keys.
+    marking(g) {
+      return {
+        init: [(u) => {
+          u.lines = this.markers.map((m) => {
+            const line = document.createElement("div");
+            line.className = "marker";
+            line.style.color = m.color;
+            line.innerHTML = "<i></i><b></b>";
+            if (g === 0) {
+              line.lastChild.textContent = m.label;
+              line.tabIndex = 0;
+              line.setAttribute("role", "slider");
+              line.setAttribute("aria-label", `${m.label}, s`);
+            }
+            const put = (value) => {
+              const x = this.span();
+              this.mark(m.key, Math.min(Math.max(value, x[0]), x[1]));
+            };
+            line.onmousedown = (e) => e.stopPropagation();  // else the plot begins to select
+            line.onpointerdown = (e) => { line.setPointerCapture(e.pointerId); e.preventDefault(); line.focus(); };
+            line.onpointermove = (e) => {
+              if (line.hasPointerCapture(e.pointerId)) put(u.posToVal(e.clientX - u.over.getBoundingClientRect().left, "x"));
+            };
+            line.onpointerup = () => this.$emit("marked", { key: m.key, at: this.at[m.key] });
+            line.onkeydown = (e) => {
+              const step = { ArrowLeft: -1, ArrowRight: 1 }[e.key];
+              if (!step) return;
+              e.preventDefault();
+              put(this.at[m.key] + step * (u.posToVal(1, "x") - u.posToVal(0, "x")) * (e.shiftKey ? 10 : 1));
+              this.$emit("marked", { key: m.key, at: this.at[m.key] });
+            };
+            u.over.appendChild(line);
+            return line;
+          });
+        }],
+        draw: [(u) => this.place(u)],
+        setScale: [(u, key) => {
+          if (g !== 0 || key !== "x" || this.refining || u.scales.x.min == null) return;
+          clearTimeout(this.later);
+          this.later = setTimeout(() => this.$emit("viewed", { from: u.scales.x.min, to: u.scales.x.max }), 120);
+        }],
+      };
+    },
+    span() {
+      const x = this.plots[0].data[0];
+      return [x[0], x[x.length - 1]];
+    },
+    place(u) {
+      const width = u.over.clientWidth;
+      this.markers.forEach((m, k) => {
+        const x = u.valToPos(this.at[m.key], "x");
+        u.lines[k].style.display = x >= -1 && x <= width + 1 ? "" : "none";
+        u.lines[k].style.left = `${x}px`;
+        u.lines[k].setAttribute("aria-valuenow", this.at[m.key]);
+        const name = u.lines[k].lastChild;  // on the side where there is room
+        name.style.left = x > width - 60 ? "auto" : "9px";
+        name.style.right = x > width - 60 ? "9px" : "auto";
+      });
     },
     curve(c) {
       const points = c.mark ? { show: c.mark === "cross" ? crosses(c.color) : true, size: c.size || 7, stroke: c.color, fill: c.mark === "ring" ? "transparent" : c.color } : { show: false };
@@ -91,6 +156,17 @@ export default {
     },
     whole(grid, columns) {
       this.plots[grid].setData(columns);
+    },
+    refine(grid, columns) {
+      const plot = this.plots[grid], { min, max } = plot.scales.x;
+      this.refining = true;
+      plot.setData(columns, min == null);
+      if (min != null) plot.setScale("x", { min, max });
+      setTimeout(() => { this.refining = false; }, 0);  // the plot says so in a microtask
+    },
+    mark(key, at) {
+      this.at[key] = at;
+      this.plots.forEach((u) => this.place(u));
     },
   },
 };

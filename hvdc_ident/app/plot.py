@@ -24,7 +24,11 @@ ASSETS = Path(__file__).parent / "static" / "uplot"
 HEAD = """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
 <style>.plot .u-legend { font: 11px system-ui, sans-serif; margin: 0; text-align: left; padding-left: 58px; }
 .plot .u-legend th { font-weight: 400; } .plot .u-legend .u-marker { border-width: 2px; width: .8em; height: .8em; }
-.plot .u-legend .u-series > * { padding: 0 2px; } .plot .u-value { min-width: 5.5em; }</style>"""
+.plot .u-legend .u-series > * { padding: 0 2px; } .plot .u-value { min-width: 5.5em; }
+.plot .marker { position: absolute; top: 0; bottom: 0; width: 13px; margin-left: -6px; cursor: ew-resize; z-index: 101; }
+.plot .marker > i { position: absolute; left: 6px; top: 0; bottom: 0; border-left: 1.5px solid; }
+.plot .marker > b { position: absolute; left: 9px; top: 0; font: 600 11px system-ui, sans-serif; white-space: nowrap; }
+.plot .marker:focus-visible { outline: 2px solid; }</style>"""
 """What a page with plots has in its head; the server offers the folder `ASSETS` as /assets."""
 
 
@@ -40,6 +44,16 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Marker:
+    """A line across all grids that can be dragged. at: on the abscissa."""
+
+    key: str
+    label: str
+    color: str
+    at: float
+
+
+@dataclass(frozen=True)
 class Grid:
     """One picture of a plot: its ordinate's title, with the unit, and its curves."""
 
@@ -48,15 +62,33 @@ class Grid:
 
 
 class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
-    """Grids one above the other. log: of the abscissa. plane: both axes are looked into, by dragging a rectangle."""
+    """Grids one above the other. log: of the abscissa. plane: both axes are looked into, by dragging a rectangle.
+
+    markers: lines that can be dragged. Where one was, the plot says "marked" with {key, at}; with markers it says "viewed" with
+    {from, to} when another part of the abscissa is looked at.
+    """
 
     def __init__(
-        self, grids: Sequence[Grid], x_title: str, height: int, label: str, *, log: bool = False, plane: bool = False
+        self,
+        grids: Sequence[Grid],
+        x_title: str,
+        height: int,
+        label: str,
+        *,
+        log: bool = False,
+        plane: bool = False,
+        markers: Sequence[Marker] = (),
     ) -> None:
         """Build the plot without data. height: px. label: what is shown, for those who cannot see it."""
         super().__init__()
         self._props.update(
-            grids=[asdict(g) for g in grids], xtitle=x_title, height=height, label=label, log=log, plane=plane
+            grids=[asdict(g) for g in grids],
+            xtitle=x_title,
+            height=height,
+            label=label,
+            log=log,
+            plane=plane,
+            markers=[asdict(m) for m in markers],
         )
 
     def put(self, grid: int, column: int, values: Array) -> None:
@@ -67,6 +99,14 @@ class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
         """Replace all columns of a grid, the abscissa first: (n,) each."""
         self.run_method("whole", grid, [_short(c) for c in columns])
 
+    def refine(self, grid: int, columns: Sequence[Array]) -> None:
+        """Replace all columns of a grid and go on looking at the same part of it: (n,) each."""
+        self.run_method("refine", grid, [columns[0].tolist(), *(_short(c) for c in columns[1:])])
+
+    def mark(self, key: str, at: float) -> None:
+        """Move a marker."""
+        self.run_method("mark", key, at)
+
 
 def _short(values: Array) -> list[float | None]:
     """Return the values in half the digits, which is more than a screen shows; None where there is no number."""
@@ -74,19 +114,50 @@ def _short(values: Array) -> list[float | None]:
     return short if np.isfinite(values).all() else [v if np.isfinite(v) else None for v in short]
 
 
-def thinned(x: Array, *ys: Array) -> list[Array]:
+def thinned(x: Array, *ys: Array, most: int = MOST) -> list[Array]:
     """Return x and curves over it as they are drawn, (n,) each: of every stretch of many rows the least and the largest value.
 
-    No peak is lost. x: rising.
+    No peak is lost. x: rising. most: rows that are drawn.
     """
-    if x.size <= MOST:
+    if x.size <= most:
         return [x, *ys]
-    edges = np.linspace(0, x.size, MOST // 2 + 1).astype(int)[:-1]
+    edges = np.linspace(0, x.size, most // 2 + 1).astype(int)[:-1]
     middle = (edges + np.append(edges[1:], x.size)) // 2
     drawn = [np.column_stack([x[edges], x[middle]]).ravel()]
     for y in ys:
         drawn.append(np.column_stack([np.fmin.reduceat(y, edges), np.fmax.reduceat(y, edges)]).ravel())
     return drawn
+
+
+def focused(x: Array, low: float, high: float, *ys: Array) -> list[Array]:
+    """Return x and curves as they are drawn by somebody who looks at low to high, (n,) each: closely there, coarsely beside."""
+    ends = [0, *np.searchsorted(x, [low, high]).clip(0, x.size).tolist(), x.size]
+    ends[1], ends[2] = max(ends[1] - 1, 0), min(ends[2] + 1, x.size)  # lines that go on beyond the edge
+    parts = [
+        thinned(x[a:b], *(y[a:b] for y in ys), most=most)
+        for a, b, most in zip(ends, ends[1:], (MOST // 8, MOST, MOST // 8), strict=False)
+        if a < b
+    ]
+    return [np.concatenate(columns) for columns in zip(*parts, strict=True)]
+
+
+def sketch(x: Array, y: Array, width: int, height: int) -> str:
+    """Return a curve as a small picture (SVG) in the colour of the text, without axes; gaps stay open."""
+    drawn_x, drawn_y = thinned(x, y, most=2 * width)
+    known = np.isfinite(drawn_y)
+    low, high = (float(drawn_y[known].min()), float(drawn_y[known].max())) if known.any() else (0.0, 0.0)
+    span, length = (high - low) or 1.0, float(x[-1] - x[0]) or 1.0
+    across = (drawn_x - x[0]) / length * width
+    up = height - 2 - ((drawn_y - low) / span if high > low else np.where(known, 0.5, np.nan)) * (height - 4)
+    pieces, drawing = [], False
+    for a, b, there in zip(across.tolist(), up.tolist(), known.tolist(), strict=True):
+        if there:
+            pieces.append(f"{'L' if drawing else 'M'}{a:.1f} {b:.1f}")
+        drawing = there
+    return (
+        f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}" aria-hidden="true">'
+        f'<path d="{"".join(pieces)}" fill="none" stroke="{RECORDED}" stroke-width="1"/></svg>'
+    )
 
 
 def scattered(*sets: Array) -> list[Array]:

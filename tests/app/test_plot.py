@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_ident[app]'")
 
-from hvdc_ident.app.plot import MOST, _short, scattered, thinned
+from hvdc_ident.app.plot import MOST, _short, focused, scattered, sketch, thinned
 
 
 def test_a_short_record_is_drawn_as_it_is() -> None:
@@ -38,3 +38,27 @@ def test_sets_of_poles_share_an_abscissa() -> None:
     assert x.tolist() == [-5.0, -3.0, -2.0]
     assert np.array_equal(one, [0.0, np.nan, 1.0], equal_nan=True)
     assert np.array_equal(two, [np.nan, -1.0, np.nan], equal_nan=True)
+
+
+def test_what_is_looked_at_is_drawn_closely_and_the_rest_coarsely() -> None:
+    x = np.arange(1e6)
+    y = np.sin(x)
+    y[500_123], y[7] = 9.0, -9.0
+    drawn_x, drawn_y = focused(x, 500_000.0, 502_000.0, y)
+    inside = (drawn_x >= 500_000) & (drawn_x <= 502_000)
+    np.testing.assert_array_equal(drawn_x[inside], np.arange(500_000.0, 502_001.0))
+    np.testing.assert_array_equal(drawn_y[inside], y[500_000:502_001])
+    assert drawn_x.size < 2 * MOST and (np.diff(drawn_x) > 0).all() and drawn_y.min() == -9.0
+    assert drawn_x[0] == 0.0 and drawn_x[-1] > x[-1] * (1.0 - 16.0 / MOST)
+
+
+def test_a_view_beside_the_record_draws_it_all_the_same() -> None:
+    x = np.arange(10.0)
+    for low, high in ((-5.0, -1.0), (20.0, 30.0), (-1.0, 30.0), (3.2, 3.4)):
+        assert focused(x, low, high, x)[0].tolist() == x.tolist()
+
+
+def test_a_sketch_leaves_gaps_open() -> None:
+    drawn = sketch(np.arange(5.0), np.array([0.0, 1.0, np.nan, 1.0, 0.0]), 40, 24)
+    assert 'd="M0.0 22.0L10.0 2.0M30.0 2.0L40.0 22.0"' in drawn
+    assert "NaN" not in sketch(np.arange(3.0), np.full(3, np.nan), 40, 24).replace("nan", "NaN")
