@@ -366,8 +366,8 @@ def workbench(
     source: Annotated[
         str | None,
         typer.Argument(
-            metavar="STUDY|MODEL",
-            help="A study, a shipped model, a card or an FMU; default vsc-hvdc-link.",
+            metavar="STUDY|MODEL|RECORDING",
+            help="A study, a shipped model, a card, an FMU or a recording; default vsc-hvdc-link.",
             show_default=False,
         ),
     ] = None,

@@ -15,16 +15,21 @@ from functools import cache
 
 from hvdc_ident.app.desk import Desk, opened
 from hvdc_ident.app.guard import LOOPBACK, Guard
+from hvdc_ident.app.study_folder import MOST_BYTES
 from hvdc_ident.errors import InputError
 
 
 @dataclass(frozen=True)
 class Tab:
-    """A tab of the page: its place in the order, its title, and a function that builds it for a desk inside NiceGUI's context."""
+    """A tab of the page: its place in the order, its title, and a function that builds it for a desk inside NiceGUI's context.
+
+    maps: whether it is the one that a desk with a recording opens at.
+    """
 
     order: int
     title: str
     build: Callable[[Desk], None]
+    maps: bool = False
 
 
 def serve(
@@ -37,7 +42,7 @@ def serve(
 ) -> None:
     """Serve the workbench until it is interrupted.
 
-    source: a study file, a shipped model, a card or an FMU (default: the phasor link). port: 0 for any that is free. trust:
+    source: a study file, a recording, a shipped model, a card or an FMU (default: the phasor link). port: 0 for any that is free. trust:
     whether a model that is Python code may be run. ready: called with the address, token included, when the server listens.
 
     Raises InputError for a source that cannot be opened, a port that is taken, and where the extra `app` is not installed.
@@ -65,11 +70,15 @@ def serve(
         outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         outer.mount("/assets", StaticFiles(directory=ASSETS))
         ui.run_with(
-            outer, root=lambda: _page(desk), title=f"{desk.title} · hvdc-ident", dark=None, show_welcome_message=False
+            outer,
+            root=lambda: _page(desk.renewed()),
+            title=f"{desk.title} · hvdc-ident",
+            dark=None,
+            show_welcome_message=False,
         )
         here = (*LOOPBACK, host)
         server = uvicorn.Server(
-            uvicorn.Config(Guard(outer, token, here), log_level="warning", timeout_graceful_shutdown=1)
+            uvicorn.Config(Guard(outer, token, here, MOST_BYTES), log_level="warning", timeout_graceful_shutdown=1)
         )
         ready(f"http://{host}:{listening.getsockname()[1]}/?token={token}")
         with suppress(KeyboardInterrupt):  # the way in which it is meant to end
@@ -115,7 +124,8 @@ def _page(desk: Desk) -> None:
         with ui.tabs().props("dense") as bar:
             for tab in tabs():
                 ui.tab(tab.title)
-    with ui.tab_panels(bar, value=tabs()[0].title).classes("w-full"):
+    first = next((t for t in tabs() if t.maps and desk.recording), tabs()[0])
+    with ui.tab_panels(bar, value=first.title).classes("w-full"):
         for tab in tabs():
             with ui.tab_panel(tab.title).classes("q-pa-sm"):
                 tab.build(desk)

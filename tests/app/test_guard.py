@@ -76,3 +76,18 @@ def test_a_wrong_token_and_one_that_is_posted_are_refused() -> None:
     assert refused(asked(query=f"token={TOKEN}", method="POST"))
     assert refused(asked("websocket", query=f"token={TOKEN}"))
     assert refused(asked(query=f"token={TOKEN}", host="elsewhere.example:8000"))
+
+
+@pytest.mark.parametrize(
+    ("headers", "inside"),
+    [
+        ({"content_length": "1048576"}, True),
+        ({"content_length": "1048577"}, False),
+        ({"content_length": "-1"}, False),
+        ({"transfer_encoding": "chunked"}, False),
+    ],
+)
+def test_an_upload_has_a_limit_and_states_its_size(headers: dict[str, str], inside: bool) -> None:
+    answer = asked(method="POST", path="/upload", cookie=COOKIE, **headers)
+    assert answer["inside"] is inside
+    assert inside or answer["sent"][0]["status"] == 413

@@ -1,0 +1,592 @@
+"""Map a recording: its signals become inputs and outputs of the model, with units, event and window; writes the study file."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import tempfile
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nicegui import background_tasks, run, ui
+
+import hvdc_ident as hi
+from hvdc_ident.app.desk import Desk, opened
+from hvdc_ident.app.mapping import (
+    Draft,
+    RecordingMap,
+    SignalLine,
+    columns_with_derived,
+    drafted,
+    experiments_in,
+    proposed,
+    write_mapping,
+)
+from hvdc_ident.app.plot import NOW, RECORDED, Curve, Grid, Marker, Plot, focused, sketch, thinned
+from hvdc_ident.app.server import Tab
+from hvdc_ident.app.study_folder import (
+    MOST_BYTES,
+    Seen,
+    chosen_recording,
+    keep_recordings,
+    recordings_in,
+    safe_name,
+    stamp,
+)
+from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.errors import HvdcIdentError, StudyError
+from hvdc_ident.model import AnyModel
+from hvdc_ident.models import shipped_models
+from hvdc_ident.study.column_matching import Column, Matching, columns_of
+
+REST = 0.3
+"""How long a mapping has to stand, s, before it is checked."""
+POLL = 1.0
+"""How often the study file is looked at, s."""
+MOST_ROWS = 40
+"""Signals of the list that are shown at once; the search finds the others."""
+MOST_GRIDS = 8
+"""Signals that are drawn below each other."""
+THUMBNAIL = (110, 34)
+"""Width and height of a signal's small picture, px."""
+HEIGHT = 470
+"""Of the plot, px, where its grids fit in."""
+EVENT_COLOR = "#d64545"
+
+
+class Mapper:
+    """The tab in one browser: the study file as it was seen, the recording, its mapping, and the elements that show them."""
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        self._source = desk.source
+        self._seen = Seen(desk.file, None)
+        self._stamp = desk.read_at
+        self._record: Trajectory | None = None
+        self._columns: tuple[Column, ...] = ()
+        self._matching: Matching | None = None
+        self._map: RecordingMap | None = None
+        self._was = ""
+        self._changed = False
+        self._draft: Draft | None = None
+        self._asked = 0
+        self._view: tuple[float, float] | None = None
+        self._rows: dict[str, Callable[[], None]] = {}
+        self._sketches: dict[str, str] = {}
+        self._showing = False
+        self._plot: Plot | None = None
+
+    # --- the page ---
+
+    def build(self) -> None:
+        """Build the tab's elements; what is on the desk is read when the tab is looked at for the first time."""
+        self._place = ui.element("div")
+        with ui.row().classes("w-full items-center gap-3 no-wrap"):
+            self._build_files()
+        self._banner = ui.row().classes("w-full items-center bg-warning text-black rounded-borders q-px-sm")
+        self._banner.visible = False
+        self._trouble = ui.label("").classes("text-negative whitespace-pre-line").props('role="alert"')
+        with ui.row().classes("w-full no-wrap items-start gap-4"):
+            with ui.column().classes("gap-1").style("width: 36rem; flex: none"):
+                self._search = ui.input(placeholder="search signals", on_change=lambda: self._build_rows())
+                self._search.props('dense clearable aria-label="search signals"').classes("w-full")
+                self._list = ui.column().classes("w-full gap-0 no-wrap").style("max-height: 690px; overflow-y: auto")
+            with ui.column().classes("col gap-1").style("min-width: 0"):
+                with ui.row().classes("w-full items-center gap-3"):
+                    self._build_fields()
+                self._plots = ui.element("div").classes("w-full")
+                ui.label("What hvdc-ident check says").classes("text-caption text-bold")
+                self._said = ui.column().classes("w-full gap-0 text-caption").props('aria-live="polite"')
+        with self._plots:
+            Plot([], "time, s", 10, "No recording").on("ready", lambda: self._in_background(self._start))
+
+    def _build_files(self) -> None:
+        """Build the line with the study's experiments, its files, the place for dropped ones, and the button that writes."""
+        self._experiment = ui.select(
+            [], label="experiment", on_change=lambda e: self._choose(e.value, self._open_experiment)
+        )
+        self._files = ui.select([], label="recordings in the study's folder", with_input=True)
+        self._files.on_value_change(lambda e: self._choose(e.value, self._open_file))
+        self._upload = ui.upload(
+            multiple=True,
+            auto_upload=True,
+            max_file_size=MOST_BYTES,
+            label="Drop a recording here (COMTRADE: .cfg and .dat)",
+            on_multi_upload=self._arrived,
+            on_rejected=lambda: self._tell(
+                f"The file is larger than {MOST_BYTES // 1024**2} MiB: put it into the study's folder."
+            ),
+        ).props("flat bordered dense")
+        self._upload.on(
+            "failed", lambda: self._tell("The upload failed: the file is too large, or the server has ended.")
+        )
+        self._upload.style("width: 24rem; max-height: 44px; overflow: hidden")
+        self._model = ui.select(self._models(), value=self._source, label="model")
+        self._model.on_value_change(lambda e: self._choose(e.value, self._choose_model))
+        ui.space()
+        self._status = ui.label("").classes("text-caption ellipsis").style("max-width: 20rem")
+        self._write = ui.button("Write the study", on_click=lambda: self._in_background(self._save))
+        for field in (self._experiment, self._files, self._model):
+            field.props("dense options-dense").style("min-width: 11rem; max-width: 17rem")
+
+    def _build_fields(self) -> None:
+        self._name = (
+            ui.input("name", on_change=lambda e: self._edit(name=e.value or "")).props("dense").style("width: 11rem")
+        )
+        self._role = ui.select(
+            ["fit", "holdout"], value="fit", label="role", on_change=lambda e: self._edit(role=e.value)
+        )
+        self._role.props("dense options-dense").style("width: 6rem")
+        self._event = ui.number("event, s", on_change=lambda e: self._edit(event=e.value))
+        self._from = ui.number("window from, s", on_change=lambda e: self._edit_window(e.value, None))
+        self._to = ui.number("to, s", on_change=lambda e: self._edit_window(None, e.value))
+        for field in (self._event, self._from, self._to):
+            field.props("dense clearable step=any").style("width: 8.5rem")
+
+    def _models(self) -> list[str]:
+        """Return the models that can be chosen: the shipped ones, those beside the recording, and the desk's own."""
+        beside = [self._desk.recording.parent] if self._desk.recording else []
+        files = [str(f) for folder in beside for f in sorted(folder.iterdir()) if f.suffix in (".toml", ".fmu")]
+        return list(dict.fromkeys([self._source, *shipped_models(), *files]))
+
+    # --- what is open ---
+
+    async def _start(self) -> None:
+        self._plots.clear()
+        ui.timer(POLL, self._look)
+        desk = self._desk
+        self._seen = await _done(Seen.now, desk.file)
+        self._show_files()
+        if desk.recording is not None:
+            await self._propose(desk.recording, os.path.relpath(desk.recording.resolve(), desk.file.parent.resolve()))
+        elif desk.study is not None and desk.study.experiments:
+            await self._open_experiment(desk.study.experiments[0].name)
+        else:
+            self._show()
+
+    async def _open_experiment(self, name: str) -> None:
+        """Open an experiment of the study file."""
+        study = self._desk.study
+        mapping = experiments_in(study.settings).get(name) if study else None
+        if mapping is None:
+            raise StudyError(f"no experiment '{name}'", where=self._desk.file.name, hint="choose another one")
+        record = await _done(hi.read_waveforms, self._desk.file.parent / mapping.data)
+        record = await _done(columns_with_derived, mapping, record, self._desk.file.name)
+        await self._take(record, mapping, None, name)
+
+    async def _open_file(self, data: str) -> None:
+        """Open a recording of the study's folder: as its experiment, where the study has one, else proposed."""
+        study = self._desk.study
+        own = next((m for m in experiments_in(study.settings).values() if m.data == data), None) if study else None
+        if own is not None:
+            await self._open_experiment(own.name)
+        else:
+            await self._propose(chosen_recording(self._desk.file.parent, data), data)
+
+    async def _propose(self, path: Path, data: str, record: Trajectory | None = None) -> None:
+        record = record or await _done(hi.read_waveforms, path)
+        taken = {e.name.lower() for e in self._desk.study.experiments} if self._desk.study else set()
+        name, number = safe_name(f"{path.stem}.x").removesuffix(".x"), 2
+        while name.lower() in taken:
+            name, number = f"{path.stem}-{number}", number + 1
+        mapping, matching = await _done(proposed, record, self._plant, name, Path(data).as_posix())
+        await self._take(record, mapping, matching, "")
+        self._changed = True
+        self._show_status()
+
+    async def _take(self, record: Trajectory, mapping: RecordingMap, matching: Matching | None, was: str) -> None:
+        self._record, self._map, self._matching, self._was = record, mapping, matching, was
+        self._changed, self._draft, self._view, self._sketches = False, None, None, {}
+        self._columns = await _done(columns_of, record, mapping.event)
+        self._show()
+
+    async def _arrived(self, event: Any) -> None:
+        """Keep the files that were dropped, and open the first recording."""
+        self._upload.reset()
+
+        async def keep() -> None:
+            with tempfile.TemporaryDirectory(prefix="hvdc-ident-") as place:
+                for file in event.files:
+                    await file.save(Path(place, safe_name(file.name)))
+                kept, record = await _done(keep_recordings, self._desk.file.parent, Path(place))
+            self._show_files()
+            await self._propose(self._desk.file.parent / kept[0], kept[0], record)
+
+        await self._guarded(keep)
+
+    async def _choose_model(self, source: str) -> None:
+        model = await _done(hi.load_model, source, self._desk.trust)
+        self._desk, self._source = replace(self._desk, model=model, source=source), source
+        if self._map is not None and self._record is not None:
+            await self._propose(Path(self._map.data), self._map.data, self._record)
+
+    # --- the file ---
+
+    async def _save(self) -> None:
+        if self._map is None:
+            return
+        was = self._was or self._map.name
+        try:
+            self._seen = await _done(write_mapping, self._seen, self._map, was, self._source, trust=self._desk.trust)
+        except StudyError as error:
+            if self._seen == await _done(Seen.now, self._desk.file):
+                raise
+            self._ask_which(str(error))
+            return
+        self._was = self._map.name
+        await self._renew(keep=True)
+        self._changed = False
+        self._show_status()
+        ui.notify(f"{self._desk.file} is written. Reload the page to explore the recording.", type="positive")
+
+    async def _renew(self, *, keep: bool) -> None:
+        """Read the study file anew. keep: the mapping that is on the page; left out, that of the file."""
+        self._stamp = stamp(self._desk.file)
+        seen = await _done(Seen.now, self._desk.file)
+        desk = await _done(opened, str(self._desk.file), trust=self._desk.trust)
+        self._seen, self._source = seen, desk.source
+        self._desk = replace(desk, recording=self._desk.recording)
+        self._banner.visible = False
+        names = [e.name for e in desk.study.experiments] if desk.study else []
+        if keep:
+            self._was = self._was if self._was in names else ""
+        elif names:
+            await self._open_experiment(self._was if self._was in names else names[0])
+        self._show_files()
+        self._ask()
+
+    async def _look(self) -> None:
+        """See whether the study file is another one than the page knows; take it over where nothing was changed here."""
+        now = stamp(self._desk.file)
+        if now == self._stamp or self._banner.visible:
+            return
+        self._stamp = now
+        if now is None or self._seen == await _done(Seen.now, self._desk.file):
+            return
+        if self._changed:
+            self._ask_which(f"{self._desk.file.name} was changed on the disk, and this page holds changes of its own.")
+        else:
+            await self._guarded(lambda: self._renew(keep=False))
+
+    def _ask_which(self, text: str) -> None:
+        self._banner.clear()
+        with self._banner:
+            ui.label(text)
+            ui.button("Keep mine", on_click=lambda: self._in_background(lambda: self._renew(keep=True))).props(
+                "flat dense"
+            )
+            theirs = ui.button("Show the file's", on_click=lambda: self._in_background(lambda: self._renew(keep=False)))
+            theirs.props("flat dense")
+        self._banner.visible = True
+
+    # --- changes ---
+
+    def _edit(self, **changes: Any) -> None:
+        if self._map is not None and not self._showing and any(getattr(self._map, k) != v for k, v in changes.items()):
+            self._set(replace(self._map, **changes))
+
+    def _edit_window(self, start: float | None, end: float | None) -> None:
+        if self._map is None or self._record is None or self._showing:
+            return
+        first, last = float(self._time[0]), float(self._time[-1])
+        low = start if start is not None else self._from.value
+        high = end if end is not None else self._to.value
+        window = (first if low is None else low, last if high is None else high)
+        self._edit(window=None if window == (first, last) else window)
+
+    def _set(self, mapping: RecordingMap) -> None:
+        before, self._map = self._map, mapping
+        self._changed = True
+        if before is not None and _columns_in(before) != _columns_in(mapping):
+            for refresh in self._rows.values():
+                refresh()
+            self._build_plot()
+        self._show_marks()
+        self._show_status()
+        self._ask()
+
+    def _marked(self, event: Any) -> None:
+        """Take over where a marker was left: at the row next to it."""
+        key, at = event.args["key"], float(event.args["at"])
+        value = float(self._time[int(np.argmin(np.abs(self._time - at)))])
+        field = {"event": self._event, "from": self._from, "to": self._to}[key]
+        field.value = value  # the field tells the mapping
+        self._show_marks()
+
+    # --- what is shown ---
+
+    @property
+    def _plant(self) -> AnyModel:
+        """The model of the study, or the one that was chosen."""
+        return self._desk.study.model if self._desk.study else self._desk.model
+
+    @property
+    def _time(self) -> Array:
+        """The rows' instants, s, as the study counts them."""
+        if self._draft is not None:
+            return self._draft.experiment.time
+        return self._record.time if self._record is not None else np.zeros(1)
+
+    def _show_files(self) -> None:
+        study = self._desk.study
+        self._experiment.set_options([e.name for e in study.experiments] if study else [], value=self._was or None)
+        self._experiment.visible = bool(study and study.experiments)
+        files = recordings_in(self._desk.file.parent) if self._desk.file.parent.is_dir() else []
+        self._files.set_options(files, value=self._map.data if self._map and self._map.data in files else None)
+        self._files.visible = bool(files)
+        self._model.visible = study is None
+
+    def _show(self) -> None:
+        """Show all of what is open."""
+        mapping = self._map
+        self._show_files()
+        self._showing = True
+        if mapping is not None:
+            self._name.value, self._role.value, self._event.value = mapping.name, mapping.role, mapping.event
+            self._from.value, self._to.value = mapping.window or (None, None)
+        self._showing = False
+        self._changed = False
+        self._build_rows()
+        self._build_plot()
+        self._show_status()
+        self._ask()
+
+    def _show_status(self) -> None:
+        self._write.set_enabled(self._map is not None and self._changed)
+        where = self._desk.file
+        self._status.text = f"{'not written yet: ' if self._changed else ''}{where}" if self._map else ""
+
+    def _build_rows(self) -> None:
+        self._list.clear()
+        self._rows = {}
+        wanted = (self._search.value or "").casefold()
+        fitting = [c for c in self._columns if wanted in c.name.casefold()]
+        if self._map is not None:  # those that are in use first
+            used = _columns_in(self._map)
+            fitting.sort(key=lambda c: c.name not in used)
+        with self._list:
+            if self._record is None:
+                ui.label("Drop a recording above, or choose one of the study's folder.").classes("q-pa-md")
+            for column in fitting[:MOST_ROWS]:
+                self._build_row(column)
+            if len(fitting) > MOST_ROWS:
+                ui.label(f"{len(fitting) - MOST_ROWS} more: search for a part of their names.").classes("text-caption")
+
+    def _build_row(self, column: Column) -> None:
+        assert self._record is not None
+        model = self._plant
+        options = {"": "not used"}
+        options |= {f"input {n}": f"input {n}" for n in model.inputs} | {
+            f"output {n}": f"output {n}" for n in model.outputs
+        }
+        with ui.row().classes("w-full items-center no-wrap gap-2 q-py-xs").style("border-bottom: 1px solid #8884"):
+            ui.html(self._sketch(column.name), sanitize=False)
+            with ui.column().classes("gap-0").style("width: 10rem; min-width: 0"):
+                ui.label(column.name).classes("ellipsis text-bold w-full").tooltip(column.name)
+                ui.label(_about(column)).classes("text-caption")
+            with ui.column().classes("col gap-0").style("min-width: 0"):
+                chosen = ui.select(options, with_input=True).props("dense options-dense").classes("w-full")
+                chosen.props["aria-label"] = f"{column.name} is"
+                details = ui.column().classes("w-full gap-0")
+
+        def refresh() -> None:
+            lines = self._map.of_column(column.name) if self._map else ()
+            chosen.value = f"{lines[0].kind} {lines[0].signal}" if lines else ""
+            details.clear()
+            with details:
+                for line in lines:
+                    self._build_line(line, column)
+                if not lines:
+                    self._build_candidates(column)
+
+        def assign(event: Any) -> None:
+            kind, _, signal = (event.value or "").partition(" ")
+            lines = self._map.of_column(column.name) if self._map else ()
+            if self._map is not None and (signal, kind) != ((lines[0].signal, lines[0].kind) if lines else ("", "")):
+                self._set(self._map.assigned(column.name, signal, kind))  # type: ignore[arg-type]
+
+        refresh()
+        chosen.on_value_change(assign)
+        self._rows[column.name] = refresh
+
+    def _sketch(self, name: str) -> str:
+        """Return the small picture of a column."""
+        assert self._record is not None
+        if name not in self._sketches:
+            self._sketches[name] = sketch(self._record.time, self._record[name], *THUMBNAIL)
+        return self._sketches[name]
+
+    def _build_line(self, line: SignalLine, column: Column) -> None:
+        """Build the fields of one signal's conversion, and why it was proposed."""
+        with ui.row().classes("w-full items-center no-wrap gap-1"):
+            if not column.unit:
+                unit = ui.input("unit", value=line.unit or "").classes("col")
+                unit.on_value_change(lambda e: self._state(line.signal, "unit", e.value or None))
+                unit.props(f'dense aria-label="{line.signal}: unit"')
+            for key in ("base", "scale", "offset"):
+                number = ui.number(key, value=getattr(line, key)).classes("col")
+                number.on_value_change(lambda e, key=key: self._state(line.signal, key, e.value))
+                number.props["aria-label"] = f"{line.signal}: {key}"
+                number.props("dense step=any")
+        if line.why:
+            ui.label(f"proposed: {line.why}").classes("text-caption")
+
+    def _build_candidates(self, column: Column) -> None:
+        """Build a button for each signal that the column may be."""
+        for match in (m for m in (self._matching.proposed if self._matching else ()) if m.column.name == column.name):
+            target = match.target
+
+            def take(signal: str = target.name, kind: Any = target.kind, base: float | None = match.base) -> None:
+                if self._map is not None:
+                    self._set(self._map.assigned(column.name, signal, kind).stated(signal, "base", base))
+
+            base = "" if match.base is None else f", base {match.base:g} {column.unit}"
+            ui.button(f"{target.kind} {target.name}{base}?", on_click=lambda take=take: take()).props(
+                "flat dense no-caps size=sm"
+            ).tooltip(match.reason)
+
+    def _state(self, signal: str, key: str, value: Any) -> None:
+        if self._map is not None:
+            self._set(self._map.stated(signal, key, value))
+
+    def _build_plot(self) -> None:
+        self._plots.clear()
+        self._plot = None
+        if self._record is None or self._map is None:
+            return
+        grids = [
+            Grid(
+                f"{name}, {unit}" if (unit := self._record.unit(name)) else name, (Curve(self._roles(name), RECORDED),)
+            )
+            for name in self._drawn()
+        ]
+        markers = [
+            Marker(key, label, color, self._marks()[key])
+            for key, label, color in (("event", "event", EVENT_COLOR), ("from", "from", NOW), ("to", "to", NOW))
+        ]
+        height = max(HEIGHT, 105 * len(grids))
+        with self._plots:
+            plot = Plot(grids, "time, s", height, "The recording", markers=markers).classes("w-full")
+        plot.on("ready", self._draw)
+        plot.on("marked", self._marked)
+        plot.on("viewed", self._viewed)
+        self._plot = plot
+
+    def _drawn(self) -> Sequence[str]:
+        """Return the columns that are drawn: those in use, else the first."""
+        assert self._record is not None and self._map is not None
+        used = [n for n in _columns_in(self._map) if n in self._record.names]
+        return used[:MOST_GRIDS] or [c.name for c in self._columns[:3]]
+
+    def _roles(self, column: str) -> str:
+        """Return what a column is, for the legend."""
+        lines = self._map.of_column(column) if self._map else ()
+        return ", ".join(f"{line.kind} {line.signal}" for line in lines) or "recorded"
+
+    def _draw(self) -> None:
+        if self._record is not None and self._plot is not None:
+            for k, name in enumerate(self._drawn()):
+                self._plot.whole(k, thinned(self._time, self._record[name]))
+
+    def _viewed(self, event: Any) -> None:
+        """Draw closely what is looked at."""
+        view = (float(event.args["from"]), float(event.args["to"]))
+        if self._record is not None and self._plot is not None and view != self._view:
+            self._view = view
+            for k, name in enumerate(self._drawn()):
+                self._plot.refine(k, focused(self._time, *view, self._record[name]))
+
+    def _marks(self) -> dict[str, float]:
+        """Return where the markers stand, s: as stated, else as found, else at the ends."""
+        first, last = float(self._time[0]), float(self._time[-1])
+        mapping = self._map
+        found = self._draft.experiment.event if self._draft else None
+        event = mapping.event if mapping and mapping.event is not None else found
+        window = (mapping.window if mapping else None) or (first, last)
+        return {"event": first if event is None else event, "from": window[0], "to": window[1]}
+
+    def _show_marks(self) -> None:
+        if self._plot is not None:
+            for key, at in self._marks().items():
+                self._plot.mark(key, at)
+
+    # --- what check says ---
+
+    def _ask(self) -> None:
+        self._asked += 1
+        self._in_background(self._check)
+
+    async def _check(self) -> None:
+        number = self._asked
+        await asyncio.sleep(REST)
+        mapping, record, desk = self._map, self._record, self._desk
+        if number != self._asked or mapping is None or record is None:
+            return
+        draft, text = None, ""
+        try:
+            draft = await _done(drafted, mapping, record, self._plant, desk.study, self._was, desk.file.name)
+        except HvdcIdentError as error:
+            text = str(error)
+        if number == self._asked:
+            self._draft = draft
+            self._show_said(draft, text)
+            self._show_marks()
+
+    def _show_said(self, draft: Draft | None, text: str) -> None:
+        self._said.clear()
+        with self._said:
+            if draft is None:
+                ui.label(text).classes("text-negative")
+                return
+            found = draft.summary.to_dict()
+            doubts = {*found["rest_lines"], *(f"steady state, {line}" for line in found["steady_state"])}
+            for line in str(draft.summary).splitlines():
+                ui.label(line).classes("text-warning text-bold" if line in doubts else "")
+        event = draft.experiment.event
+        self._event.props["placeholder"] = "none found" if event is None else f"found: {event:g}"
+
+    # --- running ---
+
+    def _choose(self, value: Any, opening: Callable[[Any], Awaitable[None]]) -> None:
+        """Open what was chosen, where it is not what is open already."""
+        now = (self._was, self._map.data if self._map else "", self._source)
+        if value and value not in now:
+            self._in_background(lambda: opening(value))
+
+    def _in_background(self, work: Callable[[], Awaitable[None]]) -> None:
+        background_tasks.create(self._guarded(work))
+
+    async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Do some work; an error of the package is told on the page."""
+        with self._place:
+            self._trouble.text = ""
+            try:
+                await work()
+            except HvdcIdentError as error:
+                self._tell(str(error))
+
+    def _tell(self, text: str) -> None:
+        self._trouble.text = text
+
+
+async def _done(work: Callable[..., Any], *given: Any, **named: Any) -> Any:
+    """Return the result of some work that is done beside the page's."""
+    return await run.io_bound(work, *given, **named)
+
+
+def _columns_in(mapping: RecordingMap) -> list[str]:
+    return list(dict.fromkeys(line.column for line in mapping.lines))
+
+
+def _about(column: Column) -> str:
+    """Return the level of a column in words."""
+    if column.level is None:
+        return f"{column.unit}, not recorded"
+    noise = f" ± {column.noise:.2g}" if column.noise else ""
+    return f"{column.level:.5g}{noise} {column.unit} {column.place}"
+
+
+TAB = Tab(order=20, title="Recording", build=lambda desk: Mapper(desk).build(), maps=True)
