@@ -127,7 +127,8 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             done = run_stage(loaded, stage.name, folder, options)
         console.print_json(done.data)
         console.say(*(f"steady state, {line}" for line in done.data.get("steady_state", ())))
-        lines = () if done.failed or console.json or console.quiet else stage.tell(done.data)
+        silent = (done.failed and not stage.told_in_part) or console.json or console.quiet
+        lines = () if silent else stage.tell(done.data)
         console.say(*(pasteable(line, study, out, access) for line in lines))
         console.say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}")
         if done.failed:

@@ -429,6 +429,25 @@ def test_a_stage_that_fails_keeps_its_results_and_ends_in_1(study: Path, monkeyp
     assert kept["experiments"]["step"]["reason"] == "the run stopped at 0.5 s"
 
 
+def test_simulate_tells_the_runs_that_ended_beside_those_that_failed(study: Path) -> None:
+    """A model that leaves its domain for an input of 2: two recordings of three have no run, for one reason."""
+    (study.parent / "lag.toml").write_text(CARD.replace("k*(u - x)", "k*(sqrt(1.5 - u) - x)"))
+    rows = (study.parent / "step.csv").read_text().splitlines()
+    high = "\n".join(
+        [rows[0], *(",".join([t, "2" if u == "1" else u, y]) for t, u, y in (r.split(",") for r in rows[1:]))]
+    )
+    text = STUDY.replace("[fit]\nstarts = 2\n", "")
+    for name in ("up", "again"):
+        (study.parent / f"{name}.csv").write_text(high)
+        text += f'[[experiment]]\nname = "{name}"\ndata = "{name}.csv"\ninputs = ["u"]\noutputs = ["y"]\nnoise = {{y = 1e-3}}\n'
+    study.write_text(text)
+    result = call("simulate", study)
+    assert result.exit_code == 1
+    assert "Worst signal: y in step, RMSE" in result.stdout and "simulate: failed" in result.stdout
+    assert said(result).startswith("error: simulate: experiment 'up': t = 0.5 s: ")
+    assert "; experiment 'again': t = 0.5 s: " in said(result)
+
+
 def test_a_bug_is_one_line_and_the_traceback_is_asked_for(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def breaks(*_: object, **__: object) -> None:
         raise ZeroDivisionError("division by zero")

@@ -295,7 +295,7 @@ def _study_text(path: Path, source: str, model: AnyModel, recordings: Sequence[M
 def _experiment_text(r: Mapped) -> Iterator[str]:
     """The lines of one experiment; all of them comments where no output is mapped, as none may be without."""
     mark = "" if r.experiment is not None else "# "
-    yield f"# {_found(r)}"
+    yield f"# {_comment(_found(r))}"
     yield f"{mark}[[experiment]]"
     yield f"{mark}name = {toml_string(r.name)}"
     yield f"{mark}data = {toml_string(r.data)}"

@@ -226,3 +226,22 @@ def test_a_study_is_never_overwritten(motor: Path, tmp_path: Path) -> None:
     assert call("new", tmp_path / "st", "--from", data, "--model", motor).exit_code == 0
     again = call("new", tmp_path / "st", "--from", data, "--model", motor)
     assert again.exit_code == 2 and "already holds a study" in again.stderr
+
+
+def test_hostile_names_stay_text(tmp_path: Path) -> None:
+    """Names that would end a comment, a string or a table of the study: they come back as they were, and add nothing."""
+    evil = ['x"]\n[fit]\nstarts = 1 #', "y\u2028[diagnose]", "a\\", "=1+1", "näme 7"]
+    path = tmp_path / "evil.hdf5"
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        file["time"] = np.arange(50) * 0.01
+        for number, name in enumerate((*evil, "Vdc1")):
+            file[name] = np.full(50, 1.0 + number)
+    found = hi.new_study(tmp_path / "st", path, "vsc-hvdc-link")
+    table = tomllib.loads(found.path.read_text("utf-8"))
+    assert set(table) == {"schema", "name", "model", "parameters", "experiment"} and table["parameters"] == {}
+    assert [e["outputs"] for e in table["experiment"]] == [{"Vdc1": "Vdc1"}]
+    assert set(found.recordings[0].columns.unused) | {
+        m.column.name for m in found.recordings[0].columns.proposed
+    } == set(evil)
+    hi.load_study(found.path)

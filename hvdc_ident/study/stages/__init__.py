@@ -87,9 +87,9 @@ class Stage:
     after: the stages it builds on; they run first. order: place among the stages of a run.
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
-    from its JSON. verdict: the same in one phrase, for the screen of a run. searches: whether it also runs at the start
-    values, where a search begins; all run at the given ones. phases: how many things it counts, one after the other, as
-    progress.
+    from its JSON; told_in_part: also where a part of the work failed. verdict: the same in one phrase, for the screen of a run.
+    searches: whether it also runs at the start values, where a search begins; all run at the given ones. phases: how many
+    things it counts, one after the other, as progress.
     """
 
     name: str
@@ -104,6 +104,7 @@ class Stage:
     tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
     verdict: Callable[[Mapping[str, Any]], str] = no_verdict
     searches: bool = False
+    told_in_part: bool = False
     phases: Callable[[Study], int] = one_phase
 
 

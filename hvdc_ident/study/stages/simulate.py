@@ -66,7 +66,14 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         "noise": {e: {o: asdict(n) for o, n in notes.items()} for e, notes in study.noise.items()},
         "windowed_errors": fitting.errors_in_windows(study, curves),
     }
-    return StageResult(data, files, failed=status[failed[0]]["reason"] if failed else "")
+    return StageResult(data, files, failed=_failures({n: status[n]["reason"] for n in failed}))
+
+
+def _failures(reasons: Mapping[str, str]) -> str:
+    """Return why some experiments have no run, the first reasons in full; empty where all have one."""
+    told = [r if n in r or len(reasons) == 1 else f"{n}: {r}" for n, r in reasons.items()]
+    others = [*reasons][REASONS:]
+    return "; ".join([*told[:REASONS], *([f"no run either of {', '.join(others)}"] if others else [])])
 
 
 def _until(experiment: Experiment, rows: int) -> Experiment:
@@ -132,6 +139,8 @@ def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
     return csv_columns(columns)
 
 
+REASONS = 3
+"""Failed experiments whose reason a message holds in full."""
 ROWS = 12
 """Rows of the table on the screen; what follows is told by its largest."""
 
@@ -153,6 +162,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     from hvdc_ident.display import Table, rounded
     from hvdc_ident.text import listed, quantity
 
+    if not data.get("gaps"):
+        return []
     gaps, roles = data["gaps"], [e["role"] for e in data["experiments"].values()]
     held = f", {roles.count('holdout')} of them held out" if "holdout" in roles else ""
     recordings = f"{len(roles)} recording{'s' if len(roles) > 1 else ''}{held}"
@@ -166,11 +177,10 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     header = ("output", "recording", "role", "RMSE", "unit", "NRMSE, %", "RMSE/noise")
     found += str(Table(header, tuple(rows)).without_empty()).splitlines()
     found += [f"and {len(gaps) - ROWS} more, with smaller errors"] if len(gaps) > ROWS else []
-    found += ["", "NRMSE: RMSE over the recorded range of the output."] if gaps else []
-    if gaps:
-        g = gaps[0]
-        by = f"{quantity(abs(g['largest']), g['unit'])} {'above' if g['largest'] > 0 else 'below'} the model"
-        found += [f"Worst signal: {worst_of(data)}.", f"Its largest gap: the recording is {by} at {g['at']:.6g} s."]
+    g = gaps[0]
+    by = f"{quantity(abs(g['largest']), g['unit'])} {'above' if g['largest'] > 0 else 'below'} the model"
+    found += ["", "NRMSE: RMSE over the recorded range of the output."]
+    found += [f"Worst signal: {worst_of(data)}.", f"Its largest gap: the recording is {by} at {g['at']:.6g} s."]
     names = list(data["candidates"])
     if names:
         found.append(f"Next: `hvdc-ident fit STUDY` estimates what the recordings determine of {listed(names)}.")
@@ -189,5 +199,6 @@ STAGE = Stage(
     wanted=lambda study: bool(study.experiments),
     order=10,
     tell=lines_of,
+    told_in_part=True,
     verdict=lambda data: f"worst is {worst}" if (worst := worst_of(data)) else "",
 )
