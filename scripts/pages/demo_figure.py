@@ -1,6 +1,7 @@
-"""The figure of the landing page, from the results of the demo.
+"""The figure of the landing page and the picture of the report's first screen, from the results of the demo.
 
-hvdc-ident demo --out DIR && python scripts/pages/demo_figure.py DIR      # writes docs/images/demo.svg
+hvdc-ident demo --out DIR && python scripts/pages/demo_figure.py DIR [CHROMIUM]     # writes docs/images/demo.svg and report.png
+CHROMIUM: the browser's program, if it is not where playwright puts one.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pages.svg import HEIGHT, WIDTH, Curve, drawing
 
 EXPERIMENT, OUTPUT = "vdc-03-step", "Irorder1"
 WINDOW = (0.08, 0.3)  # s: the step and its recovery
-TARGET = Path(__file__).resolve().parents[2] / "docs" / "images" / "demo.svg"
+TARGET = Path(__file__).resolve().parents[2] / "docs" / "images"
 STYLE = (
     "<style>text{font:12px sans-serif;fill:#444}.frame{fill:none;stroke:#bbb}.grid{stroke:#eee}"
     ".curve{fill:none;stroke-width:2}.recorded{stroke:#222}.given{stroke:#999;stroke-dasharray:6 3}.fitted{stroke:#c2571a}"
@@ -59,6 +60,23 @@ def figure(folder: Path) -> str:
     return f'{head}{STYLE}<rect width="100%" height="100%" fill="#fff"/>{"".join(parts)}</svg>\n'
 
 
+def picture(folder: Path, to: Path, browser: str | None) -> None:
+    """Write the first screen of the report, as a browser shows it, with 256 colours."""
+    from io import BytesIO
+
+    from PIL import Image
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as p:
+        chromium = p.chromium.launch(executable_path=browser, args=["--no-sandbox"])
+        page = chromium.new_page(viewport={"width": 1400, "height": 800})
+        page.goto((folder / "report.html").resolve().as_uri())
+        shown = Image.open(BytesIO(page.screenshot()))
+        chromium.close()
+    shown.convert("RGB").quantize(256, kmeans=1).save(to, optimize=True)
+
+
 if __name__ == "__main__":
-    TARGET.parent.mkdir(exist_ok=True)
-    TARGET.write_text(figure(Path(sys.argv[1])), "utf-8")
+    TARGET.mkdir(exist_ok=True)
+    (TARGET / "demo.svg").write_text(figure(Path(sys.argv[1])), "utf-8")
+    picture(Path(sys.argv[1]), TARGET / "report.png", sys.argv[2] if len(sys.argv) > 2 else None)
