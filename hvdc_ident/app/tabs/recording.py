@@ -76,6 +76,8 @@ class Mapper:
         self._view: tuple[float, float] | None = None
         self._rows: dict[str, Callable[[], None]] = {}
         self._sketches: dict[str, str] = {}
+        self._levels: dict[str, ui.label] = {}
+        self._rested_at: float | None = None
         self._showing = False
         self._plot: Plot | None = None
 
@@ -143,8 +145,9 @@ class Mapper:
         self._event = ui.number("event, s", on_change=lambda e: self._edit(event=e.value))
         self._from = ui.number("window from, s", on_change=lambda e: self._edit_window(e.value, None))
         self._to = ui.number("to, s", on_change=lambda e: self._edit_window(None, e.value))
+        self._event.props["aria-label"] = "event, s"
         for field in (self._event, self._from, self._to):
-            field.props("dense clearable step=any").style("width: 8.5rem")
+            field.props("dense clearable stack-label step=any").style("width: 8.5rem")
 
     def _models(self) -> list[str]:
         """Return the models that can be chosen: the shipped ones, those beside the recording, and the desk's own."""
@@ -200,7 +203,7 @@ class Mapper:
     async def _take(self, record: Trajectory, mapping: RecordingMap, matching: Matching | None, was: str) -> None:
         self._record, self._map, self._matching, self._was = record, mapping, matching, was
         self._changed, self._draft, self._view, self._sketches = False, None, None, {}
-        self._columns = await _done(columns_of, record, mapping.event)
+        self._columns, self._rested_at = await _done(columns_of, record, mapping.event), mapping.event
         self._show()
 
     async def _arrived(self, event: Any) -> None:
@@ -361,7 +364,7 @@ class Mapper:
 
     def _build_rows(self) -> None:
         self._list.clear()
-        self._rows = {}
+        self._rows, self._levels = {}, {}
         wanted = (self._search.value or "").casefold()
         fitting = [c for c in self._columns if wanted in c.name.casefold()]
         if self._map is not None:  # those that are in use first
@@ -386,7 +389,7 @@ class Mapper:
             ui.html(self._sketch(column.name), sanitize=False)
             with ui.column().classes("gap-0").style("width: 10rem; min-width: 0"):
                 ui.label(column.name).classes("ellipsis text-bold w-full").tooltip(column.name)
-                ui.label(_about(column)).classes("text-caption")
+                self._levels[column.name] = ui.label(_about(column)).classes("text-caption")
             with ui.column().classes("col gap-0").style("min-width: 0"):
                 chosen = ui.select(options, with_input=True).props("dense options-dense").classes("w-full")
                 chosen.props["aria-label"] = f"{column.name} is"
@@ -444,8 +447,8 @@ class Mapper:
                     self._set(self._map.assigned(column.name, signal, kind).stated(signal, "base", base))
 
             base = "" if match.base is None else f", base {match.base:g} {column.unit}"
-            ui.button(f"{target.kind} {target.name}{base}?", on_click=lambda take=take: take()).props(
-                "flat dense no-caps size=sm"
+            ui.button(f"take as {target.kind} {target.name}{base}", on_click=lambda take=take: take()).props(
+                "flat dense no-caps size=12px"
             ).tooltip(match.reason)
 
     def _state(self, signal: str, key: str, value: Any) -> None:
@@ -534,6 +537,7 @@ class Mapper:
             self._draft = draft
             self._show_said(draft, text)
             self._show_marks()
+            await self._show_found(record, draft)
 
     def _show_said(self, draft: Draft | None, text: str) -> None:
         self._said.clear()
@@ -543,10 +547,28 @@ class Mapper:
                 return
             found = draft.summary.to_dict()
             doubts = {*found["rest_lines"], *(f"steady state, {line}" for line in found["steady_state"])}
-            for line in str(draft.summary).splitlines():
+            lines = str(draft.summary).splitlines()
+            own = [line for line in lines[1:] if line.startswith(f"experiment {draft.experiment.name}")]
+            told = [lines[0], *(line for line in lines if line in doubts), *own]
+            for line in told:
                 ui.label(line).classes("text-warning text-bold" if line in doubts else "")
-        event = draft.experiment.event
-        self._event.props["placeholder"] = "none found" if event is None else f"found: {event:g}"
+            with ui.expansion("and of the rest of the study").props("dense").classes("w-full"):
+                for line in (line for line in lines if line not in told):
+                    ui.label(line)
+
+    async def _show_found(self, record: Trajectory, draft: Draft | None) -> None:
+        """Show what was found in the recording where it is not stated: the event, the ends, and the levels before the event."""
+        event = draft.experiment.event if draft else None
+        self._event.props["placeholder"] = "none found" if event is None else f"{event:g}, as found"
+        for field, row in ((self._from, 0), (self._to, -1)):
+            field.props["placeholder"] = f"{self._time[row]:g}"
+        if draft is not None and event != self._rested_at:
+            columns = await _done(columns_of, record, event)
+            if record is self._record:
+                self._columns, self._rested_at = columns, event
+                for column in columns:
+                    if column.name in self._levels:
+                        self._levels[column.name].text = _about(column)
 
     # --- running ---
 
