@@ -8,7 +8,7 @@ from pathlib import Path
 import hvdc_ident as hi
 from hvdc_ident.app.study_folder import stamp
 from hvdc_ident.errors import InputError
-from hvdc_ident.formats import formats
+from hvdc_ident.formats import formats, list_signals
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import is_shipped
@@ -77,7 +77,7 @@ def opened(source: str | None = None, *, trust: bool = False) -> Desk:
         )
     new = _new_file(path.parent, path.stem)
     if path.suffix.lower() in (ending for f in formats().values() for ending in f.SUFFIXES):
-        hi.read_waveforms(path)  # what is wrong with it is said at once
+        list_signals(path)  # what is wrong with its head is said at once
         return Desk(path.name, hi.load_model(DEFAULT), file=new, recording=path, trust=trust)
     return Desk(path.name, hi.load_model(path, trust=trust), source=str(path), file=new, trust=trust)
 

@@ -124,6 +124,7 @@ def thinned(x: Array, *ys: Array, most: int = MOST) -> list[Array]:
     edges = np.linspace(0, x.size, most // 2 + 1).astype(int)[:-1]
     middle = (edges + np.append(edges[1:], x.size)) // 2
     drawn = [np.column_stack([x[edges], x[middle]]).ravel()]
+    drawn[0][-1] = x[-1]
     for y in ys:
         drawn.append(np.column_stack([np.fmin.reduceat(y, edges), np.fmax.reduceat(y, edges)]).ravel())
     return drawn

@@ -54,6 +54,13 @@ def drop(page: Any, name: str, content: bytes) -> None:
     page.locator(".q-uploader__input").set_input_files({"name": name, "mimeType": "text/csv", "buffer": content})
 
 
+DROPPED = """([name, text]) => {
+  const data = new DataTransfer();
+  data.items.add(new File([text], name, { type: "text/csv" }));
+  document.querySelector(".plot, .q-page").dispatchEvent(new DragEvent("drop", { dataTransfer: data, bubbles: true, cancelable: true }));
+}"""
+
+
 def test_a_broken_file_is_told_and_leaves_nothing(page: Any, folder: Path) -> None:
     drop(page, "../../broken.csv", b"time [s],P2 [pu]\n0,0.4\n1,0.4\n0.5,0.4\n")
     page.get_by_text("broken.csv, line 4, column 1").wait_for()
@@ -61,7 +68,8 @@ def test_a_broken_file_is_told_and_leaves_nothing(page: Any, folder: Path) -> No
 
 
 def test_a_dropped_recording_is_mapped_and_written(page: Any, folder: Path, tmp_path: Path) -> None:
-    drop(page, "step.csv", recording(tmp_path / "step.csv", "P2 [MW]", 1000.0).read_bytes())
+    text = recording(tmp_path / "step.csv", "P2 [MW]", 1000.0).read_text("utf-8")
+    page.evaluate(DROPPED, ["step.csv", text])  # beside the place for it
     study = folder / "vsc-hvdc-link-study" / "study.toml"
     page.get_by_text("at least one recorded output").wait_for()
     page.get_by_role("button", name="take as output P2, base 1000 MW").click()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import tempfile
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from hvdc_ident.app.study_folder import (
     safe_name,
     stamp,
 )
-from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.data import Array, Trajectory, event_time
 from hvdc_ident.errors import HvdcIdentError, StudyError
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import shipped_models
@@ -55,6 +55,16 @@ THUMBNAIL = (110, 34)
 HEIGHT = 470
 """Of the plot, px, where its grids fit in."""
 EVENT_COLOR = "#d64545"
+DROP_ANYWHERE = """
+document.addEventListener("dragover", (e) => e.preventDefault());
+document.addEventListener("drop", (e) => {
+  const upload = getElement(%d);
+  if (upload.$el.contains(e.target)) return;
+  e.preventDefault();  // else the browser leaves the page for the file
+  if (upload.$el.offsetParent) upload.$refs.qRef.addFiles(e.dataTransfer.files);
+});
+"""
+"""A file that is dropped beside the place for it goes there all the same."""
 
 
 class Mapper:
@@ -70,9 +80,9 @@ class Mapper:
         self._matching: Matching | None = None
         self._map: RecordingMap | None = None
         self._was = ""
-        self._changed = False
+        self._changed = self._edited = False
         self._draft: Draft | None = None
-        self._asked = 0
+        self._asked = self._working = 0
         self._view: tuple[float, float] | None = None
         self._rows: dict[str, Callable[[], None]] = {}
         self._sketches: dict[str, str] = {}
@@ -116,7 +126,7 @@ class Mapper:
             multiple=True,
             auto_upload=True,
             max_file_size=MOST_BYTES,
-            label="Drop a recording here (COMTRADE: .cfg and .dat)",
+            label="Drop a recording (COMTRADE: .cfg and .dat)",
             on_multi_upload=self._arrived,
             on_rejected=lambda: self._tell(
                 f"The file is larger than {MOST_BYTES // 1024**2} MiB: put it into the study's folder."
@@ -129,6 +139,8 @@ class Mapper:
         self._model = ui.select(self._models(), value=self._source, label="model")
         self._model.on_value_change(lambda e: self._choose(e.value, self._choose_model))
         ui.space()
+        self._busy = ui.spinner(size="1.5em").props('aria-label="at work"')
+        self._busy.visible = False
         self._status = ui.label("").classes("text-caption ellipsis").style("max-width: 20rem")
         self._write = ui.button("Write the study", on_click=lambda: self._in_background(self._save))
         for field in (self._experiment, self._files, self._model):
@@ -160,6 +172,7 @@ class Mapper:
     async def _start(self) -> None:
         self._plots.clear()
         ui.timer(POLL, self._look)
+        ui.run_javascript(DROP_ANYWHERE % self._upload.id)
         desk = self._desk
         self._seen = await _done(Seen.now, desk.file)
         self._show_files()
@@ -203,6 +216,7 @@ class Mapper:
     async def _take(self, record: Trajectory, mapping: RecordingMap, matching: Matching | None, was: str) -> None:
         self._record, self._map, self._matching, self._was = record, mapping, matching, was
         self._changed, self._draft, self._view, self._sketches = False, None, None, {}
+        self._edited = False
         self._columns, self._rested_at = await _done(columns_of, record, mapping.event), mapping.event
         self._show()
 
@@ -216,7 +230,7 @@ class Mapper:
                     await file.save(Path(place, safe_name(file.name)))
                 kept, record = await _done(keep_recordings, self._desk.file.parent, Path(place))
             self._show_files()
-            await self._propose(self._desk.file.parent / kept[0], kept[0], record)
+            self._leave(lambda: self._propose(self._desk.file.parent / kept[0], kept[0], record))
 
         await self._guarded(keep)
 
@@ -241,7 +255,7 @@ class Mapper:
             return
         self._was = self._map.name
         await self._renew(keep=True)
-        self._changed = False
+        self._changed = self._edited = False
         self._show_status()
         ui.notify(f"{self._desk.file} is written. Reload the page to explore the recording.", type="positive")
 
@@ -274,15 +288,19 @@ class Mapper:
         else:
             await self._guarded(lambda: self._renew(keep=False))
 
-    def _ask_which(self, text: str) -> None:
+    def _ask_which(self, text: str, ways: Mapping[str, Callable[[], Awaitable[None]]] | None = None) -> None:
+        """Ask what is to be done; left out, with a study file that is another one than the page read."""
+
+        def chosen(way: Callable[[], Awaitable[None]]) -> None:
+            self._banner.visible = False
+            self._in_background(way)
+
+        file = {"Keep mine": lambda: self._renew(keep=True), "Show the file's": lambda: self._renew(keep=False)}
         self._banner.clear()
         with self._banner:
             ui.label(text)
-            ui.button("Keep mine", on_click=lambda: self._in_background(lambda: self._renew(keep=True))).props(
-                "flat dense"
-            )
-            theirs = ui.button("Show the file's", on_click=lambda: self._in_background(lambda: self._renew(keep=False)))
-            theirs.props("flat dense")
+            for name, way in (ways or file).items():
+                ui.button(name, on_click=lambda way=way: chosen(way)).props("flat dense color=black")
         self._banner.visible = True
 
     # --- changes ---
@@ -302,7 +320,7 @@ class Mapper:
 
     def _set(self, mapping: RecordingMap) -> None:
         before, self._map = self._map, mapping
-        self._changed = True
+        self._changed = self._edited = True
         if before is not None and _columns_in(before) != _columns_in(mapping):
             for refresh in self._rows.values():
                 refresh()
@@ -550,6 +568,11 @@ class Mapper:
             lines = str(draft.summary).splitlines()
             own = [line for line in lines[1:] if line.startswith(f"experiment {draft.experiment.name}")]
             told = [lines[0], *(line for line in lines if line in doubts), *own]
+            moved = event_time(draft.experiment.inputs)
+            if moved is not None and draft.experiment.event is not None and moved < draft.experiment.event:
+                doubt = f"an input moves at {moved:g} s, before the event: levels and noise before the event are not those at rest"
+                told.insert(1, doubt)
+                doubts.add(doubt)
             for line in told:
                 ui.label(line).classes("text-warning text-bold" if line in doubts else "")
             with ui.expansion("and of the rest of the study").props("dense").classes("w-full"):
@@ -576,7 +599,24 @@ class Mapper:
         """Open what was chosen, where it is not what is open already."""
         now = (self._was, self._map.data if self._map else "", self._source)
         if value and value not in now:
-            self._in_background(lambda: opening(value))
+            self._leave(lambda: opening(value))
+
+    def _leave(self, opening: Callable[[], Awaitable[None]]) -> None:
+        """Open something else; where changes made by hand would be lost, ask first."""
+        if not self._edited or self._map is None:
+            self._in_background(opening)
+            return
+
+        async def written() -> None:
+            await self._save()
+            if not self._edited:
+                await opening()
+
+        async def stay() -> None:
+            self._show_files()
+
+        ways = {"Write them first": written, "Drop them": opening, "Stay": stay}
+        self._ask_which(f"Changes to '{self._map.name}' are not written.", ways)
 
     def _in_background(self, work: Callable[[], Awaitable[None]]) -> None:
         background_tasks.create(self._guarded(work))
@@ -585,10 +625,15 @@ class Mapper:
         """Do some work; an error of the package is told on the page."""
         with self._place:
             self._trouble.text = ""
+            self._working += 1
+            self._busy.visible = True
             try:
                 await work()
             except HvdcIdentError as error:
                 self._tell(str(error))
+            finally:
+                self._working -= 1
+                self._busy.visible = self._working > 0
 
     def _tell(self, text: str) -> None:
         self._trouble.text = text
@@ -608,7 +653,7 @@ def _about(column: Column) -> str:
     if column.level is None:
         return f"{column.unit}, not recorded"
     noise = f" ± {column.noise:.2g}" if column.noise else ""
-    return f"{column.level:.5g}{noise} {column.unit} {column.place}"
+    return f"{'at rest' if column.quiet else 'first'} {column.level:.5g}{noise} {column.unit}"
 
 
 TAB = Tab(order=20, title="Recording", build=lambda desk: Mapper(desk).build(), maps=True)
