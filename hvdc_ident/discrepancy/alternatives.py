@@ -31,8 +31,8 @@ from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
 
 
-def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
-    """The refits of forms outside the catalogue in the winner's stead; those that failed are left out.
+def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, ...], int]:
+    """The refits of forms outside the catalogue in the winner's stead, and out of how many they are the best; none that failed.
 
     Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
     winner's pick. No formula of signals at one time is a delay: for one kind of these or another filters, wherever they are.
@@ -43,21 +43,22 @@ def beyond(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
     effect = effects()[placed.candidate.effect]
     if effect.equivalent_delay is not None and not effect.needs_grid:
         tried = filters(search, found, found.before.nominal()) if found.filters is None else found.filters
-        return tuple(gained(t, found.before, found.ruler) for t in tried)
+        places = {c.at for c in found.candidates if c.effect == effect.name}
+        return tuple(gained(t, found.before, found.ruler) for t in tried), len(places)
     # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
     remembers = effect.states != "none" and not effect.needs_source
     if remembers or effect.needs_grid or additive(effect):
-        return ()
+        return (), 0
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
-        return ()
-    jobs = _jobs(found, placed.candidate.at[0], placed.candidate.source)
+        return (), 0
+    jobs, count = _jobs(found, placed.candidate.at[0], placed.candidate.source)
     texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
     refits = [r for r in done(search, jobs, texts) if not r.failure]
-    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits)
+    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits), count
 
 
-def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
-    """The formulas that by regression leave least for what their coefficients cost."""
+def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], int]:
+    """The formulas that by regression leave least for what their coefficients cost, and out of how many."""
     paths = found.answers()
     library, formulas = _formulas(found, paths, place, source)
     regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
@@ -73,7 +74,7 @@ def _jobs(found: Round, place: str, source: str) -> list[RefitJob]:
             jobs.append(formula_job(found.before, place, chosen, coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model
             continue
-    return jobs
+    return jobs, len(formulas)
 
 
 def _formulas(

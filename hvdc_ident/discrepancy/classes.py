@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -57,7 +58,8 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         each.setdefault((r.effect, r.at, r.source), r)
         if r.same_as:
             same[r.effect, r.at, r.source] = r.same_as
-    return tuple(replace(r, same_as=same.get(key, "")) for key, r in each.items())
+    count = Counter(c.effect for c in found.candidates)
+    return tuple(replace(r, same_as=same.get(key, ""), prior=1.0 / max(count[r.effect], 1)) for key, r in each.items())
 
 
 def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
@@ -73,14 +75,14 @@ def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) 
 
 
 def formula_rivals(
-    found: Round, formulas: Sequence[CandidateFit], options: DiagnosisOptions
+    found: Round, formulas: Sequence[CandidateFit], options: DiagnosisOptions, tried: int = 1
 ) -> tuple[float, tuple[Rival, ...]]:
     """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
     where one is further ahead than they can be told apart.
 
-    formulas: refitted in the winner's stead. One that explains as much with a parameter more, and would not without any of
-    its own, is not refuted by the price of that, which is not counted then: of a product around its operating point a gain
-    makes a coupling.
+    formulas: refitted in the winner's stead; tried: out of how many, which share what is probable before any data. One
+    that explains as much with a parameter more, and would not without any of its own, is not refuted by the price of that,
+    which is not counted then: of a product around its operating point a gain makes a coupling.
     """
     assert found.winner is not None and found.ruler is not None
     own, *behind = behinds([found.winner, *formulas])
@@ -92,7 +94,7 @@ def formula_rivals(
         one_more = t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit)
         short = max(b - found.ruler.price, 0.0) if one_more else b
         if short <= within:
-            near.append(_rival(t, short))
+            near.append(replace(_rival(t, short), prior=1.0 / max(tried, 1)))
     return own, tuple(sorted(near, key=lambda r: r.delta_bic))
 
 
@@ -198,7 +200,7 @@ class EffectClass:
 
 
 def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
-    """The classes of an ambiguity set, the likeliest first. Evidence is exp(-delta BIC/2), every hypothesis as likely before.
+    """The classes of an ambiguity set, the likeliest first. Evidence is exp(-delta BIC/2), every effect as likely before.
 
     Effects that are the same equation are one, and so are kinds of delay that are as long: what differs is within the tolerance.
     """
@@ -215,8 +217,14 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
     for one, other in combinations([r for r in group if (r.late or 0.0) > 0.0], 2):
         if _as_long(one, other):
             parent[root(other.effect)] = root(one.effect)
+    there = {(r.effect, r.at, r.source) for r in group}
     # One hypothesis under two names is one hypothesis.
-    weights = [0.0 if r.same_as and not r.refitted else float(np.exp(-0.5 * r.delta_bic)) for r in group]
+    weights = [
+        0.0
+        if r.same_as and (not r.refitted or (r.same_as, r.at, r.source) in there)
+        else r.prior * float(np.exp(-0.5 * r.delta_bic))
+        for r in group
+    ]
     total = sum(weights)
     found: dict[str, list[tuple[Rival, float]]] = {}
     for r, w in zip(group, weights, strict=True):

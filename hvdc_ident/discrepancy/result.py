@@ -62,7 +62,8 @@ class Rival:
     """A member of an ambiguity set. delta_bic: how far it is behind the best, 0 for the best itself.
 
     refitted: whether that comes from a refit. expression: of a formula outside the catalogue, with its coefficients' names.
-    same_as: the member of the set that is the same equation at the same place; empty where none is.
+    same_as: the member of the set that is the same equation at the same place; empty where none is. prior: its probability
+    given its effect, before any data: every place and source of an effect is as likely as another.
     """
 
     effect: str
@@ -73,6 +74,7 @@ class Rival:
     refitted: bool = True
     expression: str = ""
     same_as: str = ""
+    prior: float = 1.0
 
     @property
     def late(self) -> float | None:
@@ -337,5 +339,5 @@ def _named(value: FoundEffect | Rival | Line | Place) -> dict[str, Any]:
 
 def _member(value: FoundEffect | Rival) -> dict[str, Any]:
     """Return the line of `_named`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
-    out = {k: v for k, v in _named(value).items() if k not in ("expression", "same_as") or v}
+    out = {k: v for k, v in _named(value).items() if k != "prior" and (k not in ("expression", "same_as") or v)}
     return out | ({} if value.late is None else {"late": value.late})

@@ -195,8 +195,8 @@ def _with_formulas(
         if not search.options.fallback or classes(group)[0].probability < CERTAIN:
             wider.append(group)
             continue
-        formulas = beyond(search, found)
-        behind, near = formula_rivals(found, formulas, search.options)
+        formulas, tried = beyond(search, found)
+        behind, near = formula_rivals(found, formulas, search.options, tried)
         if np.isinf(behind):
             best = max(formulas, key=lambda t: t.told)
             return (), Law(best.refit, best.gain)

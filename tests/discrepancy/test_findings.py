@@ -131,3 +131,19 @@ def test_what_to_record_next_asks_for_signals_that_are_not_there_and_not_for_oth
     alike = [Rival("coupling", ("e",), 0.0, FrozenMap({"k": 1.0}), source="w")]
     alike.append(Rival("droop", ("e",), 0.0, FrozenMap({"k": -1.0}), source="w", refitted=False, same_as="coupling"))
     assert rated.separating([alike], set()) == {}
+
+
+def test_an_effect_with_many_places_is_no_likelier_for_that() -> None:
+    """Where nothing tells them apart, an effect holds what its places hold of all those it was looked for at."""
+    leaks = [Rival("coupling", ("e",), 0.0, FrozenMap({"k": 0.1}), source=f"s{k}", prior=1 / 60) for k in range(12)]
+    gains = [Rival("gain", (at,), 0.0, FrozenMap({"k": 0.9}), prior=1 / 10) for at in ("e", "u")]
+    found = {c.names[0]: c.probability for c in rated.classes([*leaks, *gains])}
+    assert found == {"coupling": pytest.approx(0.5), "gain": pytest.approx(0.5)}
+
+
+def test_one_equation_under_two_names_counts_once() -> None:
+    leak = Rival("conductance", ("e",), 0.0, FrozenMap({"g": 0.1}), source="s", prior=0.1)
+    loss = Rival("loss", ("e",), 0.0, FrozenMap({"b": 0.1}), source="s", same_as="conductance", prior=0.1)
+    gain = Rival("gain", ("e",), 0.0, FrozenMap({"k": 0.9}), prior=0.1)
+    one, other = rated.classes([leak, loss, gain])
+    assert one.probability == other.probability == pytest.approx(0.5)
