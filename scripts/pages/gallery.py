@@ -32,7 +32,10 @@ def figures() -> dict[str, Path]:
 
 def navigation() -> list[dict[str, str]]:
     """Return the entries of the navigation."""
-    return [{"Gallery": "studies/index.md"}, *({title: f"studies/{name}.md"} for name, title, _ in listed())]
+    return [
+        {"Gallery": "studies/index.md"},
+        *({title.replace("`", ""): f"studies/{name}.md"} for name, title, _ in listed()),
+    ]
 
 
 def _gallery() -> str:
