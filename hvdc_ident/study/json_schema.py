@@ -180,6 +180,8 @@ def _card_value(section: str, field: Field[Any]) -> dict[str, Any]:
     if field.name in ("parameters", "replaces"):
         item = {"$ref": "#/$defs/parameters"} if field.name == "parameters" else {"type": ["string", "number"]}
         return {"type": "object", "additionalProperties": item}
+    if field.name in ("min", "max"):
+        return {"type": ["number", "null"]}  # taplo takes TOML's inf for null
     is_number = section in ("parameters", "inputs") or (section, field.name) == ("algebraic", "start")
     if (
         is_number
@@ -225,7 +227,7 @@ def kind_of(schema: dict[str, Any]) -> str:
         return " or ".join(dict.fromkeys(kind_of(s) for s in schema["anyOf"] if s.get("type") != "null"))
     kind = schema.get("type")
     if isinstance(kind, list):
-        return " or ".join(kind_of({"type": k}) for k in kind)
+        return " or ".join(kind_of({"type": k}) for k in kind if k != "null")
     if kind == "array":
         return f"list of {_plural(kind_of(schema.get('items', {})))}"
     if kind == "object":
