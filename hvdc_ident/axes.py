@@ -20,7 +20,7 @@ FINEST = 1e-4
 def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapping[str, Any]) -> None:
     """Draw the rise of the cost over one parameter, in units of the 95 % level, with the ends of the interval."""
     x, y = np.array(profile["values"], dtype=float), np.array(profile["rises"], dtype=float) / profile["threshold"]
-    axes.plot(*_joined(x, y), color=LINE, linewidth=1.2)
+    axes.plot(*joined(x, y), color=LINE, linewidth=1.2)
     axes.plot(x, y, color=LINE, linewidth=0, marker="o", markersize=2.5)
     axes.axhline(1.0, color=MARK, linewidth=0.8, linestyle="--")
     for end in ("lower", "upper"):
@@ -34,7 +34,7 @@ def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapp
     _plain(axes)
 
 
-def _joined(x: Array, y: Array) -> tuple[Array, Array]:
+def joined(x: Array, y: Array) -> tuple[Array, Array]:
     """Return the points joined by pieces of parabolas: straight lines in the signed root of the rise."""
     root = np.sqrt(np.clip(y, 0.0, None)) * np.where(x < x[int(np.argmin(y))], -1.0, 1.0)
     dense = np.unique(np.concatenate([x, np.linspace(x[0], x[-1], 200)]))

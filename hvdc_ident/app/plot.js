@@ -4,6 +4,7 @@
 const INK = "#7a8089", FAINT = "rgba(122,128,137,0.22)", FONT = "12px system-ui, sans-serif";
 const axis = (label, side) => ({
   label, side, stroke: INK, font: FONT, labelFont: FONT, labelSize: 16, size: side === 2 ? 26 : 58, gap: 3,
+  ...(side === 3 ? { values: (u, at) => at.map((v) => (v == null ? "" : String(+v.toPrecision(6)))) } : {}),
   grid: { stroke: FAINT, width: 1 }, ticks: { stroke: FAINT, width: 1 },
 });
 

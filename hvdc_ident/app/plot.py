@@ -28,7 +28,8 @@ HEAD = """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/asse
 .plot .marker { position: absolute; top: 0; bottom: 0; width: 13px; margin-left: -6px; cursor: ew-resize; z-index: 101; }
 .plot .marker > i { position: absolute; left: 6px; top: 0; bottom: 0; border-left: 1.5px solid; }
 .plot .marker > b { position: absolute; left: 9px; top: 0; font: 600 11px system-ui, sans-serif; white-space: nowrap; }
-.plot .marker:focus-visible { outline: 2px solid; }</style>"""
+.plot .marker:focus-visible { outline: 2px solid; }
+.body--dark .text-primary { color: #6fb0f0 !important; }</style>"""
 """What a page with plots has in its head; the server offers the folder `ASSETS` as /assets."""
 
 
@@ -90,14 +91,25 @@ class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
             plane=plane,
             markers=[asdict(m) for m in markers],
         )
+        self._drawn: dict[int, list[list[float | None]]] = {}
+        self.on("ready", self._draw)  # the browser builds a plot when its tab is opened for the first time
+
+    def _draw(self) -> None:
+        """Send what was sent before there was a plot."""
+        for grid, columns in self._drawn.items():
+            self.run_method("whole", grid, columns)
 
     def put(self, grid: int, column: int, values: Array) -> None:
         """Replace the values of one column (0: the abscissa) of a grid: (n,), thinned as the others were."""
-        self.run_method("put", grid, column, _short(values))
+        short = _short(values)
+        if grid in self._drawn:
+            self._drawn[grid][column] = short
+        self.run_method("put", grid, column, short)
 
     def whole(self, grid: int, columns: Sequence[Array]) -> None:
         """Replace all columns of a grid, the abscissa first: (n,) each."""
-        self.run_method("whole", grid, [_short(c) for c in columns])
+        self._drawn[grid] = [_short(c) for c in columns]
+        self.run_method("whole", grid, self._drawn[grid])
 
     def refine(self, grid: int, columns: Sequence[Array]) -> None:
         """Replace all columns of a grid and go on looking at the same part of it: (n,) each."""

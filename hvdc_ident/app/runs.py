@@ -56,6 +56,8 @@ def _standing(study: hi.Study, folder: Path, stage: Stage) -> StageStanding:
         why = str(data.get("message") or "; ".join(data.get("implausible", ())) or why)
     elif why:
         state = "stale"
+        same = data.get("sources") == dict(study.sources)
+        why = "by another version of hvdc_ident" if same else "the study or one of its files has changed since"
     return StageStanding(stage, stage.wanted(study), state, why, data)
 
 

@@ -90,6 +90,13 @@ class Move:
             more = {"frequencies_hz": list(self.frequencies)}
         return {"input": self.input, "shape": self.shape, "from": self.before, "to": self.after, "at": self.at, **more}
 
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Move:
+        """Return the move that `to_dict` told."""
+        slowest = min(told.get("frequencies_hz") or (), default=None)
+        seconds = float(told.get("seconds", 0.0)) if slowest is None else HARMONICS[0] / slowest
+        return cls(told["input"], told["shape"], told["from"], told["to"], told["at"], seconds)
+
 
 def _multisine(phase: Array) -> Array:
     """Sines of equal size with Schroeder's phases (doi 10.1109/TIT.1970.1054411), largest value 1, over so many periods."""

@@ -1,0 +1,34 @@
+"""Work in a thread of which only the newest request is answered: what follows faster than answers is skipped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from nicegui import background_tasks, run
+
+
+class Latest:
+    """Answers requests one after the other. work: makes the answer, in a thread. show: takes it, on the page."""
+
+    def __init__(self, work: Callable[[Any], Any], show: Callable[[Any], None]) -> None:
+        self._work, self._show = work, show
+        self._asked: list[Any] = []
+        self._busy = False
+
+    def ask(self, request: Any) -> None:
+        """Ask for the answer of a request in place of those that wait."""
+        self._asked = [request]
+        if not self._busy:
+            self._busy = True
+            background_tasks.create(self._catch_up())
+
+    async def _catch_up(self) -> None:
+        try:
+            while self._asked:
+                answer = await run.io_bound(self._work, self._asked.pop())
+                if answer is None:
+                    return  # the server is ending
+                self._show(answer)
+        finally:
+            self._busy = False

@@ -1,0 +1,124 @@
+"""The experiment to make next, simulated for every model that may lie behind the recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from nicegui import run, ui
+
+import hvdc_ident as hi
+from hvdc_ident.app.plot import GIVEN, NOW, Curve, Grid, Plot, thinned
+from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_experiments
+from hvdc_ident.data import Array, Experiment
+from hvdc_ident.errors import HvdcIdentError
+
+COLORS = ("#2a9d5c", "#b0569f", "#c2452d", "#8a6d1f", "#3a8f98")
+"""Colours of the rivals."""
+MOST = len(COLORS)
+TALL = 150
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """What an experiment would look like. runs: by model and signal, (n,). trouble: by model, why it has none."""
+
+    experiment: Experiment
+    runs: Mapping[str, Mapping[str, Array]]
+    trouble: Mapping[str, str]
+
+
+def planned_run(experiment: Experiment, models: tuple[Supposition, ...], signals: tuple[str, ...]) -> PlannedRun:
+    """Return the signals of an experiment by every model; of a model that cannot be run, why."""
+    runs: dict[str, dict[str, Array]] = {}
+    trouble: dict[str, str] = {}
+    for m in models:
+        try:
+            found = hi.simulate(m.model, experiment, outputs=signals)
+        except HvdcIdentError as error:
+            trouble[m.name] = str(error)
+        else:
+            runs[m.name] = {s: found[s] for s in signals}
+    return PlannedRun(experiment, runs, trouble)
+
+
+class NextExperiment:
+    """The experiments that the analysis recommends, and a button that simulates the chosen one.
+
+    fitted: values of the study's model. rivals: models with what a diagnosis found.
+    """
+
+    def __init__(
+        self,
+        study: hi.Study,
+        identified: Mapping[str, Any],
+        fitted: Mapping[str, float],
+        rivals: tuple[Supposition, ...],
+    ) -> None:
+        self._study = study
+        self._planned = planned_experiments(study, identified)
+        own = {n: v for n, v in fitted.items() if n in study.model.parameters}
+        best = Supposition("fitted" if own else "given values", study.model.with_values(own))
+        self._models = (best, *rivals[:MOST])
+
+    def build(self) -> None:
+        """Build the choice and the button; nothing where no experiment is recommended."""
+        if not self._planned:
+            return
+        with ui.row().classes("w-full items-center gap-3"):
+            words = {k: p.words for k, p in enumerate(self._planned)}
+            self._which = ui.select(words, value=0, label="experiment", on_change=self._choose)
+            self._which.props("dense options-dense").style("min-width: 26rem; max-width: 40rem")
+            signals = self._signals()
+            first = [s for s in self._planned[0].record if s in signals]
+            self._record = ui.select(signals, value=first or signals[:1], label="signals", multiple=True)
+            self._record.props("dense options-dense").style("min-width: 12rem; max-width: 24rem")
+            self._button = ui.button("Simulate it", on_click=self._simulate).props("dense no-caps").classes("q-px-md")
+        if len(self._models) > 1:
+            told = "Drawn for the fitted model and for what may be missing: where the curves part, a record tells them apart."
+            ui.label(told).classes("text-caption")
+        self._trouble = ui.label("").classes("text-negative").props('role="alert"')
+        self._place = ui.column().classes("w-full gap-0")
+
+    def _signals(self) -> list[str]:
+        """Return what every model has and can be recorded."""
+        own = self._study.model
+        names = dict.fromkeys((*own.outputs, *own.insertion_points))
+        inside = [{*m.model.outputs, *m.model.insertion_points} for m in self._models]
+        return [n for n in names if n not in own.inputs and all(n in known for known in inside)]
+
+    def _choose(self, event: Any) -> None:
+        planned = self._planned[int(event.value)]
+        self._record.value = [s for s in planned.record if s in self._record.options]
+
+    async def _simulate(self) -> None:
+        planned: PlannedExperiment = self._planned[int(self._which.value)]
+        signals = tuple(self._record.value or ())
+        if not signals:
+            self._trouble.text = "Choose at least one signal."
+            return
+        self._button.props("loading")
+        found = await run.io_bound(planned_run, planned.experiment(self._study), self._models, signals)
+        self._button.props(remove="loading")
+        if found is not None:  # None: the server is ending
+            self._trouble.text = "; ".join(f"{n}: {why}" for n, why in found.trouble.items())
+            self._draw(found, signals)
+
+    def _draw(self, found: PlannedRun, signals: tuple[str, ...]) -> None:
+        colors = dict(zip([m.name for m in self._models], (NOW, *COLORS), strict=False))
+        curves = tuple(Curve(n, colors[n], dashed=k > 1) for k, n in enumerate(found.runs))
+        time = found.experiment.time
+        inputs = found.experiment.inputs
+        known = self._study.model.inputs
+        grids = [Grid(f"{n}, {known[n].unit}".rstrip(", "), (Curve("input", GIVEN),)) for n in inputs]
+        units = {**{n: s.unit for n, s in self._study.model.outputs.items()}}
+        grids += [Grid(f"{s}, {units.get(s, '')}".rstrip(", "), curves) for s in signals]
+        self._place.clear()
+        with self._place:
+            plot = Plot(grids, "time, s", TALL * len(grids) + 30, "The experiment as it would be").classes("w-full")
+        for k, signal in enumerate(inputs.values()):
+            plot.whole(k, thinned(time, np.asarray(signal(time))))
+        for k, name in enumerate(signals, len(inputs)):
+            plot.whole(k, thinned(time, *(line[name] for line in found.runs.values())))

@@ -1,0 +1,109 @@
+"""Models that may lie behind the recordings, and the experiments that would tell, as the results of a study name them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hvdc_ident as hi
+from hvdc_ident.data import Experiment
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move
+from hvdc_ident.model import AnyModel
+from hvdc_ident.text import form_of, listed
+
+
+@dataclass(frozen=True)
+class Supposition:
+    """A model that may lie behind the recordings. sizes: names of its parameters that say how large what is missing is."""
+
+    name: str
+    model: AnyModel
+    sizes: tuple[str, ...] = ()
+
+
+def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) -> tuple[Supposition, ...]:
+    """Return the models with what a diagnosis found missing: the best one, then those that explain the records as well.
+
+    All have the parameters of the best one, for the results keep no others. None where nothing was put in; a rival that
+    cannot be built here is left out.
+    """
+    card = folder / Path(str(diagnosis.get("augmented_model") or "")).name
+    if not diagnosis.get("augmented_model") or not card.is_file():
+        return ()
+    best = hi.load_model(card)
+    found = diagnosis.get("effects") or []
+    rivals = [Supposition(_named(found), best, _sizes(study, best))]
+    gains = {n: v for n, v in (diagnosis.get("parameters_after") or {}).items() if n in study.model.parameters}
+    plant = study.model.with_values(gains)
+    for k, group in enumerate(diagnosis.get("ambiguity") or []):
+        for other in group[1:]:
+            effects = [*found[:k], other, *found[k + 1 :]]
+            try:
+                model = hi.apply_effects(plant, [_use(e) for e in effects])
+            except HvdcIdentError:  # a formula, or an unknown input: no effect that can be put in by its name
+                continue
+            rivals.append(Supposition(_named(effects), model, _sizes(study, model)))
+    return tuple(rivals)
+
+
+def _named(effects: Sequence[Mapping[str, Any]]) -> str:
+    """Return the effects with their places in words."""
+    parts = []
+    for e in effects:
+        source = f" from {e['from']}" if e.get("from") else ""
+        parts.append(f"{form_of(e)} at {listed(e['at'])}{source}")
+    return "; ".join(parts) or "as found"
+
+
+def _use(effect: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an effect of the results as `apply_effects` takes it."""
+    values = {n: p["value"] if isinstance(p, Mapping) else p for n, p in (effect.get("parameters") or {}).items()}
+    more = {k: effect[k] for k in ("from", "expression") if effect.get(k)}
+    return {"effect": effect["effect"], "at": effect["at"], "parameters": values, **more}
+
+
+def _sizes(study: hi.Study, model: AnyModel) -> tuple[str, ...]:
+    """Return the parameters that the study's model lacks, and those it holds at another value."""
+    own, candidates = study.model.parameters, study.candidates
+    added = [n for n in model.parameters if n not in own]
+    moved = [n for n, q in model.parameters.items() if n in own and n not in candidates and own[n].value != q.value]
+    return (*added, *moved)
+
+
+@dataclass(frozen=True)
+class PlannedExperiment:
+    """An experiment that the results say to make. words: what to do. record: signals to record; new: not recorded so far."""
+
+    words: str
+    design: ExperimentDesign
+    record: tuple[str, ...]
+    new: tuple[str, ...]
+
+    def experiment(self, study: hi.Study) -> Experiment:
+        """Return it over the instants of the study's longest record, as the results have it."""
+        return self.design.experiment(max(study.experiments, key=lambda e: float(np.ptp(e.time))))
+
+
+def planned_experiments(study: hi.Study, identified: Mapping[str, Any]) -> tuple[PlannedExperiment, ...]:
+    """Return the experiments that an identifiability analysis recommends, the best first; none where it has none."""
+    units = {n: i.unit for n, i in study.model.inputs.items()}
+    advice = identified.get("recommended_experiment") or {}
+    return tuple(dict.fromkeys(_planned((advice, *(advice.get("others") or ())), units)))
+
+
+def _planned(told: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Iterator[PlannedExperiment]:
+    for line in told:
+        if line.get("moves"):
+            design = ExperimentDesign(tuple(Move.of(m) for m in line["moves"]))
+            yield PlannedExperiment(design.text(units), design, tuple(line["record"]), tuple(line["new_signals"]))
+
+
+def advice_lines(identified: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[str]:
+    """Return in words what to record next: to tell rivals apart first, then to know the parameters better."""
+    told = (diagnosis.get("separating_experiment") or {}, identified.get("recommended_experiment") or {})
+    return [f"{text.rstrip('.')}." for t in told if (text := t.get("text"))]

@@ -1,0 +1,131 @@
+"""Compare: the results of two folders side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from nicegui import run, ui
+
+import hvdc_ident as hi
+from hvdc_ident.app.desk import Desk
+from hvdc_ident.app.result_panels import show_table
+from hvdc_ident.app.runs import result_folders
+from hvdc_ident.app.server import Tab
+from hvdc_ident.display import Table, rounded
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.study.comparison import APART, GAPS, SIDES, RunComparison, value_texts
+
+
+class ComparedRuns:
+    """The tab in one browser: two folders of the study's folder, and what differs."""
+
+    def __init__(self, study: hi.Study) -> None:
+        self._study = study
+        self._found: RunComparison | None = None
+
+    def build(self) -> None:
+        """Build the choices; what differs is shown once both are chosen."""
+        with ui.row().classes("w-full items-center gap-3"):
+            self._sides = [
+                ui.select({}, label=f"{side} result", on_change=self._compare).props("dense options-dense")
+                for side in SIDES
+            ]
+            for side in self._sides:
+                side.style("min-width: 16rem")
+            ui.button("Look again", on_click=self._offer).props("flat dense no-caps").tooltip("Folders that are new")
+            self._page = ui.button("Page", on_click=self._give).props("outline dense no-caps").classes("q-px-sm")
+            self._page.tooltip("The comparison as one HTML page")
+            self._page.set_enabled(False)
+        self._place = ui.column().classes("w-full gap-2")
+        self._offer()
+
+    def _offer(self) -> None:
+        """Offer the folders that hold results."""
+        home = self._study.path.resolve().parent
+        found = [p for p in result_folders(self._study) if p.is_dir() and any(p.glob("*.json"))]
+        names = {str(p): p.name if p != home else f"{p.name} (the study's folder)" for p in found}
+        for k, side in enumerate(self._sides):
+            first = list(names)[k] if len(names) > 1 else None
+            side.set_options(names, value=side.value if side.value in names else first)
+        if len(names) < 2 and self._found is None:
+            self._place.clear()
+            with self._place:
+                ui.label(
+                    "Fewer than two folders here hold results. `hvdc-ident run STUDY --out OTHER-results` beside the study "
+                    "writes another, for example after a change of the study."
+                )
+
+    async def _compare(self) -> None:
+        offered = {str(p): p for p in result_folders(self._study)}
+        chosen = [offered[s.value] for s in self._sides if s.value in offered]  # none that is not offered
+        if len(chosen) < 2:
+            return
+        try:
+            found = await run.io_bound(hi.compare_runs, *chosen)
+        except HvdcIdentError as error:
+            ui.notify(str(error), type="negative", multi_line=True)
+            return
+        if found is not None:  # None: the server is ending
+            self._found = found
+            self._page.set_enabled(True)
+            self._show(found, chosen)
+
+    def _show(self, found: RunComparison, folders: list[Path]) -> None:
+        data = found.to_dict()
+        self._place.clear()
+        with self._place:
+            ui.label(found.conclusion).classes("text-body1 text-bold")
+            if data["values"]:
+                rows = tuple(
+                    (
+                        v["parameter"],
+                        v["unit"],
+                        *value_texts(v),
+                        rounded(v["change_percent"], 3),
+                        rounded(v["apart"], 3),
+                    )
+                    for v in data["values"]
+                )
+                names = [f.name for f in folders]
+                show_table(Table(("parameter", "unit", *names, "change, %", "apart"), rows).without_empty())
+                ui.label(APART).classes("text-caption")
+            self._show_gaps(data, folders)
+            with ui.row().classes("w-full no-wrap items-stretch"):
+                for folder, findings in zip(folders, data["findings"], strict=True):
+                    self._show_findings(folder.name, findings)
+            for line in (*found.input_lines, *(n for n in found.verdict_lines if not n.startswith("missing"))):
+                ui.label(line).classes("text-body2")
+
+    def _show_gaps(self, data: dict[str, Any], folders: list[Path]) -> None:
+        rows = tuple(
+            (GAPS[g["at"]], g["output"], g["unit"], *map(rounded, g["rmse"]), rounded(g["ratio"], 3), g["recordings"])
+            for g in data["gaps"]
+        )
+        if rows:
+            ui.label("RMSE over the recordings that both have").classes("text-subtitle2")
+            header = ("at", "output", "unit", *(f.name for f in folders), "ratio", "recordings")
+            show_table(Table(header, rows).without_empty())
+
+    def _show_findings(self, name: str, findings: list[dict[str, Any]] | None) -> None:
+        with ui.card().classes("col").props("flat bordered"):
+            ui.label(f"What is missing, by {name}").classes("text-subtitle2")
+            if not findings:
+                ui.label("No diagnosis has run." if findings is None else "Nothing was found.")
+            for f in findings or ():
+                ui.label(f"{f['effect']} ({f['probability']:.0%}): {f['text']}")
+
+    def _give(self) -> None:
+        if self._found is not None:
+            ui.download.content(self._found.page, "compare.html")
+
+
+def build(desk: Desk) -> None:
+    """Build the tab: of a study the results beside it, else what to do."""
+    if desk.study is None:
+        ui.markdown("No study is open. `hvdc-ident app STUDY` opens one; its results are compared here.")
+        return
+    ComparedRuns(desk.study).build()
+
+
+TAB = Tab(order=40, title="Compare", build=build)
