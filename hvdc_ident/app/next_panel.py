@@ -11,7 +11,7 @@ from nicegui import run, ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.plot import GIVEN, NOW, Curve, Grid, Plot, thinned
-from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_experiments
+from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_experiments, refitted
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import HvdcIdentError
 
@@ -23,25 +23,31 @@ TALL = 150
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """What an experiment would look like. runs: by model and signal, (n,). trouble: by model, why it has none."""
+    """What an experiment would look like. models: as they were run. runs: by model and signal, (n,). trouble: by model, why it
+    has none."""
 
     experiment: Experiment
+    models: tuple[Supposition, ...]
     runs: Mapping[str, Mapping[str, Array]]
     trouble: Mapping[str, str]
 
 
-def planned_run(experiment: Experiment, models: tuple[Supposition, ...], signals: tuple[str, ...]) -> PlannedRun:
-    """Return the signals of an experiment by every model; of a model that cannot be run, why."""
+def planned_run(
+    study: hi.Study, experiment: Experiment, models: tuple[Supposition, ...], signals: tuple[str, ...]
+) -> PlannedRun:
+    """Return the signals of an experiment by every model, fitted to the study's records where it is not yet."""
     runs: dict[str, dict[str, Array]] = {}
     trouble: dict[str, str] = {}
+    ready: list[Supposition] = []
     for m in models:
         try:
-            found = hi.simulate(m.model, experiment, outputs=signals)
+            ready.append(refitted(study, m))
+            found = hi.simulate(ready[-1].model, experiment, outputs=signals)
         except HvdcIdentError as error:
             trouble[m.name] = str(error)
         else:
             runs[m.name] = {s: found[s] for s in signals}
-    return PlannedRun(experiment, runs, trouble)
+    return PlannedRun(experiment, tuple(ready), runs, trouble)
 
 
 class NextExperiment:
@@ -77,7 +83,7 @@ class NextExperiment:
             self._record.props("dense options-dense").style("min-width: 12rem; max-width: 24rem")
             self._button = ui.button("Simulate it", on_click=self._simulate).props("dense no-caps").classes("q-px-md")
         if len(self._models) > 1:
-            told = "Drawn for the fitted model and for what may be missing: where the curves part, a record tells them apart."
+            told = "Drawn for the fitted model and for what may be missing, each at its best fit: where curves part, a record tells."
             ui.label(told).classes("text-caption")
         self._trouble = ui.label("").classes("text-negative").props('role="alert"')
         self._place = ui.column().classes("w-full gap-0")
@@ -100,9 +106,12 @@ class NextExperiment:
             self._trouble.text = "Choose at least one signal."
             return
         self._button.props("loading")
-        found = await run.io_bound(planned_run, planned.experiment(self._study), self._models, signals)
+        asked = (self._study, planned.experiment(self._study), self._models, signals)
+        found = await run.io_bound(planned_run, *asked)
         self._button.props(remove="loading")
         if found is not None:  # None: the server is ending
+            known = {m.name: m for m in found.models}
+            self._models = tuple(known.get(m.name, m) for m in self._models)
             self._trouble.text = "; ".join(f"{n}: {why}" for n, why in found.trouble.items())
             self._draw(found, signals)
 

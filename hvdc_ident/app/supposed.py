@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,26 +11,32 @@ import numpy as np
 
 import hvdc_ident as hi
 from hvdc_ident.data import Experiment
-from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.errors import ComputationError, HvdcIdentError
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move
 from hvdc_ident.model import AnyModel
+from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.text import form_of, listed
 
 
 @dataclass(frozen=True)
 class Supposition:
-    """A model that may lie behind the recordings. sizes: names of its parameters that say how large what is missing is."""
+    """A model that may lie behind the recordings.
+
+    sizes: names of its parameters that say how large what is missing is. fitted: its values are those of its own best fit.
+    """
 
     name: str
     model: AnyModel
     sizes: tuple[str, ...] = ()
+    fitted: bool = True
 
 
 def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) -> tuple[Supposition, ...]:
     """Return the models with what a diagnosis found missing: the best one, then those that explain the records as well.
 
-    All have the parameters of the best one, for the results keep no others. None where nothing was put in; a rival that
-    cannot be built here is left out.
+    The rivals have the parameters of the best one, for the results keep no others: `refitted` gives them their own. None
+    where nothing was put in; a rival that cannot be built here is left out.
     """
     card = folder / Path(str(diagnosis.get("augmented_model") or "")).name
     if not diagnosis.get("augmented_model") or not card.is_file():
@@ -47,8 +53,29 @@ def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) ->
                 model = hi.apply_effects(plant, [_use(e) for e in effects])
             except HvdcIdentError:  # a formula, or an unknown input: no effect that can be put in by its name
                 continue
-            rivals.append(Supposition(_named(effects), model, _sizes(study, model)))
+            rivals.append(Supposition(_named(effects), model, _sizes(study, model), fitted=False))
     return tuple(rivals)
+
+
+def refitted(study: hi.Study, rival: Supposition) -> Supposition:
+    """Return a model with the values that fit the recordings best, by one run from those it has; itself where it has them.
+
+    Without that it would seem to differ from the best one where only its parameters are another's. Raises ComputationError
+    where the fit fails.
+    """
+    if rival.fitted:
+        return rival
+    unknowns = [
+        replace(FitParameter.of(n, rival.model.parameters[n]), min=c.min, max=c.max)
+        for n, c in study.candidates.items()
+        if c.min <= rival.model.parameters[n].value <= c.max
+    ]
+    unknowns += [FitParameter.of(n, rival.model.parameters[n]) for n in rival.sizes]
+    problem = Problem(ModelSimulator(rival.model), study.experiments, tuple(unknowns))
+    found = hi.fit(problem, starts=1, assess=False)
+    if found.status == "failed":
+        raise ComputationError(f"the model with {rival.name} could not be fitted", got=found.message)
+    return replace(rival, model=rival.model.with_values({u.name: found.values[u.name] for u in unknowns}), fitted=True)
 
 
 def _named(effects: Sequence[Mapping[str, Any]]) -> str:

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from nicegui import ui
+from nicegui import run, ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.latest import Latest
 from hvdc_ident.app.plot import GIVEN, RECORDED, Curve, Grid, Plot, thinned
 from hvdc_ident.app.setting import Setting, span_of
-from hvdc_ident.app.supposed import Supposition
+from hvdc_ident.app.supposed import Supposition, refitted
 from hvdc_ident.data import Array
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.text import quantity
@@ -63,7 +63,7 @@ class WhatIf:
     def __init__(
         self, study: hi.Study, models: tuple[Supposition, ...], before: Mapping[str, float], experiment: str = ""
     ) -> None:
-        self._study, self._models = study, models
+        self._study, self._models = study, list(models)
         known = {n: v for n, v in before.items() if n in study.model.parameters}
         self._without = study.model.with_values(known)
         self._chosen = models[0]
@@ -98,9 +98,21 @@ class WhatIf:
         self._restore()
         self._build_plot()
 
-    def _choose(self, event: Any) -> None:
-        self._chosen = self._models[int(event.value)]
-        self._restore()
+    async def _choose(self, event: Any) -> None:
+        which = int(event.value)
+
+        def fitted() -> Supposition | HvdcIdentError:
+            try:
+                return refitted(self._study, self._models[which])
+            except HvdcIdentError as error:
+                return error
+
+        found = await run.io_bound(fitted)
+        if isinstance(found, Supposition):
+            self._models[which] = self._chosen = found
+            self._restore()
+        elif found is not None:  # None: the server is ending
+            self._trouble.text = str(found)
 
     def _choose_record(self, event: Any) -> None:
         self._record = next(e for e in self._study.experiments if e.name == event.value)

@@ -11,7 +11,6 @@ import sys
 import textwrap
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -23,67 +22,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.study.pipeline import run_stage
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.store import exclusive
-
-CARD = """\
-schema = 1
-name = "lag"
-[parameters]
-k = {value = 4.0, unit = "1/s", min = 0.001, max = 1000.0}
-[inputs]
-u = {value = 0.0}
-[states]
-x = {derivative = "k*(2.0*u - x)"}
-[outputs]
-y = {value = "x", unit = "MW"}
-"""
-STUDY = """\
-schema = 1
-name = "small"
-[model]
-source = "lag.toml"
-[parameters]
-k = {min = 0.5, max = 20}
-[fit]
-starts = 1
-[diagnose]
-effects = ["lag", "gain"]
-most = 1
-"""
-SECONDS = 120.0  # that a run may take on a busy machine before a test gives up
-
-
-def write_small_study(folder: Path) -> Path:
-    """A lag of 5 1/s, recorded late by a lag of 30 ms, twice with noise."""
-    time = np.arange(201) * 0.01
-    random = np.random.default_rng(3)
-    text = STUDY
-    (folder / "lag.toml").write_text(CARD)
-    plant = hi.apply_effects(
-        hi.load_model(folder / "lag.toml"), [{"effect": "lag", "at": "u", "parameters": {"T": 0.03}}]
-    )
-    for name, to in (("up", 1.0), ("down", -0.5)):
-        y = hi.simulate(plant, time, {"k": 5.0}, inputs={"u": hi.step(0.0, to, at=0.5)})["y"]
-        rows = np.column_stack([time, np.where(time >= 0.5, to, 0.0), y + 0.005 * random.standard_normal(201)])
-        np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header="time,u,y", comments="")
-        text += (
-            f'[[experiment]]\nname = "{name}"\ndata = "{name}.csv"\ninputs = ["u"]\noutputs = ["y"]\nevent = 0.5\n'
-            'interpolation = "hold"\nnoise = {y = 0.005}\n'
-        )
-    (folder / "study.toml").write_text(text)
-    return folder / "study.toml"
-
-
-@pytest.fixture
-def study(tmp_path: Path) -> hi.Study:
-    return hi.load_study(write_small_study(tmp_path))
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[hi.Study, StudyRun]:
-    study = hi.load_study(write_small_study(tmp_path_factory.mktemp("finished")))
-    run = Runs().start(study, study.folder)
-    assert run.wait(SECONDS) == "done", run.message
-    return study, run
+from tests.app.small_study import CARD, SECONDS, hold, write_small_study
 
 
 def states(study: hi.Study) -> dict[str, str]:
@@ -107,7 +46,8 @@ def test_the_fit_is_that_of_the_verb(finished: tuple[hi.Study, StudyRun]) -> Non
     assert fit["estimates"]["k"]["value"] == pytest.approx(hi.fit(study).values["k"], rel=1e-9)
 
 
-def test_a_changed_study_is_stale_and_its_signature_another(study: hi.Study) -> None:
+def test_a_changed_study_is_stale_and_its_signature_another(small_study: hi.Study) -> None:
+    study = small_study
     assert set(states(study).values()) == {"not run"}
     before = signature(study, study.folder)
     run_stage(study, "simulate", study.folder, StageOptions())
@@ -117,7 +57,8 @@ def test_a_changed_study_is_stale_and_its_signature_another(study: hi.Study) -> 
     assert states(changed)["simulate"] == "stale" and signature(changed, study.folder) != before
 
 
-def test_a_stage_that_fails_says_why(study: hi.Study) -> None:
+def test_a_stage_that_fails_says_why(small_study: hi.Study) -> None:
+    study = small_study
     (study.path.parent / "lag.toml").write_text(CARD.replace("k*(2.0*u - x)", "k*(2.0*u - x) + exp(40.0*x**2) - 1.0"))
     broken = hi.load_study(study.path)
     assert run_stage(broken, "simulate", broken.folder, StageOptions()).failed
@@ -125,34 +66,17 @@ def test_a_stage_that_fails_says_why(study: hi.Study) -> None:
     assert found.state == "failed" and found.why
 
 
-def test_what_is_wrong_with_a_study_is_told(study: hi.Study) -> None:
+def test_what_is_wrong_with_a_study_is_told(small_study: hi.Study) -> None:
+    study = small_study
     (study.path.parent / "up.csv").unlink()
     run = Runs().start(study, study.folder)
     assert run.wait(SECONDS) == "failed" and "up.csv" in run.message and not study.folder.exists()
 
 
-def held_study(study: hi.Study, tmp_path: Path) -> hi.Study:
-    """The study with a model whose code waits at a pipe that nobody writes to: work that takes as long as it is let."""
-    os.mkfifo(tmp_path / "pipe")
-    model = f"""
-        import os, signal
-        from hvdc_ident.models import load_model
-        def model():
-            if os.environ.get("HELD"):
-                open({str(tmp_path / "pipe")!r}).read()
-            return load_model({str(tmp_path / "lag.toml")!r})
-        SUMMARY = "held"
-        """
-    (tmp_path / "held.py").write_text(textwrap.dedent(model))
-    study.path.write_text(study.path.read_text().replace("lag.toml", "held.py"))
-    return hi.load_study(study.path, trust=True)
-
-
-def test_a_run_is_cancelled_and_cannot_be_started_twice(
-    study: hi.Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    held = held_study(study, tmp_path)
-    monkeypatch.setenv("HELD", "1")
+def test_a_run_is_cancelled_and_cannot_be_started_twice(small_study: hi.Study) -> None:
+    study = small_study
+    hold(study.path)
+    held = hi.load_study(study.path, trust=True)
     runs = Runs()
     run = runs.start(held, held.folder, trust=True)
     with pytest.raises(InputError, match="'run' is at work in this folder"):
@@ -162,7 +86,8 @@ def test_a_run_is_cancelled_and_cannot_be_started_twice(
     assert run.wait(SECONDS) == "cancelled" and run.message == ""
 
 
-def test_another_process_in_the_folder_is_not_disturbed(study: hi.Study) -> None:
+def test_another_process_in_the_folder_is_not_disturbed(small_study: hi.Study) -> None:
+    study = small_study
     with exclusive(study.folder):
         run = Runs().start(study, study.folder)
         assert run.wait(SECONDS) == "failed" and "another run is at work in this folder" in run.message

@@ -29,8 +29,8 @@ MARKS = {
 }
 """Icon and colour of each state."""
 NO_STUDY = (
-    "No study is open. `hvdc-ident app STUDY` opens one; `hvdc-ident new DIR` writes one with data to start from, and a study "
-    "is written from your recordings by hand after docs/calibration.md."
+    "No study is open. The tab Recording writes one from your recordings; `hvdc-ident app STUDY` opens one; `hvdc-ident new DIR` "
+    "writes one with data to start from."
 )
 
 

@@ -1,0 +1,122 @@
+"""What the tab Run shows of results, against the results and against simulations made by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hvdc_ident as hi
+from hvdc_ident.app.result_tables import (
+    finding_table,
+    gap_table,
+    on_page,
+    overlay_columns,
+    profile_columns,
+    verdict_table,
+)
+from hvdc_ident.app.runs import StudyRun
+from hvdc_ident.app.supposed import advice_lines, planned_experiments, refitted, suppositions
+from hvdc_ident.identifiability.experiment_design import Move
+from hvdc_ident.report.overlay import Overlay, overlay_of
+from hvdc_ident.report.results import Results
+from tests.app.small_study import LATE
+
+
+@pytest.fixture(scope="module")
+def study(finished: tuple[hi.Study, StudyRun]) -> hi.Study:
+    return finished[0]
+
+
+def told(study: hi.Study, name: str) -> dict[str, Any]:
+    return json.loads((study.folder / f"{name}.json").read_text())
+
+
+def overlay(study: hi.Study) -> Overlay:
+    found = overlay_of(Results(study.folder), "up", "y")
+    assert found is not None
+    return found
+
+
+def test_the_best_model_has_the_plants_size_and_the_rivals_explain_the_record_as_well(study: hi.Study) -> None:
+    best, *rivals = suppositions(study, told(study, "discrepancy"), study.folder)
+    (size,) = best.sizes
+    assert best.model.parameters[size].value == pytest.approx(LATE, rel=0.2) and rivals
+    (record, *_) = study.experiments
+    run = hi.simulate(best.model, record)["y"]
+    np.testing.assert_allclose(run, overlay(study).runs["effect"]["y"], rtol=1e-9, atol=1e-12)
+    for rival in rivals:  # two lags in a row, whichever is the sensor's: far below the noise of 0.005
+        model = refitted(study, rival).model
+        assert np.abs(hi.simulate(model, record)["y"] - run).max() < 0.0005
+        assert rival.name != best.name and rival.sizes
+
+
+def test_without_a_finding_there_is_no_supposition(study: hi.Study, tmp_path: Path) -> None:
+    assert suppositions(study, {}, study.folder) == ()
+    assert suppositions(study, told(study, "discrepancy"), tmp_path) == ()  # the card is not there
+
+
+@pytest.mark.parametrize(
+    "move",
+    [
+        Move("u", "step", 0.4, 0.2, 0.1),
+        Move("u", "ramp", 0.4, 0.2, 0.1, 0.3),
+        Move("u", "multisine", 0.4, 0.5, 0.1, 0.4),
+    ],
+)
+def test_a_move_is_read_as_it_was_told(move: Move) -> None:
+    again = Move.of(json.loads(json.dumps(move.to_dict())))
+    t = np.linspace(0.0, 1.0, 101)
+    assert again == move
+    np.testing.assert_array_equal(again.signal(1.0)(t), move.signal(1.0)(t))
+
+
+def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) -> None:
+    identified = told(study, "identifiability")
+    advice = identified["recommended_experiment"]
+    first, *others = planned_experiments(study, identified)
+    assert advice["text"].startswith(first.words) and others
+    assert advice["text"].rstrip(".") + "." in advice_lines(identified, told(study, "discrepancy"))
+    planned = first.experiment(study)
+    (move, *_) = advice["moves"]
+    signal = planned.inputs[move["input"]]
+    assert (float(signal(0.0)), planned.event) == (move["from"], move["at"])
+    assert planned.time[-1] == max(e.time[-1] for e in study.experiments)
+
+
+def test_a_profile_passes_its_level_at_the_ends_of_the_interval(study: hi.Study) -> None:
+    profile = told(study, "identifiability")["profiles"]["k"]
+    at, between, computed, level, ends = profile_columns(profile)
+    limits = [profile[side]["limit"] for side in ("lower", "upper")]
+    np.testing.assert_allclose(at[np.isfinite(ends)], limits)
+    np.testing.assert_allclose(between[np.isfinite(ends)], 1.0, atol=0.02)
+    assert (level == 1.0).all() and np.isfinite(computed).sum() == len(set(profile["values"]))
+
+
+def test_the_errors_drawn_are_those_that_the_fit_states(study: hi.Study) -> None:
+    time, nothing, given, fitted, absent = overlay_columns(overlay(study), ("given", "fitted", "other"), errors=True)
+    assert time.size == 201 and np.isnan(nothing).all() and np.isnan(absent).all()
+    fit = told(study, "fit")
+    assert np.sqrt(np.mean(fitted**2)) == pytest.approx(fit["rmse"]["y"]["up"])
+    assert np.sqrt(np.mean(given**2)) == pytest.approx(fit["rmse_given"]["y"]["up"])
+    _, recorded, run = overlay_columns(overlay(study), ("fitted",))
+    np.testing.assert_allclose(recorded - run, fitted)
+
+
+def test_tables_hold_verdicts_findings_and_gaps(study: hi.Study) -> None:
+    identified, diagnosis = told(study, "identifiability"), told(study, "discrepancy")
+    (row,) = verdict_table(identified).rows
+    assert row[:2] == ("k", identified["parameters"]["k"]["verdict"]) and row[4] == "1/s"
+    assert row[2] == pytest.approx(identified["parameters"]["k"]["value"], rel=1e-4)
+    assert len(finding_table(diagnosis).rows) == len(diagnosis["findings"]) > 0
+    gaps = {row[0]: row[1] for row in gap_table(diagnosis).rows}
+    assert gaps["with the effect"] < gaps["refitted"] <= gaps["given values"]
+
+
+def test_commands_are_what_stands_on_the_page() -> None:
+    assert on_page("hvdc-ident diagnose STUDY looks for it") == "the stage diagnose looks for it"
+    assert on_page("`hvdc-ident letter STUDY` writes") == "the button Letter writes"
+    assert on_page("`hvdc-ident export STUDY --to FILE` writes") == "a button below Take away writes"
