@@ -117,7 +117,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     lines += data["notes"]
     advice = data["recommended_experiment"]
     lines += [f"Measure next: {advice['text']}"] if advice else []
-    names = listed(data["identifiable"])
+    names = listed(data.get("identifiable") or ())
     return [*lines, f"Next: `hvdc-ident fit STUDY` estimates {names}."] if names else lines
 
 
