@@ -91,7 +91,7 @@ def picture(e: Effect) -> str:
     if other is not None:
         curves.insert(1, Curve("other signal", "other", factor * time, other))
     values = ", ".join(
-        f"{n} = {v:g} {e.parameters[n].unit if n in e.parameters else ''}".rstrip() for n, v in e.example.items()
+        f"{n} = {v:g} {e.parameters[n].unit if n in e.parameters else ''}".rstrip() for n, v in _shown(e).items()
     )
     made = drawing(curves, f"time, {unit}", "signal", f"u and y over time for the effect {e.name} with {values}")
     return f"<figure>{made}<figcaption>{e.name} with {values}</figcaption></figure>"

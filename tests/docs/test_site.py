@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urldefrag
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -29,6 +30,7 @@ from hvdc_ident.study.stages import stages
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "scripts"))
 
+from pages import effects as pictures  # noqa: E402
 from pages import gallery, notebook, reference, results  # noqa: E402
 
 
@@ -113,6 +115,17 @@ def test_every_effect_has_its_picture_and_every_format_its_line(site: Path) -> N
     assert all(f"<code>{name}</code>" in listed for name in formats())
 
 
+def test_pictures_of_effects_show_the_sizes_of_their_captions() -> None:
+    caption = pictures.picture(effects()["limit"]).partition("<figcaption>")[2]
+    _, u, y, _ = pictures.simulated(effects()["limit"], 1.0)
+    level = float(re.findall(r"level = ([\d.]+)", caption)[0])
+    assert level < max(abs(u)) and max(abs(y)) == pytest.approx(level, rel=1e-12)
+    time, u, y, _ = pictures.simulated(effects()["delay"], 0.05)
+    late = float(re.findall(r"T = ([\d.]+) s", pictures.picture(effects()["delay"]))[0])
+    assert y[0] == u[0] and y[-1] == pytest.approx(u[-1])
+    np.testing.assert_allclose(y[time > 0.03], np.interp(time - late, time, u)[time > 0.03], atol=1e-6)
+
+
 def test_every_command_is_on_its_page(site: Path) -> None:
     import typer
 
@@ -193,8 +206,6 @@ most = 1
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The JSON of every stage of a study of a small model that lacks a lag, by file."""
-    import numpy as np
-
     folder = tmp_path_factory.mktemp("results")
     (folder / "motor.toml").write_text((ROOT / "scripts" / "pages" / "card.toml").read_text("utf-8"), "utf-8")
     motor = hvdc_ident.load_model(folder / "motor.toml")
