@@ -186,10 +186,11 @@ def zoomable(
         "columns": {
             name: base64.b64encode(values.astype("<f4").tobytes()).decode() for name, values in columns.items()
         },
-        "curves": [asdict(curve) | {"name": text(curve.name), "color": _named(curve.color)} for curve in curves],
-        "titles": [text(title) for title in titles],
+        "curves": [asdict(curve) | {"color": _named(curve.color)} for curve in curves],
+        "titles": list(titles),
     }
-    script = f'<script type="application/json">{json.dumps(data)}</script>'
+    within = json.dumps(data).replace("<", "\\u003c")  # no name ends the script
+    script = f'<script type="application/json">{within}</script>'
     return captioned(drawn + script, caption, f' data-zoom="{text(label)}"')
 
 

@@ -134,6 +134,12 @@ def test_names_are_escaped(tmp_path: Path) -> None:
     assert "<script>alert" not in text and "&lt;script&gt;" in text
 
 
+def test_a_figure_that_zooms_carries_names_as_they_are_and_none_ends_its_script(tmp_path: Path) -> None:
+    text = page(folder_of(tmp_path, output=NASTY))
+    for content in re.findall(r'<script type="application/json">(.*?)</script>', text, re.DOTALL):
+        assert json.loads(content)["titles"] == ["time, s", f"{NASTY}, pu", "error, pu"]
+
+
 def test_only_the_pages_own_script_may_run(tmp_path: Path) -> None:
     text = page(folder_of(tmp_path))
     (code,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)

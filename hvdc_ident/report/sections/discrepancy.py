@@ -137,7 +137,7 @@ def _gap(found: dict[str, Any]) -> str:
     caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
     shrink = gap.get("shrink_holdout")
     line = (
-        f"<p>Held out, the gap shrinks by {100 * shrink:.0f} %.</p>"
+        f"<p>On held-out recordings the effect shrinks the residual by {100 * shrink:.0f} % against the refitted model.</p>"
         if shrink is not None and (found.get("augmented_model") or found.get("effects"))
         else ""
     )

@@ -7,6 +7,7 @@ from typing import Any
 from hvdc_ident.report.answers import Answers
 from hvdc_ident.report.html import estimate, folded, number, share, table, text
 from hvdc_ident.report.results import Results, Section
+from hvdc_ident.text import listed
 
 
 def _render(results: Results) -> str:
@@ -14,6 +15,8 @@ def _render(results: Results) -> str:
     candidates = fit.get("candidates") or {}
     if not candidates:
         return ""
+    if results.get("discrepancy").get("verdict"):  # what is to be done next has been done
+        fit = {**fit, "adequacy": {**(fit.get("adequacy") or {}), "next": ""}}
     held = fit.get("held") or {}
     fixed = [n for n in held if n not in candidates]
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
@@ -65,7 +68,7 @@ def _note(name: str, own: dict[str, Any], fit: dict[str, Any]) -> str:
     if own.get("method") == "one-sided":
         notes.append("on a bound, one-sided interval")
     if own.get("conditional_on"):
-        notes.append(f"with {', '.join(map(str, own['conditional_on']))} as held")
+        notes.append(f"estimated with {listed(map(str, own['conditional_on']))} held")
     if own.get("reason"):
         notes.append(str(own["reason"]))
     return "; ".join(notes)
