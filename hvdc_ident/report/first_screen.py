@@ -216,6 +216,8 @@ def _verdict_word(verdict: str) -> str:
 
 
 def _undiagnosed(found: Answers) -> str:
+    if not found.values:
+        return "<p class='answer'>Not asked: a diagnosis needs parameters that may be fitted, in <code>[parameters]</code>.</p>"
     command = "<code>hvdc-ident diagnose STUDY</code> looks for what is missing."
     if found.follows is False:
         return f"<p class='answer'>Not asked yet. {command}</p>"
@@ -227,6 +229,8 @@ def _undiagnosed(found: Answers) -> str:
 def _next(found: Answers) -> str:
     if found.next:
         return f"<p class='answer'>{prose(found.next)}</p>"
+    if not found.values:
+        return "<p class='answer'>No advice: there is no parameter to be determined.</p>"
     if found.follows and all(not v.note for v in found.values):
         return "<p class='answer'>Nothing: the values are determined and the model follows.</p>"
     return "<p class='answer'>No advice yet: <code>hvdc-ident identify STUDY</code> says which recording would tell more.</p>"

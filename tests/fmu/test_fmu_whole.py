@@ -118,19 +118,19 @@ def test_the_page_has_every_stage_and_its_figures(whole):
     for name, part in zip(sections, re.split(r"<h2", page)[1:], strict=True):
         figures[name] = part.count("<svg") + part.count("<canvas")
     for name in (
-        "What the data tell about the parameters",
+        "What the recordings determine",
         "What the model lacks",
         "Linear model",
         "Sweep",
         "Waveforms",
     ):
         assert figures[name] > 0, name
-    assert {"Gains", "Error before and after", "Provenance"} <= set(sections)
+    assert {"Parameters", "Errors", "Provenance"} <= set(sections)
     for words in (
         "From perfect data of these signals every candidate could be told (numerical, local)",
         "y of the plant follows that of the model with a first-order lag",
         "The model is closed inside",
-        "the gap shrinks by",
+        "the effect shrinks the residual by",
         "differs from central differences by",
     ):
         assert words in re.sub(r"<[^>]+>", "", page), words

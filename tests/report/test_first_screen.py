@@ -172,8 +172,8 @@ LESS = {"augmented_model": None, "parameters_after": {}, "rmse_after": None, "se
             {
                 "verdict": "FAIL The model with its given values",
                 "values": "No parameter",
-                "missing": "diagnose s.toml",
-                "next": "identify",
+                "missing": "needs parameters",
+                "next": "no parameter to be determined",
             },
         ),
         (
