@@ -8,6 +8,13 @@ const axis = (label, side) => ({
   grid: { stroke: FAINT, width: 1 }, ticks: { stroke: FAINT, width: 1 },
 });
 
+// Numbers along an axis with as many decimals as tell them apart.
+const told = (u, splits, axis, space, step) => {
+  let places = 0;
+  while (places < 12 && Math.abs(step * 10 ** places - Math.round(step * 10 ** places)) > 1e-6) places += 1;
+  return splits.map((v) => (v == null ? "" : v.toFixed(places)));
+};
+
 // The ordinate's ends: a tenth beyond the curves, and of one that stands still a little about its level.
 const spread = (u, low, high) => {
   if (low == null) return [0, 1];
@@ -63,7 +70,7 @@ export default {
         const options = {
           width: this.$el.clientWidth || 300, height: this.tall(g), series, padding: [8, 12, 0, 0],
           scales: { x: { time: false, distr: this.log ? 3 : 1 }, y: { range: spread } },
-          axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g === last ? undefined : () => [] }, axis(grid.title, 3)],
+          axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g < last ? () => [] : this.log ? undefined : told }, { ...axis(grid.title, 3), values: told }],
           cursor: { sync: { key: this.sync.key }, drag: { x: true, y: this.plane } },
           legend: { show: true, live: !this.plane }, focus: { alpha: 1 },
           hooks: this.markers?.length ? this.marking(g) : {},
@@ -84,6 +91,7 @@ export default {
             line.className = "marker";
             line.style.color = m.color;
             line.innerHTML = "<i></i><b></b>";
+            line.lastChild.style.top = `${12 * this.markers.indexOf(m)}px`;  // where two stand at one place
             if (g === 0) {
               line.lastChild.textContent = m.label;
               line.tabIndex = 0;

@@ -18,6 +18,9 @@ from hvdc_ident.app.guard import LOOPBACK, Guard
 from hvdc_ident.app.study_folder import MOST_BYTES
 from hvdc_ident.errors import InputError
 
+RECONNECT = 120.0
+"""How long a page that lost its connection keeps what it shows, s: a busy machine and a closed lid are no reason to forget."""
+
 
 @dataclass(frozen=True)
 class Tab:
@@ -69,9 +72,16 @@ def serve(
         token = secrets.token_urlsafe(24)
         outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         outer.mount("/assets", StaticFiles(directory=ASSETS))
+        lying = [desk]
+
+        def page() -> None:
+            lying[0] = lying[0].renewed()
+            _page(lying[0])
+
         ui.run_with(
             outer,
-            root=lambda: _page(desk.renewed()),
+            root=page,
+            reconnect_timeout=RECONNECT,
             title=f"{desk.title} · hvdc-ident",
             dark=None,
             show_welcome_message=False,
@@ -118,7 +128,7 @@ def _page(desk: Desk) -> None:
     from hvdc_ident.app.plot import HEAD
 
     ui.add_head_html(HEAD)
-    ui.colors(primary="#1f5fa8")
+    ui.colors(primary="#1f5fa8", negative="#d64545")
     with ui.header().classes("items-center q-py-none"):
         ui.label(desk.title).classes("text-subtitle1 text-bold")
         with ui.tabs().props("dense") as bar:

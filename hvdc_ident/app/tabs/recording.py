@@ -41,6 +41,7 @@ from hvdc_ident.errors import HvdcIdentError, StudyError
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import shipped_models
 from hvdc_ident.study.column_matching import Column, Matching, columns_of
+from hvdc_ident.study.parse import parse_study
 
 REST = 0.3
 """How long a mapping has to stand, s, before it is checked."""
@@ -54,7 +55,8 @@ THUMBNAIL = (110, 34)
 """Width and height of a signal's small picture, px."""
 HEIGHT = 470
 """Of the plot, px, where its grids fit in."""
-EVENT_COLOR = "#d64545"
+EVENT_COLOR, DOUBT = "#d64545", "#b26a00"
+"""Colours, each of a contrast of 4 and more on the white and on the dark page."""
 DROP_ANYWHERE = """
 document.addEventListener("dragover", (e) => e.preventDefault());
 document.addEventListener("drop", (e) => {
@@ -263,6 +265,7 @@ class Mapper:
         """Read the study file anew. keep: the mapping that is on the page; left out, that of the file."""
         self._stamp = stamp(self._desk.file)
         seen = await _done(Seen.now, self._desk.file)
+        parse_study((seen.text or "").encode(), self._desk.file)  # what is no TOML is a broken study, and no model card
         desk = await _done(opened, str(self._desk.file), trust=self._desk.trust)
         self._seen, self._source = seen, desk.source
         self._desk = replace(desk, recording=self._desk.recording)
@@ -281,7 +284,10 @@ class Mapper:
         if now == self._stamp or self._banner.visible:
             return
         self._stamp = now
-        if now is None or self._seen == await _done(Seen.now, self._desk.file):
+        if now is None:
+            return
+        if self._seen == await _done(Seen.now, self._desk.file):
+            self._tell("")  # what was wrong with it is mended
             return
         if self._changed:
             self._ask_which(f"{self._desk.file.name} was changed on the disk, and this page holds changes of its own.")
@@ -457,17 +463,18 @@ class Mapper:
 
     def _build_candidates(self, column: Column) -> None:
         """Build a button for each signal that the column may be."""
-        for match in (m for m in (self._matching.proposed if self._matching else ()) if m.column.name == column.name):
-            target = match.target
+        found = self._matching.proposed if self._matching else ()
+        with ui.row().classes("w-full gap-0"):
+            for match in (m for m in found if m.column.name == column.name):
+                target = match.target
 
-            def take(signal: str = target.name, kind: Any = target.kind, base: float | None = match.base) -> None:
-                if self._map is not None:
-                    self._set(self._map.assigned(column.name, signal, kind).stated(signal, "base", base))
+                def take(signal: str = target.name, kind: Any = target.kind, base: float | None = match.base) -> None:
+                    if self._map is not None:
+                        self._set(self._map.assigned(column.name, signal, kind).stated(signal, "base", base))
 
-            base = "" if match.base is None else f", base {match.base:g} {column.unit}"
-            ui.button(f"take as {target.kind} {target.name}{base}", on_click=lambda take=take: take()).props(
-                "flat dense no-caps size=12px"
-            ).tooltip(match.reason)
+                base = "" if match.base is None else f", base {match.base:g} {column.unit}"
+                button = ui.button(f"take as {target.kind} {target.name}{base}", on_click=lambda take=take: take())
+                button.props("flat dense no-caps size=12px").tooltip(match.reason)
 
     def _state(self, signal: str, key: str, value: Any) -> None:
         if self._map is not None:
@@ -574,7 +581,7 @@ class Mapper:
                 told.insert(1, doubt)
                 doubts.add(doubt)
             for line in told:
-                ui.label(line).classes("text-warning text-bold" if line in doubts else "")
+                ui.label(line).style(f"color: {DOUBT}; font-weight: 600" if line in doubts else "")
             with ui.expansion("and of the rest of the study").props("dense").classes("w-full"):
                 for line in (line for line in lines if line not in told):
                     ui.label(line)
@@ -653,7 +660,7 @@ def _about(column: Column) -> str:
     if column.level is None:
         return f"{column.unit}, not recorded"
     noise = f" ± {column.noise:.2g}" if column.noise else ""
-    return f"{'at rest' if column.quiet else 'first'} {column.level:.5g}{noise} {column.unit}"
+    return f"{'at rest' if column.quiet else 'first'} {column.level:.4g}{noise} {column.unit}"
 
 
 TAB = Tab(order=20, title="Recording", build=lambda desk: Mapper(desk).build(), maps=True)
