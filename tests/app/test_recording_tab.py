@@ -40,6 +40,7 @@ def page(browser: Any, folder: Path) -> Iterator[Any]:  # noqa: F811 - the fixtu
     tab.on("pageerror", lambda e: said.append(str(e)))
     tab.set_default_timeout(SECONDS)
     tab.goto(found[0])
+    tab.get_by_text("No limit is active.").wait_for()  # the integrators are compiled, and the server is at rest
     tab.get_by_role("tab", name="Recording").click()
     tab.get_by_text("Drop a recording above").wait_for()
     yield tab
