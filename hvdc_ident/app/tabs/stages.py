@@ -51,6 +51,7 @@ class StageDesk:
 
     def build(self) -> None:
         """Build the tab's elements, which look after the run and the files from then on."""
+        self._panel = ui.context.slot.parent
         with ui.row().classes("w-full no-wrap items-start"):
             with ui.column().classes("gap-1").style("width: 21rem; flex: none"):
                 self._build_folder()
@@ -127,8 +128,8 @@ class StageDesk:
     # --- what is seen ---
 
     async def _look(self) -> None:
-        """Show what has changed since the last look."""
-        if self._busy:
+        """Show what has changed since the last look, while somebody looks."""
+        if self._busy or not self._is_open():
             return
         self._busy = True
         try:
@@ -143,6 +144,11 @@ class StageDesk:
                     self._exports.give(self._folder / "letter.html")
         finally:
             self._busy = False
+
+    def _is_open(self) -> bool:
+        """Return whether the tab is the one that is open: another one's sliders have the processor for themselves."""
+        panels = self._panel.parent_slot.parent if self._panel.parent_slot else None
+        return getattr(panels, "value", TAB.title) == TAB.title
 
     async def _read(self, seen: Any) -> None:
         """Read the study where its files have changed, and the results."""

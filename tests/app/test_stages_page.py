@@ -1,0 +1,160 @@
+"""The tabs Run and Compare in a real browser, on a small study of a card of its own: from nothing to the exported letter."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hvdc_ident as hi
+from tests.app.small_study import LATE, hold, write_small_study
+
+pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_ident[app]'")
+sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+LONG = 120_000  # ms that something may take on a busy machine before a test gives up
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small study whose model waits in a run until the file that `hold` returned is removed."""
+    file = write_small_study(tmp_path_factory.mktemp("study"))
+    hold(file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    program = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if program is None:
+        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is on the path")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def pages(browser: Any, study: Path) -> Iterator[tuple[Any, Any]]:
+    """Two browsers at one study, with the tab Run open; nothing stands in their consoles at the end."""
+    command = [
+        sys.executable,
+        "-c",
+        "from hvdc_ident.cli import main; main()",
+        "app",
+        str(study),
+        "--no-open",
+        "--trust",
+    ]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    address = re.search(r"http://\S+", server.stdout.readline())
+    assert address is not None, server.communicate()
+    opened, said = [], []
+    for _ in range(2):
+        page = browser.new_context(viewport={"width": 1400, "height": 900}).new_page()
+        page.set_default_timeout(LONG)
+        page.on("console", lambda m: said.append(m.text) if m.type == "error" else None)
+        page.on("pageerror", lambda e: said.append(str(e)))
+        page.goto(address[0])
+        page.get_by_role("tab", name="Run", exact=True).click()
+        page.get_by_text("Stages that the study asks for").wait_for()
+        opened.append(page)
+    yield opened[0], opened[1]
+    for page in opened:
+        page.context.close()
+    server.send_signal(signal.SIGINT)
+    _, words = server.communicate(timeout=60)
+    assert server.returncode == 0 and "Traceback" not in words, words
+    assert not said
+
+
+@pytest.fixture(scope="module")
+def ran(pages: tuple[Any, Any], study: Path) -> Any:
+    """The first page, once a run is cancelled and another one has come to its end."""
+    first, second = pages
+    first.get_by_role("button", name="Run all").click()
+    for page in pages:  # both see it, and none can start another one
+        page.get_by_role("button", name="Cancel").wait_for()
+        assert page.get_by_role("button", name="Run all").is_disabled()
+        assert page.get_by_role("button", name="Run fit").is_disabled()
+    second.get_by_role("button", name="Cancel").click()
+    for page in pages:
+        page.get_by_text("Cancelled. What was finished is kept").wait_for()
+    assert not (study.parent / "study-results" / "fit.json").exists()
+    (study.parent / "hold").unlink()
+    second.get_by_role("button", name="Run all").click()
+    first.get_by_role("button", name="Cancel").wait_for()
+    first.get_by_role("button", name="Cancel").wait_for(state="hidden")
+    assert first.get_by_role("alert").first.inner_text() == ""
+    first.get_by_role("button", name="Run fit").get_by_text("Again").wait_for()
+    return first
+
+
+def opened(page: Any, panel: str) -> Any:
+    page.get_by_role("tab", name="Run", exact=True).click()
+    page.get_by_role("tab", name=panel, exact=True).click()
+    return page.get_by_role("tabpanel").last
+
+
+def test_the_fit_on_the_page_is_that_of_the_verb(ran: Any, study: Path) -> None:
+    opened(ran, "Fit")
+    row = ran.get_by_role("row").filter(has_text="1/s").locator("td")
+    row.first.wait_for()
+    value = hi.fit(hi.load_study(study, trust=True)).values["k"]
+    assert float(row.nth(3).inner_text()) == pytest.approx(value, rel=1e-4)
+
+
+def test_a_row_opens_its_profile(ran: Any) -> None:
+    opened(ran, "What the recordings tell")
+    ran.get_by_role("button", name="Profile of k").click()
+    ran.get_by_role("img", name="Profile of k").wait_for()
+
+
+def test_the_size_that_was_found_moves_the_record(ran: Any) -> None:
+    opened(ran, "Diagnosis")
+    slider = ran.get_by_role("slider", name=re.compile("lag_.*_T"))
+    shown = slider.locator("xpath=following-sibling::*[1]")
+    shown.wait_for()
+    found = float(shown.inner_text().split()[0]) / 1000.0  # ms
+    assert found == pytest.approx(LATE, rel=0.2)
+    drawn = "() => getElement(+document.querySelector('[aria-label=\"Record with what was found\"]').id.slice(1)).plots[0].data[3]"
+    ran.wait_for_function(f"({drawn})()?.length === 201")
+    before = ran.evaluate(drawn)
+    slider.locator("[tabindex]").focus()
+    for _ in range(20):
+        ran.keyboard.press("ArrowRight")
+    ran.wait_for_function(f"before => JSON.stringify(({drawn})()) !== JSON.stringify(before)", arg=before)
+
+
+def test_the_next_experiment_is_simulated(ran: Any) -> None:
+    opened(ran, "What to record next")
+    ran.get_by_role("button", name="Simulate it").click()
+    ran.get_by_role("img", name="The experiment as it would be").wait_for()
+
+
+def test_the_letter_and_a_model_are_handed_over(ran: Any) -> None:
+    opened(ran, "Fit")
+    with ran.expect_download() as told:
+        ran.get_by_role("button", name=".mo", exact=True).click()
+    assert told.value.suggested_filename == "study.mo"
+    assert "model" in Path(told.value.path()).read_text()
+    with ran.expect_download() as told:
+        ran.get_by_role("button", name="Letter", exact=True).click()
+    assert told.value.suggested_filename == "letter.html"
+    assert "first-order lag" in Path(told.value.path()).read_text()
+
+
+def test_two_results_are_compared(ran: Any, study: Path) -> None:
+    shutil.copytree(study.parent / "study-results", study.parent / "other-results")
+    ran.get_by_role("tab", name="Compare", exact=True).click()
+    ran.get_by_role("button", name="Look again").click()
+    ran.get_by_text("No value differs beyond both intervals.").wait_for()
