@@ -45,6 +45,7 @@ class StageDesk:
         self._told: StudyRun | None = None
         self._letter: StudyRun | None = None
         self._panels: list[tuple[ResultPanel, Any]] = []
+        self._starts: list[Any] = []
         self._unreadable = ""
 
     # --- the page ---
@@ -167,7 +168,7 @@ class StageDesk:
         if found is None:
             return  # the server is ending
         self._study, stages, self._unreadable = found
-        self._seen = (self._folder, signature(self._study, self._folder), seen[2])
+        self._seen = seen
         self._show_stages(stages)
         data = {s.stage.name: s.data for s in stages if s.data and s.state in ("done", "stale")}
         shown = FoundResults(self._study, self._folder, data)
@@ -179,7 +180,8 @@ class StageDesk:
         working = found is not None and found.outcome == "running"
         for element in (self._progress, self._cancel):
             element.set_visibility(working)
-        self._all.set_enabled(not working)
+        for button in (self._all, *self._starts):
+            button.set_enabled(not working)
         trouble = self._unreadable
         if found is not None and working:
             self._bar.value = found.share
@@ -194,6 +196,7 @@ class StageDesk:
         at_work = RUNS.of(self._folder)
         working = at_work is not None and at_work.outcome == "running"
         self._list.clear()
+        self._starts = []
         with self._list:
             for asked, title in ((True, "Stages that the study asks for"), (False, "Other stages")):
                 group = [s for s in found if s.asked is asked]
@@ -220,6 +223,7 @@ class StageDesk:
                 ui.label(said).classes("text-caption ellipsis w-full").tooltip(said)
             button = ui.button("Again" if state == "done" else "Run", on_click=start).props("flat dense no-caps")
             button.props(f'aria-label="Run {name}"').set_enabled(enabled)
+            self._starts.append(button)
 
 
 def build(desk: Desk) -> None:
