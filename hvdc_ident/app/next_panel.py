@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import run, ui
 
 import hvdc_ident as hi
-from hvdc_ident.app.plot import GIVEN, NOW, Curve, Grid, Plot, thinned
+from hvdc_ident.app.plot import GIVEN, NOW, Grid, Plot, Trace, thinned
 from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_experiments, refitted
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import HvdcIdentError
@@ -117,11 +117,11 @@ class NextExperiment:
 
     def _draw(self, found: PlannedRun, signals: tuple[str, ...]) -> None:
         colors = dict(zip([m.name for m in self._models], (NOW, *COLORS), strict=False))
-        curves = tuple(Curve(n, colors[n], dashed=k > 1) for k, n in enumerate(found.runs))
+        curves = tuple(Trace(n, colors[n], dashed=k > 1) for k, n in enumerate(found.runs))
         time = found.experiment.time
         inputs = found.experiment.inputs
         known = self._study.model.inputs
-        grids = [Grid(f"{n}, {known[n].unit}".rstrip(", "), (Curve("input", GIVEN),)) for n in inputs]
+        grids = [Grid(f"{n}, {known[n].unit}".rstrip(", "), (Trace("input", GIVEN),)) for n in inputs]
         units = {**{n: s.unit for n, s in self._study.model.outputs.items()}}
         grids += [Grid(f"{s}, {units.get(s, '')}".rstrip(", "), curves) for s in signals]
         self._place.clear()

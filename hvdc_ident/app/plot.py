@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from nicegui import ui
+from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 
@@ -34,7 +35,7 @@ HEAD = """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/asse
 
 
 @dataclass(frozen=True)
-class Curve:
+class Trace:
     """One curve of a grid. mark: drawn as points, not as a line."""
 
     name: str
@@ -59,7 +60,7 @@ class Grid:
     """One picture of a plot: its ordinate's title, with the unit, and its curves."""
 
     title: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Trace, ...]
 
 
 class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
@@ -91,7 +92,7 @@ class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
             plane=plane,
             markers=[asdict(m) for m in markers],
         )
-        self._drawn: dict[int, list[list[float | None]]] = {}
+        self._drawn: dict[int, list[NDArray[np.float32]]] = {}
         self.on("ready", self._draw)  # the browser builds a plot when its tab is opened for the first time
 
     def _draw(self) -> None:
@@ -113,17 +114,19 @@ class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
 
     def refine(self, grid: int, columns: Sequence[Array]) -> None:
         """Replace all columns of a grid and go on looking at the same part of it: (n,) each."""
-        self.run_method("refine", grid, [columns[0].tolist(), *(_short(c) for c in columns[1:])])
+        self.run_method("refine", grid, [np.ascontiguousarray(columns[0]), *(_short(c) for c in columns[1:])])
 
     def mark(self, key: str, at: float) -> None:
         """Move a marker."""
         self.run_method("mark", key, at)
 
 
-def _short(values: Array) -> list[float | None]:
-    """Return the values in half the digits, which is more than a screen shows; None where there is no number."""
-    short = values.astype(np.float32).tolist()
-    return short if np.isfinite(values).all() else [v if np.isfinite(v) else None for v in short]
+def _short(values: Array) -> NDArray[np.float32]:
+    """Return the values in half the digits, which is more than a screen shows; what is no number is sent as null.
+
+    As an array, for a list is looked through number by number on its way out.
+    """
+    return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def thinned(x: Array, *ys: Array, most: int = MOST) -> list[Array]:

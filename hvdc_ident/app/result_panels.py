@@ -11,7 +11,7 @@ from nicegui import ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.next_panel import NextExperiment
-from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Curve, Grid, Plot, thinned
+from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Grid, Plot, Trace, thinned
 from hvdc_ident.app.result_tables import (
     finding_table,
     gap_table,
@@ -128,10 +128,10 @@ class Identifiability(ResultPanel):
             unit = data["parameters"].get(name, {}).get("unit", "")
             ui.label(f"Profile of {name}: the least cost over all other parameters").classes("text-subtitle2")
             curves = (
-                Curve("rise of the cost", NOW),
-                Curve("computed", NOW, mark="dot", size=6),
-                Curve("95 % level", GIVEN, dashed=True),
-                Curve("ends of the interval", RECORDED, mark="ring", size=10),
+                Trace("rise of the cost", NOW),
+                Trace("computed", NOW, mark="dot", size=6),
+                Trace("95 % level", GIVEN, dashed=True),
+                Trace("ends of the interval", RECORDED, mark="ring", size=10),
             )
             grid = Grid("rise of the cost / 95 % level", curves)
             plot = Plot([grid], f"{name}, {unit}" if unit else name, 330, f"Profile of {name}").classes("w-full")
@@ -179,7 +179,7 @@ class Fitted(ResultPanel):
         place.clear()
         with place:
             sets = tuple(n for n in SETS if any(n in o.runs for o in overlays))
-            curves = [Curve("recorded", RECORDED), *(Curve(WORDS[n], SETS[n][0], dashed=SETS[n][1]) for n in sets)]
+            curves = [Trace("recorded", RECORDED), *(Trace(WORDS[n], SETS[n][0], dashed=SETS[n][1]) for n in sets)]
             grids = [Grid(o.title, tuple(curves)) for o in overlays]
             plot = Plot(grids, "time, s", TALL * len(grids) + 30, f"Waveforms of {experiment}").classes("w-full")
             for k, overlay in enumerate(overlays):

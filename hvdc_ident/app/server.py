@@ -88,7 +88,12 @@ def serve(
         )
         here = (*LOOPBACK, host)
         server = uvicorn.Server(
-            uvicorn.Config(Guard(outer, token, here, MOST_BYTES), log_level="warning", timeout_graceful_shutdown=1)
+            uvicorn.Config(
+                Guard(outer, token, here, MOST_BYTES),
+                log_level="warning",
+                timeout_graceful_shutdown=1,
+                ws_per_message_deflate=False,
+            )
         )
         ready(f"http://{host}:{listening.getsockname()[1]}/?token={token}")
         with suppress(KeyboardInterrupt):  # the way in which it is meant to end

@@ -21,7 +21,7 @@ KINDS: tuple[Kind, ...] = ("constant", "step", "ramp", "multisine")
 
 
 @dataclass(frozen=True)
-class Course:
+class InputCourse:
     """An input over time. level: before the event; size: by how much it moves (of a multisine its amplitude), both in the
     input's unit; at: the event, s; length: of a ramp, s, and of a multisine its longest period."""
 
@@ -55,7 +55,7 @@ class Setting:
 
     model: AnyModel
     values: FrozenMap[float] = field(default_factory=FrozenMap)
-    courses: FrozenMap[Course] = field(default_factory=FrozenMap)
+    courses: FrozenMap[InputCourse] = field(default_factory=FrozenMap)
     end: float = 1.0
     rows: int = 1001
     outputs: tuple[str, ...] = ()
@@ -67,7 +67,7 @@ class Setting:
     @classmethod
     def of(cls, model: AnyModel, record: Experiment | None = None) -> Setting:
         """Return the setting that a model begins with: a step of its first input by 2 % of its level, or of 0.02."""
-        inputs = {n: Course(level=i.value) for n, i in model.inputs.items()}
+        inputs = {n: InputCourse(level=i.value) for n, i in model.inputs.items()}
         first = next(iter(inputs), "")
         if first:
             inputs[first] = replace(inputs[first], kind="step", size=0.02 * (abs(inputs[first].level) or 1.0))
@@ -97,7 +97,7 @@ class Setting:
         """Return the setting with another value of a parameter."""
         return replace(self, values=self.values | {name: value})
 
-    def with_course(self, name: str, course: Course) -> Setting:
+    def with_course(self, name: str, course: InputCourse) -> Setting:
         """Return the setting with another course of an input."""
         return replace(self, courses=self.courses | {name: course})
 

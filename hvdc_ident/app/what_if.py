@@ -12,7 +12,7 @@ from nicegui import run, ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.latest import Latest
-from hvdc_ident.app.plot import GIVEN, RECORDED, Curve, Grid, Plot, thinned
+from hvdc_ident.app.plot import GIVEN, RECORDED, Grid, Plot, Trace, thinned
 from hvdc_ident.app.setting import Setting, span_of
 from hvdc_ident.app.supposed import Supposition, refitted
 from hvdc_ident.data import Array
@@ -156,9 +156,9 @@ class WhatIf:
         outputs = tuple(self._record.outputs)
         self._place.clear()
         curves = (
-            Curve("recorded", RECORDED),
-            Curve("refitted without it", GIVEN, dashed=True),
-            Curve("with it", EFFECT),
+            Trace("recorded", RECORDED),
+            Trace("refitted without it", GIVEN, dashed=True),
+            Trace("with it", EFFECT),
         )
         with self._place:
             units = {o: self._study.model.outputs[o].unit for o in outputs}

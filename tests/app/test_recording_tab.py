@@ -16,7 +16,7 @@ pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_id
 
 import hvdc_ident as hi
 from tests.app.test_mapping import recording
-from tests.app.test_workbench import DESK, SECONDS, browser  # noqa: F401 - a fixture
+from tests.app.test_workbench import DESK, SECONDS
 
 SERVE = [sys.executable, "-c", "from hvdc_ident.cli import main; main()", "app", "--no-open"]
 EVENT = "[aria-label='event, s'][role=slider]"
@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def page(browser: Any, folder: Path) -> Iterator[Any]:  # noqa: F811 - the fixture
+def page(browser: Any, folder: Path) -> Iterator[Any]:
     """The tab of a workbench that was opened with a model alone; nothing stands in its console."""
     server = subprocess.Popen(SERVE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder)
     assert server.stdout is not None

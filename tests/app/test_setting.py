@@ -10,14 +10,14 @@ import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.app.desk import opened
-from hvdc_ident.app.setting import Course, Setting, near, span_of, with_effect
+from hvdc_ident.app.setting import InputCourse, Setting, near, span_of, with_effect
 from hvdc_ident.errors import InputError
 
 LINK = hi.load_model("vsc-hvdc-link")
 
 
 def test_a_setting_runs_the_model_with_its_values_and_courses() -> None:
-    setting = Setting.of(LINK).with_value("KIVDC", 900.0).with_course("Pref2", Course("ramp", 0.4, 0.1, 0.2, 0.3))
+    setting = Setting.of(LINK).with_value("KIVDC", 900.0).with_course("Pref2", InputCourse("ramp", 0.4, 0.1, 0.2, 0.3))
     ran = setting.run()
     steps = {"Vdcref1": hi.step(1.0, 1.02, at=0.1), "Pref2": hi.ramp(0.4, 0.5, start=0.2, end=0.5)}
     expected = hi.simulate(LINK, np.linspace(0.0, 1.0, 1001), {"KIVDC": 900.0}, inputs=steps)
@@ -26,7 +26,7 @@ def test_a_setting_runs_the_model_with_its_values_and_courses() -> None:
 
 
 def test_the_linear_model_stands_at_the_levels_before_the_event() -> None:
-    setting = Setting.of(LINK).with_course("Pref2", Course("step", 0.5, 0.2)).with_value("KPVDC", 30.0)
+    setting = Setting.of(LINK).with_course("Pref2", InputCourse("step", 0.5, 0.2)).with_value("KPVDC", 30.0)
     point = setting.point()
     assert point.outputs["P2"] == pytest.approx(0.5, abs=1e-9)
     expected = hi.linearize(LINK, hi.find_operating_point(LINK, {"Pref2": 0.5}, parameters={"KPVDC": 30.0}))

@@ -19,7 +19,6 @@ from tests.app.small_study import LATE, hold, write_small_study
 pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_ident[app]'")
 sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 LONG = 120_000  # ms that something may take on a busy machine before a test gives up
 
 
@@ -29,17 +28,6 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = write_small_study(tmp_path_factory.mktemp("study"))
     hold(file)
     return file
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    program = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if program is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is on the path")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
-        yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")

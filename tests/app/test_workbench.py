@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +15,6 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_ident[app]'")
 sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 DESK = {"width": 1400, "height": 900}
 SECONDS = 60_000  # ms that a page may take on a busy machine before a test gives up
 
@@ -37,17 +35,6 @@ def address() -> Iterator[str]:
     _, said = server.communicate(timeout=60)
     assert server.returncode == 0, said
     assert "Traceback" not in said
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    program = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if program is None:
-        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is on the path")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
-        yield started
-        started.close()
 
 
 @pytest.fixture

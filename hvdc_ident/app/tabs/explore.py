@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -13,9 +14,9 @@ from nicegui import background_tasks, run, ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.desk import Desk
-from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Curve, Grid, Plot, scattered, thinned
+from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Grid, Plot, Trace, scattered, thinned
 from hvdc_ident.app.server import Tab
-from hvdc_ident.app.setting import KINDS, Course, Setting, equations_of, near, span_of, with_effect
+from hvdc_ident.app.setting import KINDS, InputCourse, Setting, equations_of, near, span_of, with_effect
 from hvdc_ident.data import Array
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
@@ -81,7 +82,7 @@ class Explorer:
         self._moving = ""
         self._omega: Array | None = None
         self._ringed = self._locus = self._now = NONE
-        self._sliders: dict[str, Callable[[float], None]] = {}
+        self._sliders: dict[str, Callable[[float, bool], None]] = {}
 
     # --- the page ---
 
@@ -99,13 +100,13 @@ class Explorer:
                 self._build_choices()
                 self._waves = ui.element("div").classes("w-full")
                 with ui.row().classes("w-full no-wrap gap-0"):
-                    two = (Curve("given", GIVEN, dashed=True), Curve("now", NOW))
+                    two = (Trace("given", GIVEN, dashed=True), Trace("now", NOW))
                     grids = [Grid("gain, dB", two), Grid("phase, degrees", two)]
                     self._bode = Plot(grids, "frequency, Hz", 350, "Frequency response", log=True).classes("col-7")
                     marks = (
-                        Curve("locus", GIVEN, mark="dot", size=3),
-                        Curve("given", GIVEN, mark="ring", size=9),
-                        Curve("now", NOW, mark="cross"),
+                        Trace("locus", GIVEN, mark="dot", size=3),
+                        Trace("given", GIVEN, mark="ring", size=9),
+                        Trace("now", NOW, mark="cross"),
                     )
                     plane = [Grid("imaginary part, rad/s", marks)]
                     self._poles = Plot(plane, "real part, 1/s", 350, "Poles", plane=True).classes("col-5")
@@ -212,8 +213,12 @@ class Explorer:
         def moved(event: Any) -> None:
             self._set(self._setting.with_value(name, back(float(event.args))), moving=name)
 
-        def put(value: float) -> None:
-            shown.text = quantity(value, q.unit)
+        def put(value: float, moving: bool) -> None:
+            text = quantity(value, q.unit)
+            if moving:  # the slider stands there already, and a change of an element draws the whole page anew
+                shown.client.run_javascript(f"getHtmlElement({shown.id}).textContent = {json.dumps(text)}")
+                return
+            shown.text = text
             if not math.isclose(slider.value, to(value), rel_tol=1e-9, abs_tol=1e-12):
                 slider.value = to(value)
 
@@ -259,7 +264,7 @@ class Explorer:
     def _course_field(self, name: str, key: str, value: Any, options: Any) -> None:
         def changed(event: Any) -> None:
             if event.value is not None:
-                course: Course = replace(self._setting.courses[name], **{key: event.value})
+                course: InputCourse = replace(self._setting.courses[name], **{key: event.value})
                 self._set(self._setting.with_course(name, course))
 
         if options:
@@ -274,8 +279,8 @@ class Explorer:
     def _build_waves(self) -> None:
         self._waves.clear()
         units = {n: self._setting.model.outputs[n].unit for n in self._setting.outputs}
-        curves = [Curve("given", GIVEN, dashed=True), Curve("now", NOW)]
-        curves += [Curve("recorded", RECORDED)] if self._setting.record else []
+        curves = [Trace("given", GIVEN, dashed=True), Trace("now", NOW)]
+        curves += [Trace("recorded", RECORDED)] if self._setting.record else []
         grids = [Grid(f"{n}, {u}" if u else n, tuple(curves)) for n, u in units.items()]
         with self._waves:
             self._wave = Plot(grids, "time, s", 400, "Waveforms").classes("w-full")
@@ -288,9 +293,8 @@ class Explorer:
         before, self._setting, self._moving = self._setting, setting, moving
         if rebuilt or before.model is not setting.model:
             self._build_knobs()
-        for name, put in self._sliders.items():
-            if name == moving or not moving:
-                put(setting.parameters[name])
+        for name, put in ({} if moving else self._sliders).items():
+            put(setting.parameters[name], False)
         self._ask()
 
     def _remember(self) -> None:
@@ -335,12 +339,15 @@ class Explorer:
                 await asyncio.sleep(0)
         finally:
             self._busy = False
+        number = self._asked
         await asyncio.sleep(REST)
-        if self._shown == self._asked and not self._busy:
+        if number == self._asked == self._shown and not self._busy:
             await self._show_slow()
 
     def _show(self, setting: Setting, answer: Answer) -> None:
-        """Replace what is drawn of the setting as it is now."""
+        """Replace what is drawn of the setting as it is now, all in one message."""
+        if put := self._sliders.get(self._moving):
+            put(setting.parameters[self._moving], True)
         self._trouble.text = "; ".join(answer.trouble.values())
         if answer.run is not None:
             for k, name in enumerate(setting.outputs):
@@ -352,8 +359,10 @@ class Explorer:
         self._poles.whole(0, scattered(self._locus, self._ringed, self._now))
         if answer.point is not None:
             active = answer.point.active_limits
-            self._limits.text = f"On a limit: {', '.join(map(str, active))}" if active else "No limit is active."
-            self._limits.classes(replace="text-negative text-bold" if active else "")
+            text = f"On a limit: {', '.join(map(str, active))}" if active else "No limit is active."
+            if text != self._limits.text:
+                self._limits.text = text
+                self._limits.classes(replace="text-negative text-bold" if active else "")
 
     def _show_given(self, answer: Answer) -> None:
         """Draw what the page began with, beside which the rest is seen; of the setting now the same, until that is known."""

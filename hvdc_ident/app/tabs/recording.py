@@ -25,7 +25,7 @@ from hvdc_ident.app.mapping import (
     proposed,
     write_mapping,
 )
-from hvdc_ident.app.plot import NOW, RECORDED, Curve, Grid, Marker, Plot, focused, sketch, thinned
+from hvdc_ident.app.plot import NOW, RECORDED, Grid, Marker, Plot, Trace, focused, sketch, thinned
 from hvdc_ident.app.server import Tab
 from hvdc_ident.app.study_folder import (
     MOST_BYTES,
@@ -487,7 +487,7 @@ class Mapper:
             return
         grids = [
             Grid(
-                f"{name}, {unit}" if (unit := self._record.unit(name)) else name, (Curve(self._roles(name), RECORDED),)
+                f"{name}, {unit}" if (unit := self._record.unit(name)) else name, (Trace(self._roles(name), RECORDED),)
             )
             for name in self._drawn()
         ]
