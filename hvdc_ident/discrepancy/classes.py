@@ -12,7 +12,8 @@ import numpy as np
 
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
-from hvdc_ident.discrepancy.explain import advice
+from hvdc_ident.discrepancy.explain import advice, sentence
+from hvdc_ident.discrepancy.formula import filled
 from hvdc_ident.discrepancy.options import SURE, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, Hypothesis, Place, Rival
@@ -268,32 +269,34 @@ def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
     )
 
 
-def finding(found: Round, one: EffectClass, sentence: str) -> Finding:
-    """The class as it is told. sentence: what the likeliest member does."""
+def finding(found: Round, one: EffectClass, told: str = "") -> Finding:
+    """The class as it is told: what its likeliest member does, and where else it may be.
+
+    told: what that does, with the sizes beside all other effects, where it was put in; else as its own refit has them.
+    """
     best = one.members[0][0]
     refits = {_key_of(t.refit): t.refit for t in found.trials}
-    told = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
+    likely_ones = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
     parameters = {}
     for n, q in effects()[best.effect].parameters.items():
         if n not in best.parameters or (q.optional and best.parameters[n] == q.neutral):
             continue
-        same = [r for r, _ in told if r.effect == best.effect and (q.unit in SHARED or r is best)]
+        same = [r for r, _ in likely_ones if r.effect == best.effect and (q.unit in SHARED or r is best)]
         spans = [s for r in same if (s := _span(refits.get((r.effect, r.at, r.source)), n)) is not None]
         # At a place where the size is another, of other sign say, it is no uncertainty of this one.
         alike = [s for s in spans if s[0] <= best.parameters[n] <= s[1]]
         interval = (min(low for low, _ in alike), max(high for _, high in alike)) if alike else None
         parameters[n] = EffectSize(best.parameters[n], interval, q.unit)
     by_place: dict[tuple[tuple[str, ...], str], float] = {}
-    for r, p in told:
+    for r, p in likely_ones:
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
     places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
-    delays = [late for r, _ in told if (late := r.late) is not None]
+    delays = [late for r, _ in likely_ones if (late := r.late) is not None]
     delay = (min(delays), max(delays)) if delays else None
-    sentence = sentence or f"{best.effect} at {listed(best.at)}"
-    others = [n for n in dict.fromkeys(r.effect for r, _ in told if r.refitted) if n != best.effect]
+    others = [n for n in dict.fromkeys(r.effect for r, _ in likely_ones if r.refitted) if n != best.effect]
     other = f", or another kind of delay as long ({', '.join(others)})" if others and best.late is not None else ""
     return Finding(
-        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(sentence, parameters, best, places, other),
+        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(told, parameters, best, places, other),
         None if best.late is None else EffectSize(best.late, delay, "s"),
     )  # fmt: skip
 
@@ -315,17 +318,18 @@ def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
     return max(value - 1.96 * std, q.min), min(value + 1.96 * std, q.max)
 
 
-def _text(sentence: str, parameters: dict[str, EffectSize], best: Rival, places: Sequence[Place], other: str) -> str:
-    """The sentence, which tells of the best hypothesis, with the first interval, other kinds of the effect, and other places."""
+def _text(told: str, parameters: dict[str, EffectSize], best: Rival, places: Sequence[Place], other: str) -> str:
+    """What the best hypothesis does, with the first interval, other kinds of the effect, and other places."""
+    told = told or sentence(best, best.parameters, filled(best.expression, best.parameters))
     size = next((s for s in parameters.values() if s.ci95 is not None and None not in s.ci95), None)
     if size is not None and size.ci95 is not None:
         low, high = (quantity(v, size.unit) for v in size.ci95 if v is not None)
-        sentence = f"{sentence} (95 %: {low} to {high})"
+        told = f"{told} (95 %: {low} to {high})"
     places_too = list(dict.fromkeys(listed(p.at) for p in places if p.at != best.at))
     sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source != best.source))
     apart = [f"this place from {_some(places_too)}"] if places_too else []
     apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if sources_too else []
-    return f"{sentence}{other}; the records do not tell {', nor '.join(apart)}." if apart else f"{sentence}{other}."
+    return f"{told}{other}; the records do not tell {', nor '.join(apart)}." if apart else f"{told}{other}."
 
 
 def _brought(source: str, at: Sequence[str]) -> str:

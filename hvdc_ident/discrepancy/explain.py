@@ -12,8 +12,9 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
-from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Table
-from hvdc_ident.effects import effects
+from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, Table
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.uncertainty import uncertainty
@@ -35,7 +36,7 @@ def found_of(refit: Refit, placed: Placed, chosen_from: int) -> FoundEffect:
             interval = None if std is None else _within(sizes[n] - 1.96 * std, sizes[n] + 1.96 * std, q.min, q.max)
             shown[n] = EffectSize(sizes[n], interval, q.unit)
     return FoundEffect(
-        placed.candidate.effect, placed.candidate.at, FrozenMap(shown), sentence(placed, sizes), chosen_from,
+        placed.candidate.effect, placed.candidate.at, FrozenMap(shown), sentence(placed.candidate, sizes), chosen_from,
         placed.candidate.source,
     )  # fmt: skip
 
@@ -44,15 +45,16 @@ def _within(low: float, high: float, least: float, most: float) -> tuple[float, 
     return max(low, least), min(high, most)
 
 
-def sentence(placed: Placed, sizes: Mapping[str, float]) -> str:
-    """The effect's sentence from the catalogue, filled in."""
-    entry = effects()[placed.candidate.effect]
+def sentence(of: CandidateEffect | Rival, sizes: Mapping[str, float], expression: str = "") -> str:
+    """The effect's sentence from the catalogue, filled in; without sizes its name and place. expression: of a term, filled in."""
+    entry = effects()[of.effect]
+    if not sizes:
+        return f"{of.effect} at {listed(of.at)}"
     units = {n: q.unit for n, q in entry.parameters.items()}
     words = {n: quantity(v, units.get(n, "")) for n, v in sizes.items()}
-    at = placed.candidate.at
-    own = dict.fromkeys(placed.candidate.sources)
-    brought = f"its own of {listed(tuple(own))}" if len(own) > 1 else placed.candidate.source
-    words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought}
+    at, own = of.at, dict.fromkeys(split_sources(of.source, of.at))
+    brought = f"its own of {listed(tuple(own))}" if len(own) > 1 else of.source
+    words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought, "expression": expression}
     if (late := entry.delay_with(sizes)) is not None:
         words["equivalent_delay"] = quantity(late, "s")
     absent = {n for n, q in entry.parameters.items() if q.optional and sizes.get(n, q.neutral) == q.neutral}

@@ -132,13 +132,13 @@ def formula_job(before: Refit, place: str, chosen: Sequence[Term], coefficients:
 
 def labelled(refit: Refit) -> str:
     """The formula that a refit ends with, and where."""
-    return f"{filled(refit.placed[-1], refit)} at {refit.placed[-1].candidate.at[0]}"
+    placed = refit.placed[-1]
+    return f"{filled(placed.use.expression, refit.sizes(placed))} at {placed.candidate.at[0]}"
 
 
-def filled(placed: Placed, refit: Refit) -> str:
-    """The formula with its coefficients as they came out."""
-    text = placed.use.expression
-    for n, value in refit.sizes(placed).items():
+def filled(text: str, sizes: Mapping[str, float]) -> str:
+    """A formula with its coefficients as they came out."""
+    for n, value in sizes.items():
         text = text.replace(f"{n}*", f"{value:.4g}*")
     return text.replace("+ -", "- ")
 

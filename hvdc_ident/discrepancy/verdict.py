@@ -129,8 +129,8 @@ def findings_of(
     for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
         for one in likely(classes(group)):
             best = one.members[0][0]
-            sentence = own.text if (best.effect, best.at, best.source) == (own.effect, own.at, own.source) else ""
-            found.append(replace(finding(of, one, sentence), share=share))
+            put_in = (best.effect, best.at, best.source) == (own.effect, own.at, own.source)
+            found.append(replace(finding(of, one, own.text if put_in else ""), share=share))
     freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
     if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
         found.append(replace(moved, share=share))

@@ -107,7 +107,7 @@ def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(m
 )
 def test_a_sentence_leaves_out_the_parts_that_are_not_there(values: dict[str, float], told: str) -> None:
     placed = beside(plain(experiments()), "loss", "drag", values, {"b": (-3.0, 3.0)}, source="w").placed[-1]
-    assert sentence(placed, values) == told
+    assert sentence(placed.candidate, values) == told
 
 
 def test_a_finding_tells_places_and_sources_apart() -> None:
@@ -118,6 +118,8 @@ def test_a_finding_tells_places_and_sources_apart() -> None:
         Place(("Uref1", "Uref2"), 0.3, "iq1, iq2"),
     ]
     told = rated._text("It couples", {}, best, places, "")
+    own = rated._text("", {}, best, places[:1], "")
+    assert own == "Each of eq1 and eq2 takes 0.1 of the change of its own of Q1f and Q2f."
     assert (
         told == "It couples; the records do not tell this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2."
     )

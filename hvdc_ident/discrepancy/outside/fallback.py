@@ -87,7 +87,11 @@ def _formula_found(found: Law) -> Fallback:
     refit = found.refit
     placed = refit.placed[-1]
     (place,) = placed.candidate.at
-    text = effects()["term"].sentence.replace("{at}", place).replace("{expression}", filled(placed, refit))
+    text = (
+        effects()["term"]
+        .sentence.replace("{at}", place)
+        .replace("{expression}", filled(placed.use.expression, refit.sizes(placed)))
+    )
     said = [f"Found from the data, outside the catalogue: {text}."]
     if found.others:
         said.append(f"As good: {listed([labelled(r) for r in found.others])}.")
