@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import hvdc_ident as hi
@@ -25,7 +25,7 @@ class Desk:
 
     source: of the model, a shipped name or a path. file: the study file, which is made by writing a study where there is none.
     recording: to be mapped, where the desk was opened with one. trust: whether a model that is Python code may be run.
-    read_at: the stamp of the study file that was read.
+    read_at: the stamp of the study file that was read. why: what is wrong with the study file, where it cannot be read.
     """
 
     title: str
@@ -38,6 +38,7 @@ class Desk:
     recording: Path | None = None
     trust: bool = False
     read_at: tuple[int, int, int] | None = None
+    why: str = ""
 
     def renewed(self) -> Desk:
         """Return the desk with the study as its file is now; the same where there is none, or one that cannot be read."""
@@ -45,8 +46,8 @@ class Desk:
             return self
         try:
             return opened(str(self.file), trust=self.trust)
-        except InputError:
-            return self  # the tab with the study's recordings tells what is wrong with it, and stays until it is mended
+        except InputError as error:
+            return replace(self, why=str(error))  # until it is mended the page shows what it had
 
 
 def opened(source: str | None = None, *, trust: bool = False) -> Desk:

@@ -102,3 +102,14 @@ def test_a_card_a_study_and_a_shipped_model_are_opened(tmp_path: Path) -> None:
     assert desk.study is not None and desk.spans["b"] == (0.1, 2.0)
     with pytest.raises(InputError):
         opened(str(tmp_path / "nothing.toml"))
+
+
+def test_a_study_that_cannot_be_read_says_why_and_is_read_once_it_is_mended(tmp_path: Path) -> None:
+    file = tmp_path / "vsc-hvdc-link-study" / "study.toml"
+    desk = replace(opened(), file=file)
+    assert desk.renewed() is desk
+    file.parent.mkdir()
+    file.write_text('schema = 1\nname = "s"\n[model]\nsource = "vsc-hvdc-lonk"\n', "utf-8")
+    assert "vsc-hvdc-lonk" in desk.renewed().why and desk.renewed().study is None
+    file.write_text('schema = 1\nname = "s"\n[model]\nsource = "vsc-hvdc-link"\n', "utf-8")
+    assert desk.renewed().study is not None and desk.renewed().why == ""

@@ -14,7 +14,7 @@ from hvdc_ident.cli import app
 from hvdc_ident.study.json_schema import card_keys, study_keys
 
 ROOT = Path(__file__).resolve().parents[2]
-WITHOUT_BLOCKS = ("index.md", "report.md")
+WITHOUT_BLOCKS = ("workbench.md", "index.md", "report.md")
 GUIDES = sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in WITHOUT_BLOCKS)
 TOML = re.compile(r"^ *```toml\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -229,7 +229,7 @@ class StageDesk:
 def build(desk: Desk) -> None:
     """Build the tab: of a study its stages, else what to do."""
     if desk.study is None:
-        ui.markdown(NO_STUDY)
+        ui.markdown(desk.why or NO_STUDY)
         return
     StageDesk(desk, desk.study).build()
 
