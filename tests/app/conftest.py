@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.app.runs import Runs, StudyRun
 from tests.app.small_study import SECONDS, write_small_study
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled() -> None:
+    """The integrators, compiled before a server of a test is waited for: of a fresh installation that takes half a minute."""
+    model = hi.load_model("vsc-hvdc-link")
+    hi.simulate(model, np.linspace(0.0, 0.1, 3))
+    hi.find_operating_point(model)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ import hvdc_ident as hi
 from tests.app.small_study import CARD, write_small_study
 from tests.app.test_mapping import recording
 
-LONG = 60_000  # ms that something may take on a busy machine before a test gives up
+LONG = 120_000  # ms that something may take on a busy machine before a test gives up
 STAGES = """[fit]
 starts = 1
 [diagnose]
