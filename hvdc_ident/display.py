@@ -74,6 +74,14 @@ class Shown:
         blocks = (str(b) if isinstance(b, Table) else _wrapped(b) for b in self._screen())
         return "\n\n".join(b for b in blocks if b)
 
+    @property
+    def lines(self) -> list[str]:
+        """The screen as lines, which are as long as they are."""
+        found: list[str] = []
+        for block in self._screen():
+            found += [*str(block).splitlines(), ""] if str(block) else []
+        return found[:-1]
+
     def __repr__(self) -> str:
         headline, kind = str(next(iter(self._screen()), "")).splitlines()[0], type(self).__name__
         return f"<{headline}>" if headline.startswith(kind) else f"<{kind}: {headline}>"

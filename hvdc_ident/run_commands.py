@@ -43,8 +43,8 @@ def demo(
     """Calibrate the shipped link on recordings made here."""
     from hvdc_ident.study.demo_truth import truth_lines
     from hvdc_ident.study.examples import write_demo, write_truth
+    from hvdc_ident.study.pipeline import run_study
     from hvdc_ident.study.study import load_study
-    from hvdc_ident.study.whole_run import run_study
 
     with console.progress() as progress:
         options = work.options(console, progress)
@@ -71,7 +71,7 @@ def run(
 
     A second run redoes only what changed; after a kill it goes on.
     """
-    from hvdc_ident.study.whole_run import run_study
+    from hvdc_ident.study.pipeline import run_study
 
     loaded = access.study(study)
     folder = out or loaded.folder

@@ -20,6 +20,11 @@ def quantity(value: float, unit: str = "", digits: int = 4) -> str:
     return f"{value:.{digits}g} {unit}".rstrip()
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Return a name with its unit, as axes and legends have it; the name alone where there is no unit."""
+    return f"{name}, {unit}" if unit else name
+
+
 def duration(seconds: float) -> str:
     """Return a waiting time in s, min or h with two digits."""
     for above, unit in ((3600.0, "h"), (60.0, "min")):

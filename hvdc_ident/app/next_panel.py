@@ -14,6 +14,7 @@ from hvdc_ident.app.plot import GIVEN, NOW, Grid, Plot, Trace, thinned
 from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_experiments, refitted
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.text import with_unit
 
 COLORS = ("#2a9d5c", "#b0569f", "#c2452d", "#8a6d1f", "#3a8f98")
 """Colours of the rivals."""
@@ -121,9 +122,9 @@ class NextExperiment:
         time = found.experiment.time
         inputs = found.experiment.inputs
         known = self._study.model.inputs
-        grids = [Grid(f"{n}, {known[n].unit}".rstrip(", "), (Trace("input", GIVEN),)) for n in inputs]
-        units = {**{n: s.unit for n, s in self._study.model.outputs.items()}}
-        grids += [Grid(f"{s}, {units.get(s, '')}".rstrip(", "), curves) for s in signals]
+        grids = [Grid(with_unit(n, known[n].unit), (Trace("input", GIVEN),)) for n in inputs]
+        units = {n: s.unit for n, s in self._study.model.outputs.items()}
+        grids += [Grid(with_unit(s, units.get(s, "")), curves) for s in signals]
         self._place.clear()
         with self._place:
             plot = Plot(grids, "time, s", TALL * len(grids) + 30, "The experiment as it would be").classes("w-full")

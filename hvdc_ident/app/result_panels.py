@@ -28,6 +28,7 @@ from hvdc_ident.fit.result import FIT_WORDS
 from hvdc_ident.report.overlay import WORDS, overlay_of
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.run_summary import values_table
+from hvdc_ident.text import with_unit
 
 SETS = {"given": (GIVEN, True), "fitted": (NOW, False), "effect": (EFFECT, False)}
 """Sets of values whose runs are drawn, with their colour and whether dashed."""
@@ -134,7 +135,7 @@ class Identifiability(ResultPanel):
                 Trace("ends of the interval", RECORDED, mark="ring", size=10),
             )
             grid = Grid("rise of the cost / 95 % level", curves)
-            plot = Plot([grid], f"{name}, {unit}" if unit else name, 330, f"Profile of {name}").classes("w-full")
+            plot = Plot([grid], with_unit(name, unit), 330, f"Profile of {name}").classes("w-full")
             plot.whole(0, profile_columns(profiles[name]))
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import hvdc_ident as hi
+from hvdc_ident.app.study_folder import stamp
 from hvdc_ident.app.worker import EVERYTHING, GRACE
 from hvdc_ident.errors import InputError
 from hvdc_ident.executor import times_of
@@ -90,18 +91,16 @@ def _holds_results(folder: Path) -> bool:
         return False
 
 
-def signature(study: hi.Study, folder: Path) -> tuple[tuple[int, int], ...]:
-    """Return what changes whenever a file of the study or a stage's result does: times and sizes."""
+def folder_name(study: hi.Study, folder: Path) -> str:
+    """Return what a folder of results is called on the page."""
+    home = study.path.resolve().parent
+    return f"{folder.name} (the study's folder)" if folder == home else folder.name
+
+
+def signature(study: hi.Study, folder: Path) -> tuple[tuple[int, int, int] | None, ...]:
+    """Return what changes whenever a file of the study or a stage's result does: their stamps."""
     files = [study.path.parent / name for name in study.sources] + [folder / s.file for s in stages()]
-    return tuple(_stamp(f) for f in files)
-
-
-def _stamp(file: Path) -> tuple[int, int]:
-    try:
-        found = file.stat()
-    except OSError:
-        return 0, 0
-    return found.st_mtime_ns, found.st_size
+    return tuple(stamp(f) for f in files)
 
 
 class StudyRun:

@@ -17,7 +17,7 @@ from hvdc_ident.app.setting import Setting, span_of
 from hvdc_ident.app.supposed import Supposition, refitted
 from hvdc_ident.data import Array
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.text import quantity
+from hvdc_ident.text import quantity, with_unit
 
 EFFECT = "#2a9d5c"
 """Colour of curves with the effect."""
@@ -162,7 +162,7 @@ class WhatIf:
         )
         with self._place:
             units = {o: self._study.model.outputs[o].unit for o in outputs}
-            grids = [Grid(f"{o}, {u}" if u else o, curves) for o, u in units.items()]
+            grids = [Grid(with_unit(o, u), curves) for o, u in units.items()]
             self._plot = Plot(grids, "time, s", TALL * len(grids) + 30, "Record with what was found").classes("w-full")
 
     def _ask(self) -> None:

@@ -46,10 +46,9 @@ def work(study_file: Path, folder: Path, what: str, trust: bool, tell: Tell) -> 
     Raises as the study's reader, `run_stage`, `run_all` and `letter`.
     """
     from hvdc_ident.study.export import letter
-    from hvdc_ident.study.pipeline import run_stage
+    from hvdc_ident.study.pipeline import run_stage, run_study
     from hvdc_ident.study.stages import StageOptions
     from hvdc_ident.study.study import load_study
-    from hvdc_ident.study.whole_run import run_study
 
     def announce(lines: Sequence[str]) -> None:
         tell({"say": list(lines)})

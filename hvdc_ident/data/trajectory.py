@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import WaveformError, unknown_name
+from hvdc_ident.text import with_unit
 
 Array = NDArray[np.float64]
 
@@ -101,7 +102,7 @@ class Trajectory(Shown):
         axes = axes_of(ax)
         for name in self.names if names is None else [names] if isinstance(names, str) else names:
             unit = self.unit(name)
-            axes.plot(self.time, self[name], label=f"{name}, {unit}" if unit else name)
+            axes.plot(self.time, self[name], label=with_unit(name, unit))
         axes.set_xlabel("time, s")
         axes.legend(fontsize="small")
         return axes

@@ -23,6 +23,7 @@ from hvdc_ident.report.drawing import (
     zoomable,
 )
 from hvdc_ident.report.results import Results
+from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,7 +120,7 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
 
 
 def _error_title(unit: str) -> str:
-    return f"error, {unit}" if unit else "error"
+    return with_unit("error", unit)
 
 
 @dataclass(frozen=True, eq=False)

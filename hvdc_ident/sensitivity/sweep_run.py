@@ -36,6 +36,7 @@ from hvdc_ident.sensitivity.sweep_points import (
     points_of,
     task_of,
 )
+from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
     import xarray
@@ -219,7 +220,7 @@ class SweepResult(Shown):
             axes.plot(x, self.rmse[:, k], style, label=f"{output}, {experiment}")
         axes.axvline(self.base[name], color="0.6", linestyle=":")
         unit = self.units[name]
-        axes.set_xlabel(f"{name}, {unit}" if unit else name)
+        axes.set_xlabel(with_unit(name, unit))
         axes.set_ylabel(
             "RMSE" + (f", {self.series_units[0]}" if len(set(self.series_units)) == 1 and self.series_units[0] else "")
         )

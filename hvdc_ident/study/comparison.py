@@ -42,14 +42,6 @@ class RunComparison(Shown):
         yield self.conclusion
 
     @property
-    def lines(self) -> list[str]:
-        """The screen as lines, which are as long as they are."""
-        found: list[str] = []
-        for block in self._screen():
-            found += [*str(block).splitlines(), ""] if str(block) else []
-        return found[:-1]
-
-    @property
     def conclusion(self) -> str:
         """The values that differ beyond their intervals."""
         judged = [v for v in self.data["values"] if v["apart"] is not None]

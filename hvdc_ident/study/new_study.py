@@ -79,14 +79,6 @@ class NewStudy(Shown):
             }
         return {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
 
-    @property
-    def lines(self) -> list[str]:
-        """The screen as lines, which are as long as they are."""
-        found: list[str] = []
-        for block in self._screen():
-            found += [*str(block).splitlines(), ""] if str(block) else []
-        return found[:-1]
-
     def _screen(self) -> Iterator[str]:
         number = len(self.recordings)
         yield f"{self.path} is written: model {self.model.name}, {number} experiment{'s' if number > 1 else ''}"

@@ -24,8 +24,6 @@ from hvdc_ident.study.study import Study
 if TYPE_CHECKING:
     from hvdc_ident.study.executors.dask import DaskPool
     from hvdc_ident.study.executors.local import OpenPool
-    from hvdc_ident.study.stages import StageOptions
-    from hvdc_ident.study.study import Study
 
 
 SCHEMA = 1
@@ -91,6 +89,20 @@ def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
         for name, reason in refused.items():
             done[name] = _written(study, stage(name), folder, options, _failed(reason), rest())
     return [done[s.name] for s in stages() if s.name in done]
+
+
+def run_study(study: Study, folder: Path, options: StageOptions) -> list[Done]:
+    """Run every stage that the study asks for and return them, with `run.json` and the report written to the folder.
+
+    Raises as `run_all`.
+    """
+    from hvdc_ident.report.page import write_report  # the templates are of use to a whole run alone
+
+    done = run_all(study, folder, options)
+    write_run(folder, heading_of(study, options.seed), done)
+    options.progress(0, 1, "report: writing the page")
+    write_report(folder)
+    return done
 
 
 def _numbered(progress: Progress, number: int, count: int) -> Progress:

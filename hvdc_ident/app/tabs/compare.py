@@ -10,7 +10,7 @@ from nicegui import run, ui
 import hvdc_ident as hi
 from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.result_panels import show_table
-from hvdc_ident.app.runs import result_folders
+from hvdc_ident.app.runs import folder_name, result_folders
 from hvdc_ident.app.server import Tab
 from hvdc_ident.display import Table, rounded
 from hvdc_ident.errors import HvdcIdentError
@@ -42,9 +42,8 @@ class ComparedRuns:
 
     def _offer(self) -> None:
         """Offer the folders that hold results."""
-        home = self._study.path.resolve().parent
         found = [p for p in result_folders(self._study) if p.is_dir() and any(p.glob("*.json"))]
-        names = {str(p): p.name if p != home else f"{p.name} (the study's folder)" for p in found}
+        names = {str(p): folder_name(self._study, p) for p in found}
         for k, side in enumerate(self._sides):
             first = list(names)[k] if len(names) > 1 else None
             side.set_options(names, value=side.value if side.value in names else first)

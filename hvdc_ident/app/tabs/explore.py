@@ -20,7 +20,7 @@ from hvdc_ident.app.setting import KINDS, InputCourse, Setting, equations_of, ne
 from hvdc_ident.data import Array
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.text import quantity
+from hvdc_ident.text import quantity, with_unit
 
 THROTTLE = 0.025
 """Least time between two values that a slider sends, s: a frame of a screen at 40 Hz."""
@@ -281,7 +281,7 @@ class Explorer:
         units = {n: self._setting.model.outputs[n].unit for n in self._setting.outputs}
         curves = [Trace("given", GIVEN, dashed=True), Trace("now", NOW)]
         curves += [Trace("recorded", RECORDED)] if self._setting.record else []
-        grids = [Grid(f"{n}, {u}" if u else n, tuple(curves)) for n, u in units.items()]
+        grids = [Grid(with_unit(n, u), tuple(curves)) for n, u in units.items()]
         with self._waves:
             self._wave = Plot(grids, "time, s", 400, "Waveforms").classes("w-full")
 

@@ -176,7 +176,7 @@ class Mapper:
         ui.timer(POLL, self._look)
         ui.run_javascript(DROP_ANYWHERE % self._upload.id)
         desk = self._desk
-        self._seen = await _done(Seen.now, desk.file)
+        self._seen = await run.io_bound(Seen.now, desk.file)
         self._show_files()
         if desk.recording is not None:
             await self._propose(desk.recording, os.path.relpath(desk.recording.resolve(), desk.file.parent.resolve()))
@@ -191,8 +191,8 @@ class Mapper:
         mapping = experiments_in(study.settings).get(name) if study else None
         if mapping is None:
             raise StudyError(f"no experiment '{name}'", where=self._desk.file.name, hint="choose another one")
-        record = await _done(hi.read_waveforms, self._desk.file.parent / mapping.data)
-        record = await _done(columns_with_derived, mapping, record, self._desk.file.name)
+        record = await run.io_bound(hi.read_waveforms, self._desk.file.parent / mapping.data)
+        record = await run.io_bound(columns_with_derived, mapping, record, self._desk.file.name)
         await self._take(record, mapping, None, name)
 
     async def _open_file(self, data: str) -> None:
@@ -205,12 +205,12 @@ class Mapper:
             await self._propose(chosen_recording(self._desk.file.parent, data), data)
 
     async def _propose(self, path: Path, data: str, record: Trajectory | None = None) -> None:
-        record = record or await _done(hi.read_waveforms, path)
+        record = record or await run.io_bound(hi.read_waveforms, path)
         taken = {e.name.lower() for e in self._desk.study.experiments} if self._desk.study else set()
         name, number = safe_name(f"{path.stem}.x").removesuffix(".x"), 2
         while name.lower() in taken:
             name, number = f"{path.stem}-{number}", number + 1
-        mapping, matching = await _done(proposed, record, self._plant, name, Path(data).as_posix())
+        mapping, matching = await run.io_bound(proposed, record, self._plant, name, Path(data).as_posix())
         await self._take(record, mapping, matching, "")
         self._changed = True
         self._show_status()
@@ -219,7 +219,7 @@ class Mapper:
         self._record, self._map, self._matching, self._was = record, mapping, matching, was
         self._changed, self._draft, self._view, self._sketches = False, None, None, {}
         self._edited = False
-        self._columns, self._rested_at = await _done(columns_of, record, mapping.event), mapping.event
+        self._columns, self._rested_at = await run.io_bound(columns_of, record, mapping.event), mapping.event
         self._show()
 
     async def _arrived(self, event: Any) -> None:
@@ -230,14 +230,14 @@ class Mapper:
             with tempfile.TemporaryDirectory(prefix="hvdc-ident-") as place:
                 for file in event.files:
                     await file.save(Path(place, safe_name(file.name)))
-                kept, record = await _done(keep_recordings, self._desk.file.parent, Path(place))
+                kept, record = await run.io_bound(keep_recordings, self._desk.file.parent, Path(place))
             self._show_files()
             self._leave(lambda: self._propose(self._desk.file.parent / kept[0], kept[0], record))
 
         await self._guarded(keep)
 
     async def _choose_model(self, source: str) -> None:
-        model = await _done(hi.load_model, source, self._desk.trust)
+        model = await run.io_bound(hi.load_model, source, self._desk.trust)
         self._desk, self._source = replace(self._desk, model=model, source=source), source
         if self._map is not None and self._record is not None:
             await self._propose(Path(self._map.data), self._map.data, self._record)
@@ -249,9 +249,11 @@ class Mapper:
             return
         was = self._was or self._map.name
         try:
-            self._seen = await _done(write_mapping, self._seen, self._map, was, self._source, trust=self._desk.trust)
+            self._seen = await run.io_bound(
+                write_mapping, self._seen, self._map, was, self._source, trust=self._desk.trust
+            )
         except StudyError as error:
-            if self._seen == await _done(Seen.now, self._desk.file):
+            if self._seen == await run.io_bound(Seen.now, self._desk.file):
                 raise
             self._ask_which(str(error))
             return
@@ -264,9 +266,9 @@ class Mapper:
     async def _renew(self, *, keep: bool) -> None:
         """Read the study file anew. keep: the mapping that is on the page; left out, that of the file."""
         self._stamp = stamp(self._desk.file)
-        seen = await _done(Seen.now, self._desk.file)
+        seen = await run.io_bound(Seen.now, self._desk.file)
         parse_study((seen.text or "").encode(), self._desk.file)  # what is no TOML is a broken study, and no model card
-        desk = await _done(opened, str(self._desk.file), trust=self._desk.trust)
+        desk = await run.io_bound(opened, str(self._desk.file), trust=self._desk.trust)
         self._seen, self._source = seen, desk.source
         self._desk = replace(desk, recording=self._desk.recording)
         self._banner.visible = False
@@ -286,7 +288,7 @@ class Mapper:
         self._stamp = now
         if now is None:
             return
-        if self._seen == await _done(Seen.now, self._desk.file):
+        if self._seen == await run.io_bound(Seen.now, self._desk.file):
             self._tell("")  # what was wrong with it is mended
             return
         if self._changed:
@@ -555,7 +557,7 @@ class Mapper:
             return
         draft, text = None, ""
         try:
-            draft = await _done(drafted, mapping, record, self._plant, desk.study, self._was, desk.file.name)
+            draft = await run.io_bound(drafted, mapping, record, self._plant, desk.study, self._was, desk.file.name)
         except HvdcIdentError as error:
             text = str(error)
         if number == self._asked:
@@ -593,7 +595,7 @@ class Mapper:
         for field, row in ((self._from, 0), (self._to, -1)):
             field.props["placeholder"] = f"{self._time[row]:g}"
         if draft is not None and event != self._rested_at:
-            columns = await _done(columns_of, record, event)
+            columns = await run.io_bound(columns_of, record, event)
             if record is self._record:
                 self._columns, self._rested_at = columns, event
                 for column in columns:
@@ -644,11 +646,6 @@ class Mapper:
 
     def _tell(self, text: str) -> None:
         self._trouble.text = text
-
-
-async def _done(work: Callable[..., Any], *given: Any, **named: Any) -> Any:
-    """Return the result of some work that is done beside the page's."""
-    return await run.io_bound(work, *given, **named)
 
 
 def _columns_in(mapping: RecordingMap) -> list[str]:

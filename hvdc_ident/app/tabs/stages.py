@@ -11,7 +11,16 @@ from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.exports import ExportButtons
 from hvdc_ident.app.result_panels import PANELS, FoundResults, ResultPanel
 from hvdc_ident.app.result_tables import on_page
-from hvdc_ident.app.runs import RUNS, StageStanding, StudyRun, first_folder, result_folders, signature, standings
+from hvdc_ident.app.runs import (
+    RUNS,
+    StageStanding,
+    StudyRun,
+    first_folder,
+    folder_name,
+    result_folders,
+    signature,
+    standings,
+)
 from hvdc_ident.app.server import Tab
 from hvdc_ident.app.worker import EVERYTHING, LETTER
 from hvdc_ident.errors import HvdcIdentError
@@ -42,7 +51,6 @@ class StageDesk:
         self._folder = first_folder(study)
         self._seen: Any = None
         self._busy = False
-        self._told: StudyRun | None = None
         self._letter: StudyRun | None = None
         self._panels: list[tuple[ResultPanel, Any]] = []
         self._starts: list[Any] = []
@@ -76,11 +84,10 @@ class StageDesk:
         ui.timer(LOOK, self._look)
 
     def _build_folder(self) -> None:
-        home = self._study.path.resolve().parent
-        folders = {p: p.name if p != home else f"{p.name} (the study's folder)" for p in result_folders(self._study)}
+        folders = {str(p): folder_name(self._study, p) for p in result_folders(self._study)}
         if len(folders) > 1:
             ui.select(
-                {str(p): name for p, name in folders.items()},
+                folders,
                 value=str(self._folder),
                 label="folder of results",
                 on_change=self._choose_folder,

@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
 from hvdc_ident.report.html import captioned, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, listed, span
+from hvdc_ident.text import form_of, listed, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -182,8 +182,8 @@ def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
             (line,) = axes.plot(*visible(time, shown), color=EFFECT, linewidth=1.3, label=label)
             line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
     unit = sizes.get("output_unit") or ""
-    top.set_ylabel(f"{sizes['output']}, {unit}" if unit else str(sizes["output"]), fontsize=8)
-    strip.set_ylabel(f"error, {unit}" if unit else "error", fontsize=8)
+    top.set_ylabel(with_unit(str(sizes["output"]), unit), fontsize=8)
+    strip.set_ylabel(with_unit("error", unit), fontsize=8)
     strip.set_xlabel("time, s", fontsize=8)
     for axes in (top, strip):
         axes.grid(True, color="#e4e4e4", linewidth=0.6)

@@ -11,7 +11,7 @@ from hvdc_ident.axes import draw_intervals, draw_profile
 from hvdc_ident.report.drawing import figure, svg
 from hvdc_ident.report.html import captioned, estimate, folded, number, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import listed
+from hvdc_ident.text import listed, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -248,7 +248,7 @@ def pair_map(pair: Mapping[str, Any], parameters: Mapping[str, Mapping[str, Any]
     labels = []
     for name in pair["names"]:
         unit = parameters.get(name, {}).get("unit")
-        labels.append(f"{name}, {unit}" if unit else str(name))
+        labels.append(with_unit(str(name), unit or ""))
     axes.set_xlabel(labels[0], fontsize=8)
     axes.set_ylabel(labels[1], fontsize=8)
     axes.ticklabel_format(useOffset=False)

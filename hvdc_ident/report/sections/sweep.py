@@ -11,6 +11,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg
 from hvdc_ident.report.html import captioned, number, table, text
 from hvdc_ident.report.results import Results, Section
+from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -141,7 +142,7 @@ def sweep_errors(
         axes.plot([], [], color=OTHERS, label=f"{len(errors) - len(color)} others that move less", **style)
     if base is not None:
         axes.axvline(base, color=MARK, linewidth=0.8, linestyle=":")
-    axes.set_xlabel(f"{parameter}, {unit}" if unit else parameter)
+    axes.set_xlabel(with_unit(parameter, unit))
     axes.set_ylabel(f"RMSE, {error_unit}" if error_unit else "RMSE")
     axes.set_ylim(bottom=0)
     axes.grid(True, color="#e4e4e4", linewidth=0.6)
