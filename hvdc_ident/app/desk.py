@@ -1,4 +1,4 @@
-"""What lies on the desk when the workbench opens: a model, a study, or a recording."""
+"""The desk of the workbench when it opens: a model, a study, or a recording lies on it."""
 
 from __future__ import annotations
 

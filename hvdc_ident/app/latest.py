@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from nicegui import background_tasks, run
 
+REST = 0.25
+"""Seconds without a request, after which what takes longer than a frame begins."""
+
 
 class Latest:
-    """Answers requests one after the other. work: makes the answer, in a thread. show: takes it, on the page."""
+    """Answers requests one after the other.
 
-    def __init__(self, work: Callable[[Any], Any], show: Callable[[Any], None]) -> None:
-        self._work, self._show = work, show
+    work: makes the answer, in a thread. show: takes it, on the page. rested: called once nothing has been asked for `REST`.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Any], Any],
+        show: Callable[[Any], None],
+        rested: Callable[[], Awaitable[None]] | None = None,
+    ) -> None:
+        self._work, self._show, self._rested = work, show, rested
         self._asked: list[Any] = []
+        self._number = 0
         self._busy = False
 
     def ask(self, request: Any) -> None:
         """Ask for the answer of a request in place of those that wait."""
         self._asked = [request]
+        self._number += 1
         if not self._busy:
             self._busy = True
             background_tasks.create(self._catch_up())
@@ -32,3 +46,8 @@ class Latest:
                 self._show(answer)
         finally:
             self._busy = False
+        if self._rested is not None:
+            number = self._number
+            await asyncio.sleep(REST)
+            if number == self._number:
+                await self._rested()

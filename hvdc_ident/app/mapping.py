@@ -50,7 +50,7 @@ class SignalLine:
 
     @property
     def conversion(self) -> dict[str, Any]:
-        """What is stated of the way to the model's unit."""
+        """Unit, base, scale and offset that are stated, by key."""
         return {k: v for k in CONVERSION if (v := getattr(self, k)) is not None}
 
 
@@ -158,7 +158,7 @@ class Held(Recordings):
 
 @dataclass(frozen=True)
 class Draft:
-    """What a mapping makes of a recording: the experiment, where its noise comes from, and what `check` says of the study."""
+    """A mapping as an experiment, with where its noise comes from and what `check` says of the study."""
 
     experiment: Experiment
     noise: FrozenMap[NoiseNote]

@@ -24,7 +24,7 @@ TALL = 150
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """What an experiment would look like. models: as they were run. runs: by model and signal, (n,). trouble: by model, why it
+    """An experiment as it would look. models: as they were run. runs: by model and signal, (n,). trouble: by model, why it
     has none."""
 
     experiment: Experiment

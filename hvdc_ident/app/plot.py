@@ -31,7 +31,7 @@ HEAD = """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/asse
 .plot .marker > b { position: absolute; left: 9px; top: 0; font: 600 11px system-ui, sans-serif; white-space: nowrap; }
 .plot .marker:focus-visible { outline: 2px solid; }
 .body--dark .text-primary { --q-primary: #6fb0f0; }</style>"""
-"""What a page with plots has in its head; the server offers the folder `ASSETS` as /assets."""
+"""Head of a page with plots; the server offers the folder `ASSETS` as /assets."""
 
 
 @dataclass(frozen=True)

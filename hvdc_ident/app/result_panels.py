@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from nicegui import ui
 
@@ -35,7 +35,7 @@ SETS = {"given": (GIVEN, True), "fitted": (NOW, False), "effect": (EFFECT, False
 TALL = 150
 """Height of one output's picture, px."""
 KINDS = ("signals", "errors")
-"""What is drawn of an experiment: recorded and simulated, or recorded less simulated."""
+"""Pictures of an experiment: recorded and simulated, or recorded less simulated."""
 
 
 @dataclass(frozen=True)
@@ -51,32 +51,27 @@ class FoundResults:
         return self.data.get(stage, {})
 
 
-class ResultPanel:
-    """A panel that is built anew whenever the results it shows are others. uses: the stages it shows; the first one it needs."""
+@dataclass(frozen=True)
+class Panel:
+    """A panel of results. uses: the stages it shows, the first of which it needs. build: builds its elements on the page."""
 
-    title: ClassVar[str]
-    uses: ClassVar[tuple[str, ...]]
+    title: str
+    uses: tuple[str, ...]
+    build: Callable[[FoundResults], None]
 
-    def __init__(self) -> None:
-        self._shown: Any = None
+    def key(self, found: FoundResults) -> tuple[Any, ...]:
+        """Return what changes whenever the panel has something else to show."""
+        marks = tuple(found.of(n).get("fingerprint") for n in self.uses)
+        return found.folder, tuple(found.study.sources.items()), marks
 
     def show(self, found: FoundResults, place: Any) -> None:
-        """Show the results in an element of the page."""
-        marks = tuple(found.of(n).get("fingerprint") for n in self.uses)
-        key = (found.folder, tuple(found.study.sources.items()), marks)
-        if key == self._shown:
-            return
-        self._shown = key
+        """Show the results in an element of the page, in place of what it holds."""
         place.clear()
         with place:
             if found.of(self.uses[0]):
                 self.build(found)
             else:
                 ui.label(f"Not there yet: run the stage {self.uses[0]}, or all.").classes("text-grey")
-
-    def build(self, found: FoundResults) -> None:
-        """Build the elements that show the results."""
-        raise NotImplementedError
 
 
 def show_table(table: Table) -> Any:
@@ -95,145 +90,128 @@ def show_table(table: Table) -> Any:
     return shown.classes("w-full")
 
 
-class Identifiability(ResultPanel):
-    """Verdicts, and the profile of the parameter that is opened."""
+def _identifiability(found: FoundResults) -> None:
+    """Build the verdicts, and the profile of the parameter that is opened."""
+    data = found.of("identify")
+    if data.get("misspecified"):
+        signs = data["misspecification"]
+        told = f"The model does not explain these data: {'; '.join(signs['signs'])}. Next: {signs['next']}."
+        ui.label(on_page(told))
+    profiles = {n: p for n, p in (data.get("profiles") or {}).items() if len(p.get("values") or ()) > 1}
+    table = show_table(verdict_table(data))
+    table.add_slot(
+        "body-cell-0",
+        '<q-td :props="props"><q-btn flat dense no-caps no-wrap color="primary" icon-right="show_chart" :label="props.value"'
+        " :aria-label=\"'Profile of ' + props.value\" @click=\"$parent.$emit('open', props.value)\" /></q-td>",
+    )
+    place = ui.column().classes("w-full gap-0")
+    table.on("open", lambda event: _open(data, profiles, str(event.args), place))
+    if profiles:
+        _open(data, profiles, next(iter(profiles)), place)
 
-    title = "What the recordings tell"
-    uses = ("identify",)
 
-    def build(self, found: FoundResults) -> None:
-        """Build the table, and room for a profile."""
-        data = found.of("identify")
-        if data.get("misspecified"):
-            signs = data["misspecification"]
-            told = f"The model does not explain these data: {'; '.join(signs['signs'])}. Next: {signs['next']}."
-            ui.label(on_page(told))
-        profiles = {n: p for n, p in (data.get("profiles") or {}).items() if len(p.get("values") or ()) > 1}
-        table = show_table(verdict_table(data))
-        table.add_slot(
-            "body-cell-0",
-            '<q-td :props="props"><q-btn flat dense no-caps no-wrap color="primary" icon-right="show_chart" :label="props.value"'
-            " :aria-label=\"'Profile of ' + props.value\" @click=\"$parent.$emit('open', props.value)\" /></q-td>",
+def _open(data: Mapping[str, Any], profiles: Mapping[str, Any], name: str, place: Any) -> None:
+    place.clear()
+    with place:
+        if name not in profiles:
+            ui.label(f"No profile of {name}: it was not fitted, or its cost was not followed.").classes("text-grey")
+            return
+        unit = data["parameters"].get(name, {}).get("unit", "")
+        ui.label(f"Profile of {name}: the least cost over all other parameters").classes("text-subtitle2")
+        curves = (
+            Trace("rise of the cost", NOW),
+            Trace("computed", NOW, mark="dot", size=6),
+            Trace("95 % level", GIVEN, dashed=True),
+            Trace("ends of the interval", RECORDED, mark="ring", size=10),
         )
-        place = ui.column().classes("w-full gap-0")
-        table.on("open", lambda event: self._open(data, profiles, str(event.args), place))
-        if profiles:
-            self._open(data, profiles, next(iter(profiles)), place)
-
-    def _open(self, data: Mapping[str, Any], profiles: Mapping[str, Any], name: str, place: Any) -> None:
-        place.clear()
-        with place:
-            if name not in profiles:
-                ui.label(f"No profile of {name}: it was not fitted, or its cost was not followed.").classes("text-grey")
-                return
-            unit = data["parameters"].get(name, {}).get("unit", "")
-            ui.label(f"Profile of {name}: the least cost over all other parameters").classes("text-subtitle2")
-            curves = (
-                Trace("rise of the cost", NOW),
-                Trace("computed", NOW, mark="dot", size=6),
-                Trace("95 % level", GIVEN, dashed=True),
-                Trace("ends of the interval", RECORDED, mark="ring", size=10),
-            )
-            grid = Grid("rise of the cost / 95 % level", curves)
-            plot = Plot([grid], with_unit(name, unit), 330, f"Profile of {name}").classes("w-full")
-            plot.whole(0, profile_columns(profiles[name]))
+        grid = Grid("rise of the cost / 95 % level", curves)
+        plot = Plot([grid], with_unit(name, unit), 330, f"Profile of {name}").classes("w-full")
+        plot.whole(0, profile_columns(profiles[name]))
 
 
-class Fitted(ResultPanel):
-    """Values, and recorded, given and fitted waveforms of an experiment."""
+def _fitted(found: FoundResults) -> None:
+    """Build the values, and recorded, given and fitted waveforms of an experiment."""
+    fit = found.of("fit")
+    judged = fit.get("adequacy") or {}
+    if judged.get("text"):
+        words = FIT_WORDS[judged["verdict"]]
+        ui.label(f"{words[:1].upper()}{words[1:]}: {judged['text']}.")
+    show_table(values_table(fit, found.of("diagnose")))
+    results = Results(found.folder)
+    try:
+        names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
+    except HvdcIdentError as error:
+        ui.label(str(error)).classes("text-negative")
+        return
+    if not names:
+        return
+    roles = {n: "held out" if results.experiments[n].get("role") == "holdout" else "fitted" for n in names}
+    with ui.row().classes("w-full items-center gap-3"):
+        which = ui.select({n: f"{n} ({roles[n]})" for n in names}, value=names[0], label="experiment")
+        which.props("dense options-dense").style("min-width: 14rem")
+        kind = ui.toggle(list(KINDS), value=KINDS[0]).props("dense no-caps")
+    place = ui.column().classes("w-full gap-0")
 
-    title = "Fit"
-    uses = ("fit", "simulate", "diagnose")
+    def draw() -> None:
+        _overlay(results, which.value, place, errors=kind.value == KINDS[1])
 
-    def build(self, found: FoundResults) -> None:
-        """Build the table, and the waveforms of the first experiment."""
-        fit = found.of("fit")
-        judged = fit.get("adequacy") or {}
-        if judged.get("text"):
-            words = FIT_WORDS[judged["verdict"]]
-            ui.label(f"{words[:1].upper()}{words[1:]}: {judged['text']}.")
-        show_table(values_table(fit, found.of("diagnose")))
-        results = Results(found.folder)
-        try:
-            names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
-        except HvdcIdentError as error:
-            ui.label(str(error)).classes("text-negative")
-            return
-        if not names:
-            return
-        roles = {n: "held out" if results.experiments[n].get("role") == "holdout" else "fitted" for n in names}
-        with ui.row().classes("w-full items-center gap-3"):
-            which = ui.select({n: f"{n} ({roles[n]})" for n in names}, value=names[0], label="experiment")
-            which.props("dense options-dense").style("min-width: 14rem")
-            kind = ui.toggle(list(KINDS), value=KINDS[0]).props("dense no-caps")
-        place = ui.column().classes("w-full gap-0")
-
-        def draw() -> None:
-            self._overlay(results, which.value, place, errors=kind.value == KINDS[1])
-
-        which.on_value_change(draw)
-        kind.on_value_change(draw)
-        draw()
-
-    def _overlay(self, results: Results, experiment: str, place: Any, *, errors: bool) -> None:
-        overlays = [o for name in results.units if (o := overlay_of(results, experiment, name)) is not None]
-        place.clear()
-        with place:
-            sets = tuple(n for n in SETS if any(n in o.runs for o in overlays))
-            curves = [Trace("recorded", RECORDED), *(Trace(WORDS[n], SETS[n][0], dashed=SETS[n][1]) for n in sets)]
-            grids = [Grid(o.title, tuple(curves)) for o in overlays]
-            plot = Plot(grids, "time, s", TALL * len(grids) + 30, f"Waveforms of {experiment}").classes("w-full")
-            for k, overlay in enumerate(overlays):
-                plot.whole(k, thinned(*overlay_columns(overlay, sets, errors=errors)))
+    which.on_value_change(draw)
+    kind.on_value_change(draw)
+    draw()
 
 
-class Diagnosed(ResultPanel):
-    """Findings, gaps, and the records with what was found at a size that a slider sets."""
-
-    title = "Diagnosis"
-    uses = ("diagnose", "fit")
-
-    def build(self, found: FoundResults) -> None:
-        """Build the findings, and the slider of their sizes."""
-        data = found.of("diagnose")
-        ui.label(str(data.get("text") or data.get("verdict", ""))).classes("text-body2")
-        findings, gaps = finding_table(data), gap_table(data)
-        if findings.rows:
-            show_table(findings)
-        if gaps.rows:
-            with ui.row().style("max-width: 40rem"):
-                show_table(gaps)
-        try:
-            models = suppositions(found.study, data, found.folder)
-        except HvdcIdentError as error:
-            ui.label(str(error)).classes("text-negative")
-            return
-        if models and found.study.experiments:
-            before = data.get("parameters_refitted") or data.get("parameters_before") or {}
-            told = str((data.get("sizes") or {}).get("experiment", ""))
-            WhatIf(found.study, models, before, told).build()
+def _overlay(results: Results, experiment: str, place: Any, *, errors: bool) -> None:
+    overlays = [o for name in results.units if (o := overlay_of(results, experiment, name)) is not None]
+    place.clear()
+    with place:
+        sets = tuple(n for n in SETS if any(n in o.runs for o in overlays))
+        curves = [Trace("recorded", RECORDED), *(Trace(WORDS[n], SETS[n][0], dashed=SETS[n][1]) for n in sets)]
+        grids = [Grid(o.title, tuple(curves)) for o in overlays]
+        plot = Plot(grids, "time, s", TALL * len(grids) + 30, f"Waveforms of {experiment}").classes("w-full")
+        for k, overlay in enumerate(overlays):
+            plot.whole(k, thinned(*overlay_columns(overlay, sets, errors=errors)))
 
 
-class Next(ResultPanel):
-    """What to record next, simulated before it is made."""
+def _diagnosed(found: FoundResults) -> None:
+    """Build findings, gaps, and the records with what was found at a size that a slider sets."""
+    data = found.of("diagnose")
+    ui.label(str(data.get("text") or data.get("verdict", ""))).classes("text-body2")
+    findings, gaps = finding_table(data), gap_table(data)
+    if findings.rows:
+        show_table(findings)
+    if gaps.rows:
+        with ui.row().style("max-width: 40rem"):
+            show_table(gaps)
+    try:
+        models = suppositions(found.study, data, found.folder)
+    except HvdcIdentError as error:
+        ui.label(str(error)).classes("text-negative")
+        return
+    if models and found.study.experiments:
+        before = data.get("parameters_refitted") or data.get("parameters_before") or {}
+        told = str((data.get("sizes") or {}).get("experiment", ""))
+        WhatIf(found.study, models, before, told).build()
 
-    title = "What to record next"
-    uses = ("identify", "diagnose", "fit")
 
-    def build(self, found: FoundResults) -> None:
-        """Build the advice, and the button that simulates it."""
-        identified, diagnosis = found.of("identify"), found.of("diagnose")
-        lines = advice_lines(identified, diagnosis)
-        for line in lines or ["The results ask for no further record."]:
-            ui.label(line).classes("text-body2")
-        try:
-            rivals = suppositions(found.study, diagnosis, found.folder)
-        except HvdcIdentError as error:
-            ui.label(str(error)).classes("text-negative")
-            return
-        fitted = {n: v for n, v in (found.of("fit").get("values") or {}).items() if v is not None}
-        NextExperiment(found.study, identified, fitted, rivals).build()
+def _next(found: FoundResults) -> None:
+    """Build what to record next, simulated before it is made."""
+    identified, diagnosis = found.of("identify"), found.of("diagnose")
+    lines = advice_lines(identified, diagnosis)
+    for line in lines or ["The results ask for no further record."]:
+        ui.label(line).classes("text-body2")
+    try:
+        rivals = suppositions(found.study, diagnosis, found.folder)
+    except HvdcIdentError as error:
+        ui.label(str(error)).classes("text-negative")
+        return
+    fitted = {n: v for n, v in (found.of("fit").get("values") or {}).items() if v is not None}
+    NextExperiment(found.study, identified, fitted, rivals).build()
 
 
-PANELS: tuple[type[ResultPanel], ...] = (Identifiability, Fitted, Diagnosed, Next)
+PANELS = (
+    Panel("What the recordings tell", ("identify",), _identifiability),
+    Panel("Fit", ("fit", "simulate", "diagnose"), _fitted),
+    Panel("Diagnosis", ("diagnose", "fit"), _diagnosed),
+    Panel("What to record next", ("identify", "diagnose", "fit"), _next),
+)
 """The panels, in the order of the page."""

@@ -17,7 +17,7 @@ from hvdc_ident.text import figures_of
 
 _COMMAND = re.compile(r"`?hvdc-ident ([a-z]+) STUDY(?: --to FILE)?`?")
 _BUTTONS = {"letter": "the button Letter", "export": "a button below Take away", "run": "Run all"}
-"""What stands on the page for commands that are no stages."""
+"""Names on the page for commands that are no stages."""
 MODELS = {"nominal": "given values", "refitted": "refitted", "augmented": "with the effect"}
 """Models whose gaps a diagnosis compares, and their names on the page."""
 PLACES = 6

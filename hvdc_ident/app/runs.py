@@ -144,7 +144,7 @@ class StudyRun:
 
     @property
     def times(self) -> str:
-        """How long the stage has taken, and how much longer it takes."""
+        """The time that the stage has taken, and how much longer it takes."""
         now = time.monotonic()
         finish = now + (now - self._stage_begun) * (1.0 - self.share) / self.share if self.share else None
         return times_of(self._stage_begun, finish, now)

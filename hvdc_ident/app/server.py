@@ -19,7 +19,7 @@ from hvdc_ident.app.study_folder import MOST_BYTES
 from hvdc_ident.errors import InputError
 
 RECONNECT = 120.0
-"""How long a page that lost its connection keeps what it shows, s: a busy machine and a closed lid are no reason to forget."""
+"""Seconds for which a page that lost its connection keeps what it shows: a busy machine and a closed lid are no reason to forget."""
 
 
 @dataclass(frozen=True)

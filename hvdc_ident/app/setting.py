@@ -45,7 +45,7 @@ class InputCourse:
 
 @dataclass(frozen=True)
 class Setting:
-    """What the tab Explore shows the answers of.
+    """A model with values, courses of its inputs and what is looked at, of which the tab Explore shows the answers.
 
     model: with effects, if any. values: of its parameters, where they differ from the model's, in their units. courses: of
     its inputs. end: of the run, s, with so many rows. outputs: whose waveforms are shown. channel: input and output of the

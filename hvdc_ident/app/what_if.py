@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,17 +10,17 @@ import numpy as np
 from nicegui import run, ui
 
 import hvdc_ident as hi
+from hvdc_ident.app.knob import Knob
 from hvdc_ident.app.latest import Latest
 from hvdc_ident.app.plot import GIVEN, RECORDED, Grid, Plot, Trace, thinned
 from hvdc_ident.app.setting import Setting, span_of
 from hvdc_ident.app.supposed import Supposition, refitted
 from hvdc_ident.data import Array
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.text import quantity, with_unit
+from hvdc_ident.text import with_unit
 
 EFFECT = "#2a9d5c"
 """Colour of curves with the effect."""
-STEPS, THROTTLE = 400, 0.04
 TALL = 150
 
 
@@ -135,22 +134,16 @@ class WhatIf:
         self._ask()
 
     def _knob(self, name: str) -> None:
-        q = self._chosen.model.parameters[name]
-        low, high = span_of(self._chosen.model, name, {})
-        log = low > 0
-        to, back = (math.log, math.exp) if log else (float, float)
-        with ui.row().classes("w-full items-center no-wrap gap-2"):
-            ui.label(f"{q.description}, {name}" if q.description else name).classes("col-5 ellipsis").tooltip(name)
-            slider = ui.slider(min=to(low), max=to(high), step=(to(high) - to(low)) / STEPS, value=to(q.value))
-            slider.props(f'aria-label="{name}" dense').classes("col")
-            shown = ui.label(quantity(q.value, q.unit)).classes("col-2 text-right")
+        model = self._chosen.model
+        q, span = model.parameters[name], span_of(model, name, {})
 
-        def moved(event: Any) -> None:
-            self._sizes[name] = back(float(event.args))
-            shown.text = quantity(self._sizes[name], q.unit)
+        def moved(value: float) -> None:
+            self._sizes[name] = value
+            knob.tell(value)
             self._ask()
 
-        slider.on("update:model-value", moved, throttle=THROTTLE)
+        label = f"{q.description}, {name}" if q.description else name
+        knob = Knob(name, q, span, q.value, moved, log=span[0] > 0, label=label)
 
     def _build_plot(self) -> None:
         outputs = tuple(self._record.outputs)

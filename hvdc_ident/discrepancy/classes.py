@@ -167,7 +167,7 @@ def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> 
     for group in groups:
         if len(group) > 1:
             first = group[0]
-            # What is the same equation under another name no experiment tells apart.
+            # No experiment tells one equation from itself under another name.
             others = [(r.effect, r.at) for r in group[1:] if not r.same_as]
             told = advice(first.effect, others, first.at, recorded)
             if told:
@@ -319,7 +319,7 @@ def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
 
 
 def _text(told: str, parameters: dict[str, EffectSize], best: Rival, places: Sequence[Place], other: str) -> str:
-    """What the best hypothesis does, with the first interval, other kinds of the effect, and other places."""
+    """Return what the best hypothesis does, with the first interval, other kinds of the effect, and other places."""
     told = told or sentence(best, best.parameters, filled(best.expression, best.parameters))
     size = next((s for s in parameters.values() if s.ci95 is not None and None not in s.ci95), None)
     if size is not None and size.ci95 is not None:

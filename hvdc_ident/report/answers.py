@@ -1,4 +1,4 @@
-"""What a folder of results answers: does the model follow, with which values, what does it lack, what is to be recorded next.
+"""Answers of a folder of results: does the model follow, with which values, what does it lack, what is to be recorded next.
 
 The first screen of the report and the letter both show these answers, each in its own words.
 """
@@ -45,12 +45,12 @@ class Errors:
 
     @property
     def on_noise(self) -> bool | None:
-        """Whether every signal with a known noise is followed to it; None where none is known."""
+        """True where every signal with a known noise is followed to it; None where none is known."""
         return self.above == 0 if self.judged else None
 
     @property
     def tolerated(self) -> bool | None:
-        """Whether every signal with a tolerance keeps it; None without one."""
+        """True where every signal with a tolerance keeps it; None without one."""
         return self.outside == 0 if self.limited else None
 
 
@@ -166,7 +166,7 @@ class Answers:
 
     @property
     def by_tolerance(self) -> bool:
-        """Whether the verdict is against a tolerance that the study names, and not against the noise."""
+        """True where the verdict is against a tolerance that the study names, and not against the noise."""
         return bool(self.tolerance) or bool(self.profile.get("named"))
 
     @cached_property
@@ -323,7 +323,7 @@ class Answers:
 
     @property
     def next(self) -> str:
-        """What to record next: what tells likely effects apart, else what tells the parameters best; empty where none is known."""
+        """Return what to record next: what tells likely effects apart, else what tells the parameters best; empty where none is known."""
         for advice in (
             self.diagnosis.get("separating_experiment"),
             self.results.get("identifiability").get("recommended_experiment"),

@@ -156,7 +156,7 @@ def _which(found: Answers) -> str:
 
 
 def _moved(found: Answers) -> str:
-    """What a fit without the effect does to the parameter that it moves most."""
+    """Return what a fit without the effect does to the parameter that it moves most."""
     moved = {v.name: v for v in found.values if v.effect is not None and v.fitted is not None and v.given}
     if not moved:
         return ""

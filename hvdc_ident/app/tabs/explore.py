@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from nicegui import background_tasks, run, ui
+from nicegui import run, ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.desk import Desk
+from hvdc_ident.app.knob import Knob
+from hvdc_ident.app.latest import Latest
 from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Grid, Plot, Trace, scattered, thinned
 from hvdc_ident.app.server import Tab
 from hvdc_ident.app.setting import KINDS, InputCourse, Setting, equations_of, near, span_of, with_effect
@@ -22,12 +21,6 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.text import quantity, with_unit
 
-THROTTLE = 0.025
-"""Least time between two values that a slider sends, s: a frame of a screen at 40 Hz."""
-STEPS = 500
-"""Positions of a slider."""
-REST = 0.25
-"""How long a slider has to stand, s, before what takes longer than a frame is computed."""
 FIRST = 8
 """Parameters that stand open where no study says which matter."""
 PARAMETER = "parameter (RMS of the derivative times the value)"
@@ -40,7 +33,10 @@ NONE = np.empty(0, complex)
 
 @dataclass(frozen=True)
 class Answer:
-    """What the plots show of one setting; None and empty for what cannot be had. trouble: by part of the page why."""
+    """Waveforms, operating point, response and poles of one setting; None and empty for what cannot be had.
+
+    trouble: by part of the page why.
+    """
 
     run: hi.Simulation | None
     point: hi.OperatingPoint | None
@@ -69,6 +65,15 @@ def answered(setting: Setting, omega: Array | None = None) -> Answer:
     return Answer(ran, point, bode, NONE if poles is None else poles, trouble)
 
 
+def _both(asked: tuple[Setting | None, Setting, Array | None]) -> tuple[Answer | None, Setting, Answer]:
+    """Return the answers of the setting as given, where it is asked for, and of the one as it is now, at the same frequencies."""
+    given, setting, omega = asked
+    first = None if given is None else answered(given)
+    if first is not None:
+        omega = None if first.bode is None else first.bode.omega
+    return first, setting, answered(setting, omega)
+
+
 class Explorer:
     """The tab in one browser: its setting, those before it, and the elements that show the answer."""
 
@@ -77,12 +82,12 @@ class Explorer:
         self._desk, self._setting = desk, Setting.of(desk.model, record)
         self._given = self._setting
         self._past: list[Setting] = []
-        self._asked = self._shown = 0
-        self._busy = False
+        self._latest = Latest(_both, self._take, self._show_slow)
+        self._stale = True  # what the page began with is to be drawn anew
         self._moving = ""
         self._omega: Array | None = None
         self._ringed = self._locus = self._now = NONE
-        self._sliders: dict[str, Callable[[float, bool], None]] = {}
+        self._sliders: dict[str, Knob] = {}
 
     # --- the page ---
 
@@ -155,7 +160,7 @@ class Explorer:
     def _look(self, **changes: Any) -> None:
         """Change what is looked at, of the setting as it is now and of the one as given."""
         self._given = replace(self._given, **changes)
-        self._shown = 0
+        self._stale = True
         self._set(replace(self._setting, **changes))
 
     def _look_into(self, source: str = "", output: str = "") -> None:
@@ -197,34 +202,15 @@ class Explorer:
                         self._knob(name)
 
     def _knob(self, name: str) -> None:
-        q = self._setting.model.parameters[name]
-        low, high = span_of(self._setting.model, name, self._desk.spans)
-        log = low > 0 and high > 20.0 * low
-        to, back = (math.log, math.exp) if log else (float, float)
-        value = self._setting.parameters[name]
-        with ui.row().classes("w-full items-center no-wrap gap-2"):
-            ui.label(name).classes("col-4 ellipsis").tooltip(q.description or name)
-            slider = ui.slider(min=to(low), max=to(high), step=(to(high) - to(low)) / STEPS, value=to(value)).classes(
-                "col"
-            )
-            slider.props(f'aria-label="{name}" dense')
-            shown = ui.label(quantity(value, q.unit)).classes("col-3 text-right text-caption")
+        low, high = span = span_of(self._setting.model, name, self._desk.spans)
 
-        def moved(event: Any) -> None:
-            self._set(self._setting.with_value(name, back(float(event.args))), moving=name)
+        def moved(value: float) -> None:
+            self._set(self._setting.with_value(name, value), moving=name)
 
-        def put(value: float, moving: bool) -> None:
-            text = quantity(value, q.unit)
-            if moving:  # the slider stands there already, and a change of an element draws the whole page anew
-                shown.client.run_javascript(f"getHtmlElement({shown.id}).textContent = {json.dumps(text)}")
-                return
-            shown.text = text
-            if not math.isclose(slider.value, to(value), rel_tol=1e-9, abs_tol=1e-12):
-                slider.value = to(value)
-
-        slider.on("update:model-value", moved, throttle=THROTTLE)
-        slider.on("pan", lambda e: self._remember() if e.args == "start" else None)
-        self._sliders[name] = put
+        self._sliders[name] = Knob(
+            name, self._setting.model.parameters[name], span, self._setting.parameters[name], moved,
+            log=low > 0 and high > 20.0 * low, began=self._remember,
+        )  # fmt: skip
 
     def _build_effects(self) -> None:
         with ui.expansion("Add an effect").classes("w-full"):
@@ -293,8 +279,8 @@ class Explorer:
         before, self._setting, self._moving = self._setting, setting, moving
         if rebuilt or before.model is not setting.model:
             self._build_knobs()
-        for name, put in ({} if moving else self._sliders).items():
-            put(setting.parameters[name], False)
+        for name, knob in ({} if moving else self._sliders).items():
+            knob.put(setting.parameters[name])
         self._ask()
 
     def _remember(self) -> None:
@@ -316,38 +302,19 @@ class Explorer:
     # --- answers ---
 
     def _ask(self) -> None:
-        self._asked += 1
-        if not self._busy:
-            self._busy = True
-            background_tasks.create(self._catch_up())
+        self._latest.ask((self._given if self._stale else None, self._setting, self._omega))
 
-    async def _catch_up(self) -> None:
-        """Show the answer of the setting that stands; of settings that follow faster than answers only the last."""
-        try:
-            if not self._shown:
-                given = await run.io_bound(answered, self._given)
-                if given is None:
-                    return  # the server is ending
-                self._show_given(given)
-            while self._shown != self._asked:
-                number, setting = self._asked, self._setting
-                answer = await run.io_bound(answered, setting, self._omega)
-                if answer is None:
-                    return
-                self._show(setting, answer)
-                self._shown = number
-                await asyncio.sleep(0)
-        finally:
-            self._busy = False
-        number = self._asked
-        await asyncio.sleep(REST)
-        if number == self._asked == self._shown and not self._busy:
-            await self._show_slow()
+    def _take(self, found: tuple[Answer | None, Setting, Answer]) -> None:
+        given, setting, answer = found
+        if given is not None:
+            self._stale = False
+            self._show_given(given)
+        self._show(setting, answer)
 
     def _show(self, setting: Setting, answer: Answer) -> None:
         """Replace what is drawn of the setting as it is now, all in one message."""
-        if put := self._sliders.get(self._moving):
-            put(setting.parameters[self._moving], True)
+        if knob := self._sliders.get(self._moving):
+            knob.tell(setting.parameters[self._moving])
         self._trouble.text = "; ".join(answer.trouble.values())
         if answer.run is not None:
             for k, name in enumerate(setting.outputs):

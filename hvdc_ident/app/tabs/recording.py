@@ -40,13 +40,13 @@ from hvdc_ident.data import Array, Trajectory, event_time
 from hvdc_ident.errors import HvdcIdentError, StudyError
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import shipped_models
-from hvdc_ident.study.column_matching import Column, Matching, columns_of
+from hvdc_ident.study.column_matching import Column, Kind, Matching, columns_of
 from hvdc_ident.study.parse import parse_study
 
 REST = 0.3
-"""How long a mapping has to stand, s, before it is checked."""
+"""Seconds that a mapping has to stand before it is checked."""
 POLL = 1.0
-"""How often the study file is looked at, s."""
+"""Seconds between two looks at the study file."""
 MOST_ROWS = 40
 """Signals of the list that are shown at once; the search finds the others."""
 MOST_GRIDS = 8
@@ -407,10 +407,9 @@ class Mapper:
     def _build_row(self, column: Column) -> None:
         assert self._record is not None
         model = self._plant
-        options = {"": "not used"}
-        options |= {f"input {n}": f"input {n}" for n in model.inputs} | {
-            f"output {n}": f"output {n}" for n in model.outputs
-        }
+        signals: dict[str, tuple[Kind, str]] = {f"input {n}": ("input", n) for n in model.inputs}
+        signals |= {f"output {n}": ("output", n) for n in model.outputs}
+        options = {"": "not used", **{name: name for name in signals}}
         with ui.row().classes("w-full items-center no-wrap gap-2 q-py-xs").style("border-bottom: 1px solid #8884"):
             ui.html(self._sketch(column.name), sanitize=False)
             with ui.column().classes("gap-0").style("width: 10rem; min-width: 0"):
@@ -432,10 +431,12 @@ class Mapper:
                     self._build_candidates(column)
 
         def assign(event: Any) -> None:
-            kind, _, signal = (event.value or "").partition(" ")
-            lines = self._map.of_column(column.name) if self._map else ()
-            if self._map is not None and (signal, kind) != ((lines[0].signal, lines[0].kind) if lines else ("", "")):
-                self._set(self._map.assigned(column.name, signal, kind))  # type: ignore[arg-type]
+            if self._map is None:
+                return
+            kind, signal = signals.get(event.value, ("input", ""))  # "": of no kind
+            lines = self._map.of_column(column.name)
+            if signal != lines[0].signal or kind != lines[0].kind if lines else signal:
+                self._set(self._map.assigned(column.name, signal, kind))
 
         refresh()
         chosen.on_value_change(assign)

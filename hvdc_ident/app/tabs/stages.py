@@ -9,7 +9,7 @@ from nicegui import run, ui
 import hvdc_ident as hi
 from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.exports import ExportButtons
-from hvdc_ident.app.result_panels import PANELS, FoundResults, ResultPanel
+from hvdc_ident.app.result_panels import PANELS, FoundResults, Panel
 from hvdc_ident.app.result_tables import on_page
 from hvdc_ident.app.runs import (
     RUNS,
@@ -52,7 +52,8 @@ class StageDesk:
         self._seen: Any = None
         self._busy = False
         self._letter: StudyRun | None = None
-        self._panels: list[tuple[ResultPanel, Any]] = []
+        self._panels: list[tuple[Panel, Any]] = []
+        self._panel_keys: dict[str, Any] = {}
         self._starts: list[Any] = []
         self._unreadable = ""
 
@@ -80,7 +81,7 @@ class StageDesk:
                 with ui.tab_panels(bar, value=PANELS[0].title, animated=False).classes("w-full"):
                     for panel in PANELS:
                         with ui.tab_panel(panel.title).classes("q-pa-none"):
-                            self._panels.append((panel(), ui.column().classes("w-full gap-2 q-pt-sm")))
+                            self._panels.append((panel, ui.column().classes("w-full gap-2 q-pt-sm")))
         ui.timer(LOOK, self._look)
 
     def _build_folder(self) -> None:
@@ -180,7 +181,9 @@ class StageDesk:
         data = {s.stage.name: s.data for s in stages if s.data and s.state in ("done", "stale")}
         shown = FoundResults(self._study, self._folder, data)
         for panel, place in self._panels:
-            panel.show(shown, place)
+            if self._panel_keys.get(panel.title) != (key := panel.key(shown)):
+                self._panel_keys[panel.title] = key
+                panel.show(shown, place)
         self._next.text = on_page(next_step(data))
 
     def _show_run(self, found: StudyRun | None) -> None:
