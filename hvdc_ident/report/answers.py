@@ -102,12 +102,12 @@ class Answers:
         found["given"] = (
             self.fit.get("rmse_given")
             or self.results.get("simulation").get("rmse")
-            or _joined(gap.get("nominal") or {})
+            or joined_gap(gap.get("nominal") or {})
         )
         if self.fitted:
             found["fitted"] = self.fit.get("rmse") or {}
         if self.added:
-            found["effect"] = self.diagnosis.get("rmse_after") or _joined(gap.get("augmented") or {})
+            found["effect"] = self.diagnosis.get("rmse_after") or joined_gap(gap.get("augmented") or {})
         return {n: t for n, t in found.items() if t}
 
     @property
@@ -351,8 +351,8 @@ def _entries(table: Table) -> Iterable[tuple[Signal, float]]:
                 yield (output, experiment), float(error)
 
 
-def _joined(gap: Mapping[str, Table]) -> dict[str, dict[str, float | None]]:
-    """The errors of fitted and held-out experiments in one table."""
+def joined_gap(gap: Mapping[str, Table]) -> dict[str, dict[str, float | None]]:
+    """Return the errors of fitted and held-out experiments, which a diagnosis keeps apart, in one table."""
     found: dict[str, dict[str, float | None]] = {}
     for part in gap.values():
         for output, line in part.items():

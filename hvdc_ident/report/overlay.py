@@ -65,7 +65,7 @@ class Overlay:
     @property
     def title(self) -> str:
         """The output with its unit."""
-        return f"{self.output}, {self.unit}" if self.unit else self.output
+        return with_unit(self.output, self.unit)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -101,7 +101,7 @@ class Overlay:
         for name in same:
             found.append(PlottedCurve(WORDS[name], STYLES[name][0], name))
             found.append(PlottedCurve(f"error, {WORDS[name]}", STYLES[name][0], "measured", minus=name, lower=True))
-        return {n: v[rows] for n, v in columns.items()}, found, ("time, s", self.title, _error_title(self.unit))
+        return {n: v[rows] for n, v in columns.items()}, found, ("time, s", self.title, with_unit("error", self.unit))
 
 
 def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[str] = tuple(STAGES)) -> Overlay | None:
@@ -117,10 +117,6 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
     window = about.get("window")
     unit = str(results.units.get(output, ""))
     return Overlay(experiment, output, unit, runs, about.get("event"), (window[0], window[1]) if window else None)
-
-
-def _error_title(unit: str) -> str:
-    return with_unit("error", unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +159,7 @@ class Sheet:
                 kind = "95 % band of a sample"
                 self.top.fill_between(run.time, low, high, color=color, alpha=0.15, linewidth=0, label=kind)
         self.top.set_ylabel(overlay.title, fontsize=8)
-        self.strip.set_ylabel(_error_title(overlay.unit), fontsize=8)
+        self.strip.set_ylabel(with_unit("error", overlay.unit), fontsize=8)
         self.strip.axhline(0.0, color=MARK, linewidth=0.6)
         for axes in (self.top, self.strip):
             if overlay.event is not None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from hvdc_ident.display import Shown, Table, rounded
 from hvdc_ident.errors import InputError
+from hvdc_ident.report.answers import joined_gap
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.stages import Stage, stages
@@ -276,7 +277,7 @@ def _gaps(first: Results, second: Results) -> list[dict[str, Any]]:
     return rows
 
 
-def _rmse(results: Results, kind: str) -> dict[str, dict[str, Any]]:
+def _rmse(results: Results, kind: str) -> Mapping[str, Mapping[str, Any]]:
     """The RMSE by output and recording at one set of values; empty where that has not been computed."""
     if kind == "given":
         return results.get("simulation").get("rmse") or results.get("fit").get("rmse_given") or {}
@@ -285,11 +286,7 @@ def _rmse(results: Results, kind: str) -> dict[str, dict[str, Any]]:
     diagnosis = results.get("discrepancy")
     if not diagnosis.get("augmented_model"):
         return {}
-    found: dict[str, dict[str, Any]] = {}
-    for part in ("fit", "holdout"):
-        for output, by in (diagnosis["gap"]["augmented"].get(part) or {}).items():
-            found.setdefault(output, {}).update(by)
-    return found
+    return dict(joined_gap(diagnosis["gap"]["augmented"]))
 
 
 def _verdict(stage: Stage, results: Results) -> str:

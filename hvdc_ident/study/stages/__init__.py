@@ -78,6 +78,11 @@ def one_phase(study: Study) -> int:
     return 1
 
 
+def two_by_group(study: Study) -> int:
+    """Return 2 for each group of a fit, whose search and profiles are counted one after the other."""
+    return 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ()))
+
+
 @dataclass(frozen=True)
 class Stage:
     """One stage.

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
 from hvdc_ident.text import figures_of
 
 if TYPE_CHECKING:
@@ -197,5 +197,5 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
-    phases=lambda study: 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ())),  # search, profiles
+    phases=two_by_group,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
 from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
@@ -140,5 +140,5 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
-    phases=lambda study: 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ())),  # search, profiles
+    phases=two_by_group,
 )
