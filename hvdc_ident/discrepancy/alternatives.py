@@ -87,11 +87,12 @@ def _formulas(
     library = terms([own, *(s for s in others if s != own)])
     within = [t.form != "x" and (own in t.signals or source in t.signals) for t in library]
     stated = _stated(found, paths, place) if any(within) else []
-    near = [
-        k
-        for k, t in enumerate(library)
-        if within[k] and not any(proportional(at_runs(t, paths), one) for one in stated)
-    ]
+
+    def is_stated(term: Term) -> bool:
+        own_runs = at_runs(term, paths)
+        return any(proportional(own_runs, one) for one in stated)
+
+    near = [k for k, t in enumerate(library) if within[k] and not is_stated(t)]
     return library, [*((k,) for k in near), *((k, 0) for k in near)]
 
 

@@ -18,6 +18,7 @@ from hvdc_ident.discrepancy.options import BEAM, TOLERANCE
 from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
 from hvdc_ident.discrepancy.proposals import View, by_latent, by_score, joined, views_of
+from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refitted import (
     all_far,
     best_each,
@@ -133,8 +134,7 @@ def _in_its_stead(
     law = opened.law
     if law is None or search.spent:
         return opened, trials
-    k, whole = len(opened.before.problem.free), len(law.refit.problem.free)
-    gains = (*law.refit.theta[:k].tolist(), *law.refit.theta[whole:].tolist())
+    gains = _gains(opened, law.refit)
     best: dict[int, Pick] = {}
     for p in field:
         if opened.candidates[p.candidate].at == law.refit.placed[-1].candidate.at:
@@ -222,10 +222,9 @@ class _Lead:
 
     @classmethod
     def of(cls, opened: Round, trial: CandidateFit) -> _Lead:
-        refit, k = trial.refit, len(opened.before.problem.free)
-        gains = (*refit.theta[:k].tolist(), *refit.theta[len(refit.problem.free) :].tolist())
-        number = trial.pick.candidate
-        return cls(number, opened.candidates[number], gains, refit.sizes(refit.placed[-1]), _late(trial))
+        refit, number = trial.refit, trial.pick.candidate
+        sizes = refit.sizes(refit.placed[-1])
+        return cls(number, opened.candidates[number], _gains(opened, refit), sizes, _late(trial))
 
     def is_elsewhere(self, other: CandidateEffect) -> bool:
         """Return True for the same effect at another place."""
@@ -274,6 +273,12 @@ def _neighbours(
         picks += _other_forms(opened, lead.number, trials, asked)
     more = [replace(found[n], probes=tuple(probes)) for n, probes in extra.items()]
     return replace(opened, candidates=joined(found, more)), sorted(picks, key=lambda p: -p.score)[:FIELD]
+
+
+def _gains(opened: Round, refit: Refit) -> tuple[float, ...]:
+    """Return the unknowns of the model before the round as a refit came to them."""
+    k, whole = len(opened.before.problem.free), len(refit.problem.free)
+    return (*refit.theta[:k].tolist(), *refit.theta[whole:].tolist())
 
 
 def _as_late(candidate: CandidateEffect, late: float | None) -> tuple[int, float] | None:

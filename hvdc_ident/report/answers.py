@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.report.overlay import Overlay, overlay_of
+from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
 from hvdc_ident.text import quantity
 
@@ -217,8 +217,7 @@ class Answers:
         return kept
 
     def _windows(self, name: str) -> Mapping[str, Any]:
-        stage = {"given": "simulation", "fitted": "fit", "effect": "discrepancy"}[name]
-        return (self.results.get(stage).get("windowed_errors") or {}).get("errors") or {}
+        return (self.results.get(STAGES[name]).get("windowed_errors") or {}).get("errors") or {}
 
     def _swing(self, output: str, experiment: str) -> float | None:
         """Peak-to-peak value of a recorded signal, in its unit; None where its recording is not at hand."""
@@ -231,7 +230,7 @@ class Answers:
         """The recording of the worst signal with the model's runs."""
         if self.worst is None:
             return None
-        sets = tuple(n for n in ("given", "fitted", "effect") if n in self.rmse)
+        sets = tuple(n for n in STAGES if n in self.rmse)
         return overlay_of(self.results, self.worst[1], self.worst[0], sets)
 
     @cached_property

@@ -7,10 +7,9 @@ from typing import Any
 
 from hvdc_ident.report.answers import Answers, Errors, Value
 from hvdc_ident.report.html import badge, estimate, number, percent, prose, rough, share, table, text
-from hvdc_ident.report.overlay import Sheet
+from hvdc_ident.report.overlay import WORDS, Sheet
 from hvdc_ident.report.results import Results
 
-WORDS = {"given": "given values", "fitted": "fitted", "effect": "with the effect"}
 PLACES = 4
 """Likely places that are shown of each finding."""
 ROWS = 9
