@@ -241,7 +241,7 @@ class CachingExecutor:
 def _item_digest(item: Any) -> str:
     """Return a digest of an item, so that a result is never taken for another's; empty where it has no text form."""
     try:
-        return digest(packed(item))[:16]
+        return digest(_text(item, _array_digest))[:16]
     except TypeError:
         return ""
 
@@ -264,13 +264,18 @@ def source_hash() -> str:
     return digest("\n".join(f"{p.relative_to(root).as_posix()} {digest(p.read_bytes())}" for p in files).encode())
 
 
+_OfArray = Callable[["np.ndarray[Any, Any]", bool], dict[str, Any]]
 PACKAGE = "hvdc_ident"
 _KIND = "!"
 
 
 def packed(value: Any) -> bytes:
     """The value as bytes. Raises TypeError for what is no number, text, array, collection or dataclass of here."""
-    return json.dumps(_plain(value), ensure_ascii=False, separators=(",", ":")).encode()
+    return _text(value, _array)
+
+
+def _text(value: Any, array: _OfArray) -> bytes:
+    return json.dumps(_plain(value, array), ensure_ascii=False, separators=(",", ":")).encode()
 
 
 def unpacked(content: bytes) -> Any:
@@ -283,7 +288,8 @@ def unpacked(content: bytes) -> Any:
         ) from None
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, array: _OfArray) -> Any:
+    """The value as JSON holds it, each of its arrays as `array` gives it."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, int) and not isinstance(value, np.generic):
@@ -293,26 +299,38 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         return {_KIND: "b", "v": base64.b64encode(value).decode()}
     if isinstance(value, complex) and not isinstance(value, np.generic):
-        return {_KIND: "c", "v": [_plain(value.real), _plain(value.imag)]}
+        return {_KIND: "c", "v": [_plain(value.real, array), _plain(value.imag, array)]}
     if isinstance(value, np.ndarray | np.generic):
-        return _array(np.asarray(value), isinstance(value, np.generic))
+        return array(np.asarray(value), isinstance(value, np.generic))
     if isinstance(value, list):
-        return [_plain(v) for v in value]
+        return [_plain(v, array) for v in value]
     if isinstance(value, tuple):
-        return {_KIND: "t", "v": [_plain(v) for v in value]}
+        return {_KIND: "t", "v": [_plain(v, array) for v in value]}
     if isinstance(value, Mapping):
         kind = "m" if isinstance(value, FrozenMap) else "d"
-        return {_KIND: kind, "v": [[_plain(k), _plain(v)] for k, v in value.items()]}
+        return {_KIND: kind, "v": [[_plain(k, array), _plain(v, array)] for k, v in value.items()]}
     if dataclasses.is_dataclass(value) and type(value).__module__.split(".")[0] == PACKAGE:
-        made = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        made = {f.name: _plain(getattr(value, f.name), array) for f in dataclasses.fields(value) if f.init}
         return {_KIND: "o", "of": f"{type(value).__module__}:{type(value).__qualname__}", "v": made}
     raise TypeError(f"{type(value).__module__}.{type(value).__qualname__} cannot be kept")
 
 
 def _array(value: np.ndarray[Any, Any], scalar: bool) -> dict[str, Any]:
+    return _described(value, scalar, base64.b64encode(_content(value)).decode())
+
+
+def _array_digest(value: np.ndarray[Any, Any], scalar: bool) -> dict[str, Any]:
+    """As `_array`, the content by its digest only: the text of many megabytes takes longer than what is kept for it."""
+    return _described(value, scalar, digest(_content(value)))
+
+
+def _content(value: np.ndarray[Any, Any]) -> bytes:
     if value.dtype.kind not in "biufc":
         raise TypeError(f"an array of {value.dtype} cannot be kept")
-    content = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
+    return np.ascontiguousarray(value).tobytes()
+
+
+def _described(value: np.ndarray[Any, Any], scalar: bool, content: str) -> dict[str, Any]:
     return {_KIND: "s" if scalar else "a", "type": value.dtype.str, "shape": list(value.shape), "v": content}
 
 
