@@ -25,8 +25,8 @@ from hvdc_ident.simulate import simulate
 
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
-GLANCE = 6
-"""Evaluations of a further start, which goes on only where it is better by then than the first at its end."""
+GLANCE = 3
+"""Evaluations of each of several starts, of which the best goes on: its start, and the first two steps."""
 SCANNED = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
 
@@ -145,49 +145,52 @@ def found_by(refit: Refit) -> RefitResult:
 
 
 def run(job: RefitJob) -> Refit:
-    """The best end of the starts, judged on the held-out experiments too; a failure is told, not raised."""
-    best: Refit | None = None
-    why = ""
+    """The end of the best start, judged on the held-out experiments too; a failure is told, not raised."""
     scanned = any(effects()[p.candidate.effect].needs_grid for p in job.placed)
     most = min(job.evaluations, SCANNED) if scanned else job.evaluations
-    begins = _apart(job.begins)
-    for k, begin in enumerate([*begins, *job.spare]):
-        if best is not None and k >= len(begins):
-            break
-        try:
-            end = _walked(job.problem, begin, most, None if best is None else best.chi2)
-            # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
-            if end.cost is None:
-                why = end.message
-                continue
-            if best is None or 2.0 * end.cost < best.chi2:
-                best = Refit(
-                    job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost,
-                    ended=scanned or end.status != "max-evaluations",
-                )  # fmt: skip
-        except HvdcIdentError as error:
-            why = str(error)
-    if best is None:
-        return Refit(job.model, job.placed, job.problem, job.noise, job.begins[0], failure=why or "no start succeeded")
+    end = _best_walk(job, most)
+    # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
+    if end.cost is None:
+        return Refit(job.model, job.placed, job.problem, job.noise, job.begins[0], failure=end.message)
+    ended = scanned or end.status != "max-evaluations"
+    best = Refit(job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost, ended=ended)
     try:
         return judged(best)
     except HvdcIdentError as error:
         return replace(best, failure=str(error))
 
 
+def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
+    """The end of a walk of so many evaluations from the start whose first steps come lowest; a failed one where none runs."""
+    starts = _apart(job.begins)
+    glance = most if len(starts) == 1 else min(GLANCE, most)
+    walks = [_walk(job.problem, begin, glance) for begin in starts]
+    best = min(walks, key=_cost)
+    for begin in job.spare:
+        if best.cost is not None:
+            break
+        best = _walk(job.problem, begin, glance)
+    if best.status != "max-evaluations" or glance == most:
+        return best
+    further = _walk(job.problem, best.theta, most - glance)
+    return further if _cost(further) <= _cost(best) else best
+
+
+def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:
+    """The end of a walk, failed with the reason where the model raises."""
+    try:
+        return replace(METHOD, max_evaluations=evaluations).run(problem, begin)
+    except HvdcIdentError as error:
+        return OptimiserResult(begin, None, "failed", str(error), 0)
+
+
+def _cost(walk: OptimiserResult) -> float:
+    return np.inf if walk.cost is None else walk.cost
+
+
 def _apart(begins: Sequence[Array]) -> list[Array]:
     """The starts, each once."""
     return [b for k, b in enumerate(begins) if not any(np.array_equal(b, a) for a in begins[:k])]
-
-
-def _walked(problem: Problem, begin: Array, most: int, beat: float | None) -> OptimiserResult:
-    """The end of a walk of so many evaluations; with a chi2 to beat, that of a glance unless it is beaten by then."""
-    if beat is None or most <= GLANCE:
-        return replace(METHOD, max_evaluations=most).run(problem, begin)
-    end = replace(METHOD, max_evaluations=GLANCE).run(problem, begin)
-    if end.status != "max-evaluations" or end.cost is None or not 2.0 * end.cost < beat:
-        return end
-    return replace(METHOD, max_evaluations=most - GLANCE).run(problem, end.theta)
 
 
 def judged(refit: Refit) -> Refit:
