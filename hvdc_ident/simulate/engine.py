@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import Lock
@@ -184,7 +184,7 @@ class Engine:
         return state, self._room(state.copy())
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
-        """True where the explicit pair is the better choice: no unknowns, and no mode so fast that it would rule the step."""
+        """True where the explicit pair is the better choice: no unknowns, and no eigenvalue so fast that it would rule the step."""
         s = self.structure.sizes
         if method != "auto":
             if method == "explicit" and s.nz:
@@ -198,7 +198,7 @@ class Engine:
             if s.nz:
                 self._explicit = False
             else:
-                fastest = np.abs(np.linalg.eigvals(self.jacobian(p, y, w))).max(initial=0.0)
+                fastest = max(np.abs(np.linalg.eigvals(j)).max(initial=0.0) for j in self._jacobians(p, y, w))
                 # The explicit pair takes some fastest * span / 3 steps whatever the tolerance, each for about half the
                 # work of one of the other's, which needs some hundreds to follow a waveform.
                 self._explicit = bool(fastest * span < 3e3)
@@ -206,12 +206,20 @@ class Engine:
 
     def jacobian(self, p: Array, y: Array, w: Array) -> Array:
         """d[f; g]/d[x; z], (n, n), at y and w with modes as the values say."""
+        return next(self._jacobians(p, y, w))
+
+    def _jacobians(self, p: Array, y: Array, w: Array) -> Iterator[Array]:
+        """The Jacobian in the mode that the values say, then with each switch the other way: a play is slow until it is passed."""
         s = self.structure.sizes
         n = s.nx + s.nz
-        m, jac = np.zeros(max(s.ns, 1)), np.zeros((n, n))
+        m = np.zeros(max(s.ns, 1))
         evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
-        evaluate(self._address[NAMES.index("jac")], y, w, p, m, jac.reshape(-1))
-        return jac
+        for other in (None, *range(s.ns)):
+            mode, jac = m.copy(), np.zeros((n, n))
+            if other is not None:
+                mode[other] = 1.0 - mode[other]
+            evaluate(self._address[NAMES.index("jac")], y, w, p, mode, jac.reshape(-1))
+            yield jac
 
 
 @lru_cache(maxsize=64)

@@ -128,16 +128,37 @@ def test_rate_limit_follows_its_definition_and_the_ideal_one():
     np.testing.assert_allclose(y, ideal, atol=5.0 * (2e-4 + 5e-4))
 
 
+def play(u, width):
+    """The play operator of Krasnosel'skii: the least movement that keeps |u - y| within half of the width."""
+    y = np.empty_like(u)
+    y[0] = u[0]
+    for k in range(1, u.size):
+        y[k] = min(max(y[k - 1], u[k] - width / 2), u[k] + width / 2)
+    return y
+
+
 def test_backlash_is_the_play_operator():
     fine = np.linspace(0.0, 1.0, 200_001)
-    v = U(fine)
-    y = np.empty_like(v)
-    y[0] = v[0]
-    for k in range(1, v.size):  # Krasnosel'skii: the least movement that keeps |u - y| within half of the play
-        y[k] = min(max(y[k - 1], v[k] - 0.1), v[k] + 0.1)
-    mine = passed("backlash", {"width": 0.2})
-    away = (T < 0.3) | (T > 0.302)  # the pull after the jump takes some 0.2 ms
-    np.testing.assert_allclose(mine[away], np.interp(T, fine, y)[away], atol=2e-4 * 6.0 * 1.05)
+    ideal = np.interp(T, fine, play(U(fine), 0.2))
+    away = np.abs(T - 0.3) > 1e-9  # at the jump both of its sides are right
+    np.testing.assert_allclose(passed("backlash", {"width": 0.2})[away], ideal[away], atol=3e-5)
+
+
+@pytest.mark.parametrize("period", [0.005, 1.0, 3600.0])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8])
+def test_backlash_lets_go_where_a_signal_turns_however_slow_it_is(period, rtol):
+    """A sine that swells, without a corner that an integrator would be told of."""
+    speed = 2 * np.pi / period
+    states = {
+        "a": {"derivative": f"{speed} * b", "start": 0.0},
+        "b": {"derivative": f"-{speed} * a", "start": 1.0},
+    }
+    model = Model("m", states=states, signals={"u": f"a * (1 + 0.3 * time / {period})"}, outputs={"y": "u"})
+    model = apply_effects(model, [{"effect": "backlash", "at": "u", "parameters": {"width": 0.2}}])
+    fine = np.linspace(0.0, 2.2 * period, 200_001)
+    expected = play(np.sin(2 * np.pi * fine / period) * (1 + 0.3 * fine / period), 0.2)[::1000]
+    found = simulate(model, experiment("e", fine[::1000]), rtol=rtol)["y"]
+    np.testing.assert_allclose(found, expected, atol=1e-7 * speed * 1.7 + 100 * rtol)
 
 
 def test_quantisation_rounds():

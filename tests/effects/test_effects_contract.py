@@ -68,9 +68,8 @@ NEARLY = {
     "window-mean": {"T": 4e-5},
     "sample-hold": {"Ts": 1e-4, "compute": 0.0},
 }
-FOLLOWING = ("backlash", "rate-limit")  # they follow within 0.2 ms, however close to neutral
 SMALL = {
-    **dict.fromkeys(FOLLOWING, 2e-3),
+    "rate-limit": 2e-3,  # it follows within 0.2 ms, however close to neutral
     "sample-hold": 1e-3,
     "quantisation": 3e-4,
     "window-mean": 1e-4,

@@ -140,6 +140,9 @@ TOGETHER = [  # plant, effect, slot, from, parameters
     ("converter", "limit", "idref", "", {"level": 0.52}),
     ("converter", "gain", "theta", "", {"k": 0.97}),
     ("converter", "droop", "Pref", "theta", {"k": 0.5}),
+    ("machine", "backlash", "gate", "", {"width": 0.03}),
+    ("converter", "backlash", "vcq", "", {"width": 0.0015}),
+    ("converter", "backlash", "erd", "", {"width": 0.02}),
 ]
 
 
