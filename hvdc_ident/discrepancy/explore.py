@@ -28,6 +28,7 @@ from hvdc_ident.discrepancy.refitted import (
     refitted,
     telling,
 )
+from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.size_profile import has_to_be_met, resized, sized
 from hvdc_ident.effects import Probe, effects
@@ -88,13 +89,13 @@ def _with_sizes_to_be_met(
 def _with_the_others(
     search: SearchContext, opened: Round, trials: list[CandidateFit], field: Sequence[Pick], taken: Sequence[Pick]
 ) -> tuple[Round, list[CandidateFit]]:
-    """The trials with proposals that promise less, so many at a time while nothing comes near the noise.
+    """The trials with proposals that promise less, so many at a time while nothing explains the gap.
 
     taken: those that were refitted. The round keeps the number of those that never were.
     """
     done = {id(p) for p in taken}
     batches = math.inf if search.options.thorough else BATCHES
-    while all_far(opened.before, trials) and not opened.law:
+    while _unexplained(search, opened, trials) and not opened.law:
         rest = [p for p in field if id(p) not in done]
         taken = _entrants(opened, rest)
         if not taken or not batches or search.spent:
@@ -106,18 +107,24 @@ def _with_the_others(
     return opened, trials
 
 
+def _unexplained(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where no refit comes near the noise, and the best leaves more of the gap than a verdict passes over."""
+    far = all_far(opened.before, trials)
+    return far and not any(is_small(search, opened.before, t.refit) for t in by_cost(trials)[:BEAM])
+
+
 def _noise(search: SearchContext, trials: Sequence[CandidateFit]) -> bool:
     best = next(iter(by_cost(trials)), None)
     return best is None or is_noise(best.refit, search.seed)
 
 
 def _outside(search: SearchContext, opened: Round, nominal: Nominal, trials: Sequence[CandidateFit]) -> Round:
-    """The round with a filter, or where nothing comes near the noise a formula, from outside the catalogue, if one does."""
+    """The round with a filter, or where nothing explains the gap a formula, from outside the catalogue, if one does."""
     best = by_cost(trials)[0].refit
     tried = filters(search, opened, nominal)
     opened = replace(opened, filters=tried)
     found = filtered(search, opened, tried, best)
-    if found is None and all_far(opened.before, trials):
+    if found is None and _unexplained(search, opened, trials):
         found = law(search, opened, best)
         return replace(opened, laws=() if found is None else (found,))
     return opened if found is None else replace(opened, laws=(found,))

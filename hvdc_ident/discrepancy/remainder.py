@@ -24,6 +24,7 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
+from hvdc_ident.discrepancy.refitted import left_by
 from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import SimulationError
@@ -70,6 +71,12 @@ class Remainder:
         """True where nobody need ask what is left: next to nothing of the gap, or a small part and within every output's tolerance."""
         within = bool(self.beyond) and max(self.beyond.values()) <= 1.0
         return self.largest <= TOLERANCE or (within and self.largest <= REFUTED)
+
+
+def is_small(search: SearchContext, first: Refit, last: Refit) -> bool:
+    """Return True where the hypothesis `last` leaves a small part of the gap of `first`, and no output more than its tolerance."""
+    beyond = _beyond(search.tolerance, last, 1.0).values()
+    return left_by(last) <= REFUTED * left_by(first) and max(beyond, default=np.inf) <= 1.0
 
 
 @dataclass(frozen=True, eq=False)

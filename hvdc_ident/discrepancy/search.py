@@ -17,6 +17,7 @@ from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
 from hvdc_ident.discrepancy.refit_jobs import as_given, job_of
 from hvdc_ident.discrepancy.refitted import is_far, is_noise
 from hvdc_ident.discrepancy.released import released
+from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.errors import HvdcIdentError, SimulationError
@@ -36,23 +37,24 @@ class SearchOutcome:
 
 
 def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
-    """The search from the refitted gains; where that leaves more than noise, from the given ones if it then ends nearer.
+    """The search from the refitted gains; where that leaves more than anybody asks about, from the given ones if it then ends nearer.
 
     Gains that have moved far to make up for what is missing may leave no room for it: beside them a lag of its true size is
     unstable, and no score tells of it. first: the nominal model, refitted.
     """
     outcome = forward(search, first)
     theta = as_given(first)
-    if theta is None or not is_far(first, outcome.refit) or search.spent:
+    last = outcome.refit
+    if theta is None or not is_far(first, last) or is_small(search, first, last) or search.spent:
         return outcome
     search.tell(0, 1, "once more, from the given values")
     try:
         again = forward(search, judged(replace(first, theta=theta)))
     except SimulationError as error:
         return replace(outcome, notes=(*outcome.notes, f"from the given values nothing was looked for: {error}"))
-    ruler = Ruler.of(min(outcome.refit, again.refit, key=lambda r: r.chi2))
-    more = len(again.refit.problem.free) - len(outcome.refit.problem.free)
-    nearer = bool(again.kept) and ruler.gain(outcome.refit.chi2, again.refit.chi2, more) > search.options.named_bic
+    ruler = Ruler.of(min(last, again.refit, key=lambda r: r.chi2))
+    more = len(again.refit.problem.free) - len(last.problem.free)
+    nearer = bool(again.kept) and ruler.gain(last.chi2, again.refit.chi2, more) > search.options.named_bic
     return again if nearer else outcome
 
 
