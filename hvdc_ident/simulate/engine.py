@@ -198,7 +198,9 @@ class Engine:
             if s.nz:
                 self._explicit = False
             else:
-                fastest = max(np.abs(np.linalg.eigvals(j)).max(initial=0.0) for j in self._jacobians(p, y, w))
+                # The other side of a switch need not be defined here: the root of a signal that is below 0 now.
+                known = [j for j in self._jacobians(p, y, w) if np.isfinite(j).all()]
+                fastest = max((np.abs(np.linalg.eigvals(j)).max(initial=0.0) for j in known), default=np.inf)
                 # The explicit pair takes some fastest * span / 3 steps whatever the tolerance, each for about half the
                 # work of one of the other's, which needs some hundreds to follow a waveform.
                 self._explicit = bool(fastest * span < 3e3)

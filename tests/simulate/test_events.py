@@ -232,3 +232,9 @@ def test_many_structures_leave_no_memory_behind():
 
     before = build(60)
     assert build(120) - before < 6_000  # KiB: an engine that stays would cost 100 KiB or more
+
+
+def test_the_other_side_of_a_switch_need_not_be_defined():
+    model = Model("m", states={"x": State("where(x > 0, x**0.3, 0) - (x + 1)", start=-2)}, outputs={"x": "x"})
+    run = experiment("root", np.linspace(0, 1, 5))
+    np.testing.assert_allclose(simulate(model, run, **TIGHT)["x"], -1 - np.exp(-run.time), atol=1e-9)
