@@ -252,7 +252,7 @@ def _consistent(found: dict[str, Any]) -> str:
         they = "They" if len(effects) > 1 else "It"
         first += f" {they} may stand for something that none of those tried is: {found['doubt']}."
     else:
-        first += " No other effect of the catalogue, and no other place, explains the recordings as well."
+        first += " No other effect that was tried, and no other place, explains the recordings as well."
     if not found.get("doubt") and not (found.get("remaining") or {}).get("adequate", True):
         first += " It is not all that is missing: with it the residuals are still not noise."
     return first

@@ -104,7 +104,7 @@ def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp
     assert "cannot tell it from: delay at P2_m. It is not all that is missing" in consistent
     alone = diagnosis(ambiguity=[rivals[1:]], remaining={"adequate": True})
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, alone))).sentences
-    assert "No other effect of the catalogue" in consistent and "not all" not in consistent
+    assert "No other effect that was tried" in consistent and "not all" not in consistent
     doubted = diagnosis(ambiguity=[rivals[1:]], remaining={"adequate": True}, doubt="the first rows are loud")
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, doubted))).sentences
     assert "none of those tried is: the first rows are loud." in consistent and "No other effect" not in consistent
