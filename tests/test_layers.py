@@ -19,8 +19,8 @@ fmu linearize sensitivity fit identifiability discrepancy report study api app c
 INSIDE = {
     "discrepancy": """
 noise_colour options result signatures placed record_noise size_curves nominal refit scores bode evidence
-explain formula latent race residual_checks context localise refit_jobs remainder size_profile proposals
-refitted released outside explore rounds alternatives search candidate_table classes verdict diagnosis
+explain formula latent race residual_checks context localise refit_jobs size_profile proposals
+refitted remainder released outside explore rounds alternatives search candidate_table classes verdict diagnosis
 """
 }
 
