@@ -25,6 +25,11 @@ def with_unit(name: str, unit: str) -> str:
     return f"{name}, {unit}" if unit else name
 
 
+def percentage(share: float, digits: int = 0) -> str:
+    """Return a share of 1 in per cent, so many digits after the point."""
+    return f"{100.0 * share:.{digits}f} %"
+
+
 def duration(seconds: float) -> str:
     """Return a waiting time in s, min or h with two digits."""
     for above, unit in ((3600.0, "h"), (60.0, "min")):

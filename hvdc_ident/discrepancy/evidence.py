@@ -12,6 +12,7 @@ from hvdc_ident.discrepancy.refit import Refit, held_out, held_out_by_record, un
 from hvdc_ident.discrepancy.scores import Scores
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import effects
+from hvdc_ident.text import percentage
 
 CLEARLY = 30.0
 """In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say. With a smaller squared
@@ -194,7 +195,9 @@ def objections(
         if not (shown and ((was**2 - now**2) * unseen_rows(refit) > options.named_bic or silent(before, refit))):
             return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
     if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
-        return f"it closes less than {STEP:.0%} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
+        return (
+            f"it closes less than {percentage(STEP)} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
+        )
     return ""
 
 

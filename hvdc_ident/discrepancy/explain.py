@@ -19,7 +19,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import listed, quantity
+from hvdc_ident.text import listed, percentage, quantity
 
 MOST_PLACES = 4
 """Signals at most that are asked for."""
@@ -158,7 +158,7 @@ def off_given(last: Refit, given: Refit) -> Finding | None:
     if found is None:
         return None
     share = 1.0 - max(last.chi2 - last.rows, 0.0) / (before - last.rows)
-    text = f"No effect is missing: {found.text[:-1]}. That explains {share:.1%} of the gap."
+    text = f"No effect is missing: {found.text[:-1]}. That explains {percentage(share, 1)} of the gap."
     return replace(found, text=text, share=share)
 
 

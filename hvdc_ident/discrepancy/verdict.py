@@ -26,7 +26,7 @@ from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, Verdict
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.text import listed
+from hvdc_ident.text import listed, percentage
 
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
@@ -75,7 +75,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
     remainder = remainder_of(search, first, last, floor)
     labels = ", ".join(p.candidate.label for p in last.placed)
     if remainder.share > 1.0 - DOMINANT:
-        text = f"Something is missing; the best of the catalogue ({labels}) explains only {1 - remainder.share:.0%} of the gap."
+        text = f"Something is missing; the best of the catalogue ({labels}) explains only {percentage(1 - remainder.share)} of the gap."
         return Judgement("unnameable", text, tests, remainder=remainder)
     sets = tuple(rivals(r, options, search.tries) for r in outcome.kept)
     sets, better = _with_formulas(search, outcome, sets)
@@ -147,19 +147,23 @@ def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
         ", within the tolerance" if left.below_tolerance else ""
     )
     caveat = f" {judgement.caveat[:1].upper()}{judgement.caveat[1:]}." if judgement.caveat else ""
-    return f"{' '.join(f.text for f in findings)} {explains} {1.0 - left.share:.1%} of the gap; {rest}.{caveat}"
+    return (
+        f"{' '.join(f.text for f in findings)} {explains} {percentage(1.0 - left.share, 1)} of the gap; {rest}.{caveat}"
+    )
 
 
 def _rest(remainder: Remainder) -> str:
     """Return the remainder in words; empty where it may be noise."""
     parts = []
     if remainder.p <= REFUTED_P and remainder.share > TOLERANCE:
+        left = percentage(remainder.share, 1)
         parts.append(
-            f"{remainder.share:.1%} of the gap is left, which is no noise and which an unknown input at {remainder.at} would explain"
+            f"{left} of the gap is left, which is no noise and which an unknown input at {remainder.at} would explain"
         )
-    if (remainder.held_out or 0.0) > TOLERANCE and remainder.held_out_p <= REFUTED_P:
+    held = remainder.held_out or 0.0
+    if held > TOLERANCE and remainder.held_out_p <= REFUTED_P:
         record = f", most of it in '{remainder.record}' ({remainder.record_units:.3g} times the noise)"
-        parts.append(f"{remainder.held_out:.1%} of the held-out gap is left{record if remainder.record else ''}")
+        parts.append(f"{percentage(held, 1)} of the held-out gap is left{record if remainder.record else ''}")
     return "; ".join(parts)
 
 
@@ -174,7 +178,7 @@ def _class_text(each: Sequence[EffectClass]) -> str:
         at = list(dict.fromkeys(r.at for r, _ in c.members))
         where = ", or at ".join(listed(places) for places in at[:TOLD])
         more = f", or at one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
-        told.append(f"{' or '.join(c.kinds)} ({c.probability:.0%}) at {where}{more}")
+        told.append(f"{' or '.join(c.kinds)} ({percentage(c.probability)}) at {where}{more}")
     return "; or ".join(told)
 
 

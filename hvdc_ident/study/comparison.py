@@ -14,7 +14,7 @@ from hvdc_ident.report.answers import joined_gap
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.stages import Stage, stages
-from hvdc_ident.text import figures_of, listed
+from hvdc_ident.text import figures_of, listed, percentage
 
 SIDES = ("first", "second")
 APART = (
@@ -204,7 +204,7 @@ def finding_lines(findings: Sequence[Sequence[Mapping[str, Any]] | None]) -> lis
     lines = []
     for side, found in zip(SIDES, findings, strict=True):
         if found is not None:
-            said = [f"{f['effect']} ({f['probability']:.0%}): {f['text']}" for f in found]
+            said = [f"{f['effect']} ({percentage(f['probability'])}): {f['text']}" for f in found]
             lines.append(f"missing, {side}: {' '.join(said) or 'nothing was found'}")
     kinds = [sorted(f["effect"] for f in found) for found in findings if found is not None]
     if len(kinds) == 2 and any(kinds):

@@ -17,7 +17,7 @@ from hvdc_ident.display import Table, rounded
 from hvdc_ident.linearize import loop, margins
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study.run_summary import values_table
-from hvdc_ident.text import listed, quantity
+from hvdc_ident.text import listed, percentage, quantity
 
 FILE = "truth.json"
 """Name of the file in the folder of results; the report reads it there."""
@@ -70,7 +70,7 @@ def found_effect(diagnosis: Mapping[str, Any]) -> str:
     for f in findings:
         delay = f.get("equivalent_delay") or {}
         size = f" that acts as a delay of {quantity(delay['value'], 's')}" if delay.get("value") else ""
-        said.append(f"{f['effect']}{size} ({f['probability']:.0%})")
+        said.append(f"{f['effect']}{size} ({percentage(f['probability'])})")
     return "; ".join(said) or "nothing"
 
 

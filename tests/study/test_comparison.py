@@ -145,7 +145,7 @@ def test_findings_stand_beside_each_other(pair: tuple[Path, Path], tmp_path: Pat
         found = {"verdict": "named" if findings else "no-evidence", "text": name, "findings": findings}
         (folder / "discrepancy.json").write_text(json.dumps({**heading, **found}))
     result = call("compare", tmp_path / "one", tmp_path / "none", "--out", tmp_path)
-    assert "missing, first: lag (90%): T = 2 ms" in result.stdout
+    assert "missing, first: lag (90 %): T = 2 ms" in result.stdout
     assert (
         "missing, second: nothing was found" in result.stdout and "missing: different effects in both" in result.stdout
     )

@@ -64,7 +64,7 @@ def test_the_screen_and_the_page_have_the_truth_beside_what_was_found(tmp_path: 
     lines = truth_lines(truth, fit, diagnosis)
     assert lines[2].split()[-1] == "true"
     assert lines[3].split() == ["KIP", "pu/s", "28", "31.25", "31", "to", "31.5", "29.875", "30"]
-    assert found_effect(diagnosis) == "lag that acts as a delay of 1.4 ms (98%)" and found_effect({}) == "nothing"
+    assert found_effect(diagnosis) == "lag that acts as a delay of 1.4 ms (98 %)" and found_effect({}) == "nothing"
     assert lines[-1].startswith("missing, true: vsc-hvdc-avm has further states in its dc link, current control, PLL, ")
     assert f"delay the loop of Irorder2 by {1e3 * truth['delays'][0]['seconds']:.4g} ms (at 4.77 Hz)" in lines[-1]
     heading = {"schema": 1, "study": "demo", "model": "vsc-hvdc-link", "software": "hvdc_ident"}

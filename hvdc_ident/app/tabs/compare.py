@@ -15,6 +15,7 @@ from hvdc_ident.app.server import Tab
 from hvdc_ident.display import Table, rounded
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.study.comparison import APART, GAPS, SIDES, RunComparison, value_texts
+from hvdc_ident.text import percentage
 
 
 class ComparedRuns:
@@ -112,7 +113,7 @@ class ComparedRuns:
             if not findings:
                 ui.label("No diagnosis has run." if findings is None else "Nothing was found.")
             for f in findings or ():
-                ui.label(f"{f['effect']} ({f['probability']:.0%}): {f['text']}")
+                ui.label(f"{f['effect']} ({percentage(f['probability'])}): {f['text']}")
 
     def _give(self) -> None:
         if self._found is not None:

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.signatures.candidates import kind_of, source_signals
 from hvdc_ident.effects import effects
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import listed
+from hvdc_ident.text import listed, percentage
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,9 @@ def _formula_found(found: Law) -> Fallback:
     if found.others:
         said.append(f"As good: {listed([labelled(r) for r in found.others])}.")
     if found.stability is not None and found.stability < STABLE:
-        said.append(f"With other noise other terms would have been chosen in {1 - found.stability:.0%} of all cases.")
+        said.append(
+            f"With other noise other terms would have been chosen in {percentage(1 - found.stability)} of all cases."
+        )
     return Fallback(
         "term", place, " ".join(said), placed.use.expression, _sizes(refit), found.stability, found.gain, None,
         tuple({"at": r.placed[-1].candidate.at[0], "expression": r.placed[-1].use.expression} for r in found.others), refit,

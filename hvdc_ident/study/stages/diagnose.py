@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
-from hvdc_ident.text import form_of
+from hvdc_ident.text import form_of, percentage
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis
@@ -106,7 +106,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     lines = [f"{data['verdict']}: {data['text']}"]
     findings = data.get("findings") or []
     if data["verdict"] != "named" and data["effects"]:
-        lines += [f"Probability {f['probability']:.0%}: {f['text']}" for f in findings]
+        lines += [f"Probability {percentage(f['probability'])}: {f['text']}" for f in findings]
     pooled = data["gap"]["pooled"]
     shown = [
         f"{n} {pooled[n]['fit']:.3g}" for n in ("nominal", "refitted", "augmented") if pooled[n]["fit"] is not None
