@@ -10,6 +10,7 @@ Young, 1993 (the largest of several statistics under noise).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -33,8 +34,6 @@ from hvdc_ident.immutable import FrozenMap
 
 NOISE_SHARE, RANGE_SHARE = 0.1, 0.01
 """Of an output's noise, and of its range: an error below the larger is of no interest where the study says nothing else."""
-DRAWS = 100
-"""Records of noise: a p of 1 % is the least that is asked for."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,8 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     jobs = [_LatentJob(nominal, {n: p.only(s) for n, p in inner.items()}, s, None) for s in places]
     falls = list(mapped(search.executor, _fall, jobs))
     best = sorted(range(len(places)), key=lambda k: -falls[k])[:SHORTLIST]
-    drawn = draws(nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), DRAWS, search.seed + 5)
+    count = math.ceil(1.0 / search.options.significance)  # the least p that is asked for
+    drawn = draws(nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), count, search.seed + 5)
     noise = nominal.projected(np.vstack(drawn))
     jobs = [_LatentJob(nominal, {n: p.only(places[k]) for n, p in inner.items()}, places[k], noise) for k in best]
     table = np.array(list(mapped(search.executor, _log_evidence, jobs))).reshape(len(jobs), -1)

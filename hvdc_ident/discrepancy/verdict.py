@@ -32,7 +32,6 @@ DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
-REFUTED_P = 0.01
 TOLD = 3
 """Places of an effect that a sentence lists."""
 STRONG = 0.1
@@ -70,7 +69,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
         return _nothing(search, last, outcome, tests)
     floor = noise_left(left)
     # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
-    if all(b.p > REFUTED_P for b in tests):
+    if all(b.p > options.significance for b in tests):
         floor = max(floor, last.chi2 / last.rows)
     remainder = remainder_of(search, first, last, floor)
     labels = ", ".join(p.candidate.label for p in last.placed)
@@ -83,17 +82,19 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better, remainder=remainder)
     explained = first.chi2 - last.chi2
-    return _weighed(outcome, left, explained, Judgement("named", "", tests, sets, remainder=remainder), labels)
+    return _weighed(search, outcome, left, explained, Judgement("named", "", tests, sets, remainder=remainder), labels)
 
 
-def _weighed(outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str) -> Judgement:
+def _weighed(
+    search: SearchContext, outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str
+) -> Judgement:
     """The judgement: named, ambiguous where several classes are likely or something else may be behind one, or unnameable where
     too much is left that a latent input would explain."""
     assert found.remainder is not None
     remainder, each = found.remainder, [classes(g) for g in found.sets]
     sure = all(c[0].probability >= CERTAIN for c in each)
     names = "; and ".join(_class_text(c) for c in each)
-    rest = _rest(remainder)
+    rest = _rest(remainder, search.options.significance)
     if rest and remainder.largest > REFUTED:
         if sure or _all_of_one_kind(found.sets):
             text = f"Missing: something like {names}. It is not all of it: {rest}."
@@ -152,16 +153,16 @@ def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
     )
 
 
-def _rest(remainder: Remainder) -> str:
-    """Return the remainder in words; empty where it may be noise."""
+def _rest(remainder: Remainder, significance: float) -> str:
+    """Return the remainder in words; empty where it may be noise, at this level."""
     parts = []
-    if remainder.p <= REFUTED_P and remainder.share > TOLERANCE:
+    if remainder.p <= significance and remainder.share > TOLERANCE:
         left = percentage(remainder.share, 1)
         parts.append(
             f"{left} of the gap is left, which is no noise and which an unknown input at {remainder.at} would explain"
         )
     held = remainder.held_out or 0.0
-    if held > TOLERANCE and remainder.held_out_p <= REFUTED_P:
+    if held > TOLERANCE and remainder.held_out_p <= significance:
         record = f", most of it in '{remainder.record}' ({remainder.record_units:.3g} times the noise)"
         parts.append(f"{percentage(held, 1)} of the held-out gap is left{record if remainder.record else ''}")
     return "; ".join(parts)
