@@ -10,12 +10,12 @@ import numpy as np
 
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between
-from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
+from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
 from hvdc_ident.discrepancy.refit_jobs import as_given, job_of
-from hvdc_ident.discrepancy.refitted import is_far, is_noise
+from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by
 from hvdc_ident.discrepancy.released import released
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
@@ -89,6 +89,7 @@ def _behind(one: Refit, other: Refit) -> float:
 
 def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round]) -> SearchOutcome:
     """The search from the nominal model `here`; rounds: its first, where that is done."""
+    nominal = here
     kept: list[Round] = []
     notes: tuple[str, ...] = ()
     for number in range(1, search.options.most + 1):
@@ -121,7 +122,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             kept += both
             assert both[1].winner is not None
             here = both[1].winner.refit
-            if not is_noise(here, search.seed):
+            if not _explains(search, nominal, here):
                 base, here = released(search, base, here)
             break
         kept.append(found)
@@ -129,13 +130,18 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         if is_noise(here, search.seed):
             break
         base, here = released(search, base, here)
-        if here is not found.winner.refit and is_noise(here, search.seed):
+        if _explains(search, nominal, here):
             break
     # Where a parameter was set free beside an effect, its rivals were refitted without that.
     if kept and not search.spent and (len(kept) > 1 or _closed_to(base, kept[0])):
         here, kept, more = settled(search, base, here, kept, len(rounds))
         notes += more
     return SearchOutcome(here, tuple(rounds), tuple(kept), notes)
+
+
+def _explains(search: SearchContext, nominal: Refit, here: Refit) -> bool:
+    """Return True where a hypothesis leaves noise, or so little of the gap that nobody asks about it: no effect is added to it."""
+    return left_by(here) <= TOLERANCE * left_by(nominal) or is_noise(here, search.seed)
 
 
 def _closed_to(base: Refit, found: Round) -> bool:
