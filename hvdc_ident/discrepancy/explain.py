@@ -163,14 +163,15 @@ def off_given(last: Refit, given: Refit) -> Finding | None:
 
 
 def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:
-    """The parameters, of those named, whose values are clearly off the given ones, as one finding; None where none is."""
+    """The parameters, of those named, whose estimates are clearly off the given values, as one finding; None where none is."""
     problem = last.problem
     spans = np.array([u.span for u in problem.unknowns])
     known = uncertainty(problem.blocks(last.theta), problem.names, spans, dict.fromkeys(problem.outputs, "given"))
     sizes, told = {}, []
     for k in last.gains:
         free, value, std = problem.free[k], float(last.theta[k]), known.std(problem.free[k].name)
-        if free.name not in names or std is None or abs(value - free.given) <= SURE * std:
+        # A value on its bound is no estimate.
+        if free.name not in names or free.on_bound(value) or std is None or abs(value - free.given) <= SURE * std:
             continue
         unit = last.model.parameters[free.name].unit
         sizes[free.name] = EffectSize(value, (value - 1.96 * std, value + 1.96 * std), unit)
