@@ -82,11 +82,12 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Judgement("unnameable", text, tests, instead=better, remainder=remainder)
     explained = first.chi2 - last.chi2
-    return _weighed(search, outcome, left, explained, Judgement("named", "", tests, sets, remainder=remainder), labels)
+    found = Judgement("named", "", tests, sets, remainder=remainder)
+    return _weighed(outcome, left, explained, found, labels, options.significance)
 
 
 def _weighed(
-    search: SearchContext, outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str
+    outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str, significance: float
 ) -> Judgement:
     """The judgement: named, ambiguous where several classes are likely or something else may be behind one, or unnameable where
     too much is left that a latent input would explain."""
@@ -94,7 +95,7 @@ def _weighed(
     remainder, each = found.remainder, [classes(g) for g in found.sets]
     sure = all(c[0].probability >= CERTAIN for c in each)
     names = "; and ".join(_class_text(c) for c in each)
-    rest = _rest(remainder, search.options.significance)
+    rest = _rest(remainder, significance)
     if rest and remainder.largest > REFUTED:
         if sure or _all_of_one_kind(found.sets):
             text = f"Missing: something like {names}. It is not all of it: {rest}."

@@ -169,7 +169,7 @@ def rated(groups: Sequence[Sequence[Rival]], **remainder: float) -> Judgement:
     refit = plain(experiments())
     left = Remainder(**({"share": 0.0, "held_out": 0.0, "noise_units": 1.0} | remainder), at="wm")  # type: ignore[arg-type]
     found = Judgement("named", "", (), tuple(tuple(g) for g in groups), remainder=left)
-    return _weighed(SearchOutcome(refit, (), ()), refit.nominal(), 1000.0, found, "lag at wm")
+    return _weighed(SearchOutcome(refit, (), ()), refit.nominal(), 1000.0, found, "lag at wm", 0.01)
 
 
 def rival(effect: str, at: str, behind: float = 0.0, **values: float) -> Rival:
