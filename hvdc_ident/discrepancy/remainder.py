@@ -74,8 +74,9 @@ class Remainder:
 
 def is_small(search: SearchContext, first: Refit, last: Refit) -> bool:
     """Return True where the hypothesis `last` leaves a small part of the gap of `first`, and no output more than its tolerance."""
-    beyond = _beyond(search.tolerance, last, 1.0).values()
-    return left_by(last) <= REFUTED * left_by(first) and max(beyond, default=np.inf) <= 1.0
+    if not left_by(last) <= REFUTED * left_by(first):
+        return False
+    return max(_beyond(search.tolerance, last, 1.0).values(), default=np.inf) <= 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,7 +122,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             kept += both
             assert both[1].winner is not None
             here = both[1].winner.refit
-            if not _explains(search, nominal, here):
+            if not is_noise(here, search.seed):
                 base, here = released(search, base, here)
             break
         kept.append(found)
@@ -130,18 +130,15 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         if is_noise(here, search.seed):
             break
         base, here = released(search, base, here)
-        if _explains(search, nominal, here):
+        # Nothing is added where so little of the gap is left that nobody asks about it.
+        little = left_by(here) <= TOLERANCE * left_by(nominal)
+        if little or (here is not found.winner.refit and is_noise(here, search.seed)):
             break
     # Where a parameter was set free beside an effect, its rivals were refitted without that.
     if kept and not search.spent and (len(kept) > 1 or _closed_to(base, kept[0])):
         here, kept, more = settled(search, base, here, kept, len(rounds))
         notes += more
     return SearchOutcome(here, tuple(rounds), tuple(kept), notes)
-
-
-def _explains(search: SearchContext, nominal: Refit, here: Refit) -> bool:
-    """Return True where a hypothesis leaves noise, or so little of the gap that nobody asks about it: no effect is added to it."""
-    return left_by(here) <= TOLERANCE * left_by(nominal) or is_noise(here, search.seed)
 
 
 def _closed_to(base: Refit, found: Round) -> bool:
