@@ -82,7 +82,7 @@ def finding_table(diagnosis: Mapping[str, Any]) -> Table:
         places = [f"{', '.join(p['at'])} ({percentage(p['probability'])})" for p in f["places"]]
         more = [f"{len(places) - PLACES} more"] if len(places) > PLACES else []
         where = "; ".join([*places[:PLACES], *more])
-        rows.append((" or ".join(f["same_as"]), f"{percentage(f['probability'])}", "; ".join(sizes), where))
+        rows.append((" or ".join(f["same_as"]), percentage(f["probability"]), "; ".join(sizes), where))
     return Table(("effect", "probability", "size (95 %)", "likely at"), tuple(rows)).without_empty()
 
 

@@ -12,6 +12,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import percentage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -261,7 +262,7 @@ class Diagnosis(Shown):
         ]
         yield TextTable(("residual in noise units", "fitted data", "held out"), tuple(gaps))
         if self.gap.shrink_holdout is not None and self.effects:
-            yield f"The held-out gap shrinks by {100 * self.gap.shrink_holdout:.1f} %."
+            yield f"The held-out gap shrinks by {percentage(self.gap.shrink_holdout, 1)}."
         found = [
             (f.effect, f.probability, "; ".join(", ".join(p.at) for p in f.places[:4]), len(f.places))
             for f in self.findings

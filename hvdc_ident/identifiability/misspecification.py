@@ -19,6 +19,7 @@ from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, normalised, pivoted_order, standard_deviations
+from hvdc_ident.text import percentage
 
 LEVEL = 0.01
 """Level of the test of all parameters together (Bonferroni)."""
@@ -120,7 +121,7 @@ def misspecification(
             unit = f" {units[name]}" if units.get(name) else ""
             signs.append(
                 f"the experiments disagree on {name}: alone they would put it at {low:.4g} to {high:.4g}{unit} "
-                f"(Q {h.q:.0f} for {h.dof} degree{'' if h.dof == 1 else 's'} of freedom, I2 {100 * h.i2:.0f} %)"
+                f"(Q {h.q:.0f} for {h.dof} degree{'' if h.dof == 1 else 's'} of freedom, I2 {percentage(h.i2)})"
             )
     if optimum.excess > 1.0:
         signs.append(f"the residuals are {times_text(float(np.sqrt(optimum.excess)))} the noise")

@@ -16,7 +16,7 @@ import numpy as np
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.text import quantity
+from hvdc_ident.text import percentage, quantity
 
 Signal = tuple[str, str]
 """An output and an experiment."""
@@ -309,7 +309,7 @@ class Answers:
             and share >= 0.005
         ):
             at = f"; an unknown input at {left['at']} would explain it" if left.get("at") else ""
-            parts.append(f"{100 * share:.0f} % of the gap is left and is not noise{at}")
+            parts.append(f"{percentage(share)} of the gap is left and is not noise{at}")
         if isinstance(held, int | float) and held >= 0.005:
             where = f", most of it in {left['record']}" if left.get("record") else ""
             times = (
@@ -317,7 +317,7 @@ class Answers:
                 if left.get("record") and left.get("record_units")
                 else ""
             )
-            parts.append(f"on held-out recordings {100 * held:.0f} % is left{where}{times}")
+            parts.append(f"on held-out recordings {percentage(held)} is left{where}{times}")
         return ". ".join(p[:1].upper() + p[1:] for p in parts)
 
     @property

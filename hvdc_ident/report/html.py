@@ -8,6 +8,8 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from hvdc_ident.text import percentage
+
 
 def text(value: Any) -> str:
     """Any value as text that is safe inside a page."""
@@ -41,7 +43,7 @@ def rough(value: Any, digits: int = 2) -> str:
 
 def percent(share: float) -> str:
     """A share of 1 in whole per cent; one that is nearly nothing, or nearly all, is said so."""
-    return "< 1 %" if 0 < share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 - 1e-9 else f"{100 * share:.0f} %"
+    return "< 1 %" if 0 < share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 - 1e-9 else percentage(share)
 
 
 def decimals(low: float, high: float) -> int:

@@ -17,7 +17,7 @@ from hvdc_ident.report.answers import Answers, Errors
 from hvdc_ident.report.html import badge, estimate, number, table, text
 from hvdc_ident.report.overlay import Sheet, overlay_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.text import form_of, listed, quantity, span
+from hvdc_ident.text import form_of, listed, percentage, quantity, span
 
 FILE = "letter.html"
 STAGE = "discrepancy"
@@ -342,7 +342,7 @@ def _gained(found: dict[str, Any]) -> str:
     against = gap.get("held_out", "experiments")
     where = "experiments that no fit has seen" if against == "experiments" else against
     return (
-        f"Adding it shrinks the error on {where} by {100 * shrink:.0f} %, "
+        f"Adding it shrinks the error on {where} by {percentage(shrink)}, "
         f"measured against the same model with its gains fitted and nothing added{rest}."
     )
 

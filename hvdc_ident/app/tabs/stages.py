@@ -25,6 +25,7 @@ from hvdc_ident.app.server import Tab
 from hvdc_ident.app.worker import EVERYTHING, LETTER
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.study.run_summary import next_step
+from hvdc_ident.text import percentage
 
 LOOK = 0.3
 """Seconds between two looks at the run and at the files: it moves for the eye, and costs a look at some files' times."""
@@ -195,7 +196,7 @@ class StageDesk:
         trouble = self._unreadable
         if found is not None and working:
             self._bar.value = found.share
-            self._times.text = f"{100 * found.share:.0f} %, {found.times}" if found.share else found.times
+            self._times.text = f"{percentage(found.share)}, {found.times}" if found.share else found.times
             self._text.text = found.text
         elif found is not None:
             said = {"failed": found.message, "cancelled": "Cancelled. What was finished is kept; the next run goes on."}

@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
 from hvdc_ident.report.html import captioned, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, listed, span, with_unit
+from hvdc_ident.text import form_of, listed, percentage, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,7 +137,7 @@ def _gap(found: dict[str, Any]) -> str:
     caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
     shrink = gap.get("shrink_holdout")
     line = (
-        f"<p>On held-out recordings the effect shrinks the residual by {100 * shrink:.0f} % against the refitted model.</p>"
+        f"<p>On held-out recordings the effect shrinks the residual by {percentage(shrink)} against the refitted model.</p>"
         if shrink is not None and (found.get("augmented_model") or found.get("effects"))
         else ""
     )
@@ -211,11 +211,11 @@ def _where(found: dict[str, Any]) -> str:
         ends = f"{number(region['from'], 3)} and {number(region['to'], 3)}"
         parts.append(f"It is densest where {text(region['signal'])} lies between {ends}.")
     if slots := place.get("slots"):
-        listed = ", ".join(f"{text(n)} {100 * min(v, 1.0):.0f} %" for n, v in slots.items())
+        listed = ", ".join(f"{text(n)} {percentage(min(v, 1.0))}" for n, v in slots.items())
         parts.append(f"An effect at one insertion point could explain at most: {listed}.")
     explained, rest = left.get("explained_share"), "noise" if left.get("adequate") else "not all noise"
     if explained is not None:
-        parts.append(f"{100 * explained:.1f} % of the gap is explained; what is left is {rest}.")
+        parts.append(f"{percentage(explained, 1)} of the gap is explained; what is left is {rest}.")
     elif left:
         parts.append(f"What is left is {rest}.")
     if not parts:
@@ -224,7 +224,7 @@ def _where(found: dict[str, Any]) -> str:
 
 
 def _shares(found: dict[str, float] | None) -> str:
-    return ", ".join(f"{text(n)} {100 * v:.0f} %" for n, v in list((found or {}).items())[:5] if v >= SHOWN)
+    return ", ".join(f"{text(n)} {percentage(v)}" for n, v in list((found or {}).items())[:5] if v >= SHOWN)
 
 
 def _candidates(found: dict[str, Any]) -> str:

@@ -113,7 +113,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     ]
     lines.append(f"Residual in noise units: {', '.join(shown)}.")
     if data["augmented_model"] and data["gap"]["shrink_holdout"] is not None:
-        lines.append(f"The held-out gap shrinks by {100 * data['gap']['shrink_holdout']:.1f} %.")
+        lines.append(f"The held-out gap shrinks by {percentage(data['gap']['shrink_holdout'], 1)}.")
     for group in (g for g in data["ambiguity"] if len(g) > 1):
         members = "; ".join(f"{form_of(r)} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for r in group[:8])
         rest = f"; and {len(group) - 8} more" if len(group) > 8 else ""
