@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit
@@ -23,16 +21,16 @@ from hvdc_ident.discrepancy.refit import RefitJob
 from hvdc_ident.discrepancy.refitted import PRICE
 from hvdc_ident.discrepancy.rounds import gained
 from hvdc_ident.discrepancy.scores import Path
-from hvdc_ident.discrepancy.signatures.block import block, parameter
 from hvdc_ident.discrepancy.signatures.candidates import additive, proportional, source_signals
-from hvdc_ident.discrepancy.signatures.finite import Kind, is_linear, kind_of
-from hvdc_ident.effects import Probe, effects
+from hvdc_ident.discrepancy.signatures.finite import additions, is_linear, kind_of
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
 
 
 def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, ...], int]:
-    """The refits of forms outside the catalogue in the winner's stead, and out of how many they are the best; none that failed.
+    """The refits of forms outside the catalogue in the winner's stead, and out of how many they would be the best if all places
+    and sources were tried; none that failed.
 
     Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
     winner's pick. No formula of signals at one time is a delay: for one kind of these or another filters, wherever they are.
@@ -54,7 +52,9 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, ...
     jobs, count = _jobs(found, placed.candidate.at[0], placed.candidate.source)
     texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
     refits = [r for r in done(search, jobs, texts) if not r.failure]
-    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits), count
+    # There are as many at every other place, and of every other signal that is brought in.
+    alike = sum(c.effect == effect.name and len(c.at) == 1 for c in found.candidates)
+    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits), count * alike
 
 
 def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], int]:
@@ -106,15 +106,6 @@ def _stated(found: Round, paths: Mapping[str, Path], place: str) -> list[list[Ar
         if c.at != (place,):
             continue
         for k, probe in enumerate(c.probes):
-            kind = kind_of(c, k)
-            if len(probe.free) == 1 and is_linear(kind):
-                shapes.append([_added(kind, probe, c.source, place, path) for path in paths.values()])
+            if len(probe.free) == 1 and is_linear(kind_of(c, k)):
+                shapes.append(additions(c.effect, probe.values, c.at, c.source, paths.values()))
     return shapes
-
-
-def _added(kind: Kind, probe: Probe, source: str, place: str, path: Path) -> Array:
-    """(K,): the effect's signal less its own, along a run."""
-    u = path.signal(place)[:, None]
-    brought = path.signal(source)[:, None] if source else None
-    values = {parameter(n): np.array([probe.values[n]]) for n in kind.present}
-    return np.asarray(block(kind.effect, kind.present, kind.brings).run(values, path.time, u, brought) - u)[:, 0]

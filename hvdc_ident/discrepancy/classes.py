@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
 from hvdc_ident.discrepancy.explain import advice, sentence
@@ -19,7 +20,7 @@ from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, Hypothesis, Place, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
+from hvdc_ident.discrepancy.signatures.finite import additions, is_linear, kind_of
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import listed, quantity
@@ -31,7 +32,7 @@ MISSED = 0.15
 
 
 def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
-    """The winner and every candidate within delta BIC of it, the best first, and those that are the same equation.
+    """The winner and every candidate within delta BIC of it, the best first, and those that are the same equation or do the same.
 
     tries: whether an effect is one of those that are looked for.
     """
@@ -60,7 +61,43 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         if r.same_as:
             same[r.effect, r.at, r.source] = r.same_as
     count = Counter(c.effect for c in found.candidates)
-    return tuple(replace(r, same_as=same.get(key, ""), prior=1.0 / max(count[r.effect], 1)) for key, r in each.items())
+    told = [replace(r, same_as=same.get(key, ""), prior=1.0 / max(count[r.effect], 1)) for key, r in each.items()]
+    return tuple(replace(r, akin=akin) for r, akin in zip(told, _akin(found, told), strict=True))
+
+
+def _akin(found: Round, group: Sequence[Rival]) -> list[str]:
+    """For each the first effect before it that adds the same to the same signals, within the tolerance; empty where none does.
+
+    A dead band whose signal stays beyond its edge is an offset; so are, where a signal hardly moves, its gain error and
+    what is lost in proportion to it. Where the records do not show an offset, what differs by one is the same.
+    """
+    paths = found.answers().values() if len({r.effect for r in group if r.parameters}) > 1 else ()
+    offsets = {i: c.at for i, c in enumerate(found.candidates) if c.effect == "offset"}
+    seen = {
+        offsets.get(c.candidate) for c, usable in zip(found.scores.columns, found.scores.usable, strict=True) if usable
+    }
+
+    def added(r: Rival) -> Array | None:
+        if not paths or not r.parameters:
+            return None
+        signal = np.concatenate(additions(r.effect, r.parameters, r.at, r.source, paths))
+        return signal - np.mean(signal) if r.at in offsets.values() and r.at not in seen else signal
+
+    signals = [added(r) for r in group]
+    akin = []
+    for k, (r, own) in enumerate(zip(group, signals, strict=True)):
+        earlier = (
+            q.effect
+            for q, other in zip(group[:k], signals, strict=False)
+            if own is not None and other is not None and q.at == r.at and q.effect != r.effect and _alike(own, other)
+        )
+        akin.append(next(earlier, ""))
+    return akin
+
+
+def _alike(one: Array, other: Array) -> bool:
+    """Return True for two signals whose difference is within the tolerance: that share of the square of the larger."""
+    return bool(np.sum((one - other) ** 2) <= TOLERANCE * max(np.sum(one**2), np.sum(other**2)))
 
 
 def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
@@ -187,12 +224,26 @@ SHARED = ("s", "rad/s", "Hz", "")
 
 @dataclass(frozen=True)
 class EffectClass:
-    """Hypotheses that are one effect. names: the effects that are the same equation, the likeliest first; probability: of all
-    members together; members: the hypotheses, the likeliest first, with their probabilities."""
+    """Hypotheses that are one effect. names: the effects that are the same equation or do the same, the likeliest first;
+    probability: of all members together; members: the hypotheses, the likeliest first, with their probabilities."""
 
     names: tuple[str, ...]
     probability: float
     members: tuple[tuple[Rival, float], ...]
+
+    @property
+    def equations(self) -> dict[str, float]:
+        """The probability of each effect, over all its places, the likeliest first; of one equation with two names, of the first."""
+        total: dict[str, float] = {}
+        for r, p in self.members:
+            total[r.same_as or r.effect] = total.get(r.same_as or r.effect, 0.0) + p
+        return dict(sorted(total.items(), key=lambda kv: -kv[1]))
+
+    @property
+    def best(self) -> Rival:
+        """The likeliest member of the likeliest effect."""
+        own = next(iter(self.equations))
+        return next(r for r, _ in self.members if (r.same_as or r.effect) == own)
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -203,7 +254,8 @@ class EffectClass:
 def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
     """The classes of an ambiguity set, the likeliest first. Evidence is exp(-delta BIC/2), every effect as likely before.
 
-    Effects that are the same equation are one, and so are kinds of delay that are as long: what differs is within the tolerance.
+    Effects that are the same equation are one, and so are effects that add the same to a signal, and kinds of delay that are as
+    long: what differs is within the tolerance.
     """
     parent = {r.effect: r.effect for r in group} | {r.same_as: r.same_as for r in group if r.same_as}
 
@@ -213,8 +265,8 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
         return name
 
     for r in group:
-        if r.same_as:
-            parent[root(r.effect)] = root(r.same_as)
+        for name in filter(None, (r.same_as, r.akin)):
+            parent[root(r.effect)] = root(name)
     for one, other in combinations([r for r in group if (r.late or 0.0) > 0.0], 2):
         if _as_long(one, other):
             parent[root(other.effect)] = root(one.effect)
@@ -274,7 +326,7 @@ def finding(found: Round, one: EffectClass, told: str = "") -> Finding:
 
     told: what that does, with the sizes beside all other effects, where it was put in; else as its own refit has them.
     """
-    best = one.members[0][0]
+    best = one.best
     refits = {_key_of(t.refit): t.refit for t in found.trials}
     likely_ones = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
     parameters = {}
@@ -293,12 +345,26 @@ def finding(found: Round, one: EffectClass, told: str = "") -> Finding:
     places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
     delays = [late for r, _ in likely_ones if (late := r.late) is not None]
     delay = (min(delays), max(delays)) if delays else None
-    others = [n for n in dict.fromkeys(r.effect for r, _ in likely_ones if r.refitted) if n != best.effect]
-    other = f", or another kind of delay as long ({', '.join(others)})" if others and best.late is not None else ""
+    others = [
+        n
+        for n, p in one.equations.items()
+        if p >= LIKELY * one.probability and n in one.kinds and not _equation(n, best.effect)
+    ]
+    kind = (
+        "another kind of delay as long"
+        if best.late is not None
+        else "another effect that does the same in these records"
+    )
+    other = f", or {kind} ({', '.join(others)})" if others else ""
     return Finding(
         best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(told, parameters, best, places, other),
         None if best.late is None else EffectSize(best.late, delay, "s"),
     )  # fmt: skip
+
+
+def _equation(one: str, other: str) -> bool:
+    """Return True for two names that may stand for one equation."""
+    return one == other or one in effects()[other].equals or other in effects()[one].equals
 
 
 def _key_of(refit: Refit) -> tuple[str, tuple[str, ...], str]:
@@ -326,9 +392,9 @@ def _text(told: str, parameters: dict[str, EffectSize], best: Rival, places: Seq
         low, high = (quantity(v, size.unit) for v in size.ci95 if v is not None)
         told = f"{told} (95 %: {low} to {high})"
     places_too = list(dict.fromkeys(listed(p.at) for p in places if p.at != best.at))
-    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source != best.source))
+    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source and p.source != best.source))
     apart = [f"this place from {_some(places_too)}"] if places_too else []
-    apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if sources_too else []
+    apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
     return f"{told}{other}; the records do not tell {', nor '.join(apart)}." if apart else f"{told}{other}."
 
 

@@ -63,8 +63,9 @@ class Rival:
     """A member of an ambiguity set. delta_bic: how far it is behind the best, 0 for the best itself.
 
     refitted: whether that comes from a refit. expression: of a formula outside the catalogue, with its coefficients' names.
-    same_as: the member of the set that is the same equation at the same place; empty where none is. prior: its probability
-    given its effect, before any data: every place and source of an effect is as likely as another.
+    same_as: the member of the set that is the same equation at the same place; empty where none is. akin: the likeliest effect
+    of the set that adds the same to the same signals in these records, within the tolerance; empty where none does. prior: its
+    probability given its effect, before any data: every place and source of an effect is as likely as another.
     """
 
     effect: str
@@ -75,6 +76,7 @@ class Rival:
     refitted: bool = True
     expression: str = ""
     same_as: str = ""
+    akin: str = ""
     prior: float = 1.0
 
     @property
@@ -96,10 +98,10 @@ class Place:
 class Finding:
     """A missing effect, wherever it is, or the parameters whose values are off.
 
-    same_as: all names of it, its own first: effects that are the same equation there. probability: of the effect, summed over
-    its places. parameters: at the likeliest place; their intervals hold over the likely places. places: the likely ones, the
-    likeliest first. equivalent_delay: by how long it delays a slow signal, s, with its span over the places; None for what is no
-    delay. share: of the gap that it explains with the other findings.
+    same_as: all names of it, its own first: effects that are the same equation there, or do the same in these records.
+    probability: of the effect, summed over its places. parameters: at the likeliest place; their intervals hold over the
+    likely places. places: the likely ones, the likeliest first. equivalent_delay: by how long it delays a slow signal, s, with
+    its span over the places; None for what is no delay. share: of the gap that it explains with the other findings.
     """
 
     effect: str
@@ -340,5 +342,5 @@ def _named(value: FoundEffect | Rival | Line | Place) -> dict[str, Any]:
 
 def _member(value: FoundEffect | Rival) -> dict[str, Any]:
     """Return the line of `_named`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
-    out = {k: v for k, v in _named(value).items() if k != "prior" and (k not in ("expression", "same_as") or v)}
+    out = {k: v for k, v in _named(value).items() if k != "prior" and (k not in ("expression", "same_as", "akin") or v)}
     return out | ({} if value.late is None else {"late": value.late})

@@ -130,7 +130,7 @@ def findings_of(
     found: list[Finding] = []
     for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
         for one in likely(classes(group)):
-            best = one.members[0][0]
+            best = one.best
             put_in = (best.effect, best.at, best.source) == (own.effect, own.at, own.source)
             found.append(replace(finding(of, one, own.text if put_in else ""), share=share))
     freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)

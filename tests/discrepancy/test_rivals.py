@@ -12,7 +12,7 @@ from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.classes import _equal, classes
+from hvdc_ident.discrepancy.classes import _akin, _equal, classes
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, as_recorded, behinds, objections
 from hvdc_ident.discrepancy.refit import Refit, run
@@ -241,6 +241,43 @@ def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
     assert [(r.effect, r.at, r.source, r.delta_bic, r.refitted) for r in _equal(found, leaks, lambda _: True)] == [
         ("loss", ("torque",), "w", 0.5, False)
     ]
+
+
+def test_effects_that_add_the_same_to_a_signal_in_these_records_are_one_class() -> None:
+    """Beyond its edge a dead band takes off its width, as an offset does; the speed moves too much for a gain to do the same."""
+    found = one_round(
+        SearchContext(("offset", "deadband", "gain"), ("w",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0),
+        plain(experiments()),
+        1,
+    )
+    speeds = np.concatenate([path.signal("w") for path in found.answers().values()])
+    width, middle = 0.01, float(np.mean(speeds))
+    assert speeds.min() > width and np.ptp(speeds) > 0.3 * middle
+    group = [
+        rival("offset", "w", c=-width),
+        rival("deadband", "w", 1.0, width=width),
+        rival("gain", "w", 2.0, k=1 - width / middle),
+    ]
+    assert _akin(found, group) == ["", "offset", ""]
+    assert _akin(found, [group[0], rival("offset", "err", c=-width), rival("deadband", "w", width=1.5 * width)]) == [
+        "",
+        "",
+        "",
+    ]
+    named = [replace(r, akin=akin) for r, akin in zip(group, _akin(found, group), strict=True)]
+    assert [set(c.names) for c in classes(named)] == [{"offset", "deadband"}, {"gain"}]
+
+
+def test_what_differs_by_an_offset_that_no_record_shows_is_one_class() -> None:
+    """A coupling acts by the change of a signal since the start, a conductance by all of it. Before the torque the integrator
+    makes good for any offset; one of the measured speed is seen in the speed."""
+    search = SearchContext(
+        ("offset", "coupling"), ("wm", "torque"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
+    )
+    found = one_round(search, plain(experiments()), 1)
+    for place, akin in (("wm", ""), ("torque", "coupling")):
+        coupling = replace(rival("coupling", place, k=0.1), source="w")
+        assert _akin(found, [coupling, replace(rival("conductance", place, g=-0.1), source="w")]) == ["", akin]
 
 
 def test_a_refit_that_began_at_a_poor_size_is_judged_by_its_candidates_best_score() -> None:

@@ -7,7 +7,7 @@ derivative, and enough.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.closed import Ends
 from hvdc_ident.discrepancy.signatures.propagation import replaced
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.effects import effects
+from hvdc_ident.effects import effects, split_sources
 
 PASSES = 4
 CLOSED = 0.05
@@ -73,7 +73,7 @@ def tasks(
     by_place: dict[tuple[str, ...], list[Task]] = {}
     for k, column in enumerate(columns):
         c = candidates[column.candidate]
-        present = _present(c, column.probe)
+        present = _present(c.effect, c.probes[column.probe].values)
         values = tuple(float(c.probes[column.probe].values[n]) for n in present)
         own = c.sources if len(set(c.sources)) > 1 else c.sources[:1]
         task = Task(Kind(c.effect, present, bool(own)), c.at, own, values, k)
@@ -86,14 +86,35 @@ def tasks(
     return tuple(tuple(p) for p in parcels if p)
 
 
-def _present(candidate: CandidateEffect, probe: int) -> tuple[str, ...]:
-    entry, values = effects()[candidate.effect], candidate.probes[probe].values
-    return tuple(n for n, q in entry.parameters.items() if not (q.optional and values[n] == q.neutral))
+def _present(effect: str, values: Mapping[str, float]) -> tuple[str, ...]:
+    return tuple(
+        n for n, q in effects()[effect].parameters.items() if not (q.optional and values.get(n, q.neutral) == q.neutral)
+    )
 
 
 def kind_of(candidate: CandidateEffect, probe: int) -> Kind:
     """The equations that a probe of a candidate asks for."""
-    return Kind(candidate.effect, _present(candidate, probe), bool(candidate.source))
+    return Kind(candidate.effect, _present(candidate.effect, candidate.probes[probe].values), bool(candidate.source))
+
+
+def additions(
+    effect: str, values: Mapping[str, float], at: Sequence[str], source: str, paths: Iterable[Along | Ends]
+) -> list[Array]:
+    """Return what an effect with these values adds to the signals of its slots, (K,) each, by run and slot, without the plant.
+
+    source: the signals that it brings in, as a candidate has them; paths: the runs of the model without it.
+    """
+    present = _present(effect, values)
+    own = {parameter(n): np.array([values[n]]) for n in present}
+    run = block(effect, present, bool(source)).run
+    found = []
+    sources = split_sources(source, at)
+    for path in paths:
+        for k, place in enumerate(at):
+            u = path.signal(place)[:, None]
+            brought = path.signal(sources[k])[:, None] if sources else None
+            found.append(np.asarray(run(own, path.time, u, brought) - u)[:, 0])
+    return found
 
 
 @lru_cache(maxsize=256)
