@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
-from hvdc_ident.discrepancy.explain import advice, sentence
-from hvdc_ident.discrepancy.formula import filled
 from hvdc_ident.discrepancy.options import SURE, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
-from hvdc_ident.discrepancy.result import EffectSize, Finding, Hypothesis, Place, Rival
+from hvdc_ident.discrepancy.result import Hypothesis, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import additions, is_linear, kind_of
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import listed, quantity
 
 SLIGHT = 1e-3
 """Share of what a form explains by which a formula may explain more and not refute it: of so much the noise is not known."""
@@ -198,28 +194,10 @@ def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -
     return equal
 
 
-def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:
-    """For each set with more than one member what would tell them apart, in words; empty where there is none."""
-    texts = []
-    for group in groups:
-        if len(group) > 1:
-            first = group[0]
-            # No experiment tells one equation from itself under another name.
-            others = [(r.effect, r.at) for r in group[1:] if not r.same_as]
-            told = advice(first.effect, others, first.at, recorded)
-            if told:
-                texts.append(told)
-    return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}
-
-
 CERTAIN = 0.95
 """Probability of an effect class from which it is named."""
-LIKELY = 0.05
-"""Probability, given its class, from which a place is told, and its size counts for the class's interval."""
 TOLD = 20
 """Hypotheses that are told, the likeliest."""
-SHARED = ("s", "rad/s", "Hz", "")
-"""Units of parameters that mean the same at every place."""
 
 
 @dataclass(frozen=True)
@@ -319,90 +297,3 @@ def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
     return tuple(
         Hypothesis(k, evidence[k], unseen(refits[k]), float(np.exp(evidence[k] - most) / total)) for k in order
     )
-
-
-def finding(found: Round, one: EffectClass, told: str = "") -> Finding:
-    """The class as it is told: what its likeliest member does, and where else it may be.
-
-    told: what that does, with the sizes beside all other effects, where it was put in; else as its own refit has them.
-    """
-    best = one.best
-    refits = {_key_of(t.refit): t.refit for t in found.trials}
-    likely_ones = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
-    parameters = {}
-    for n, q in effects()[best.effect].parameters.items():
-        if n not in best.parameters or (q.optional and best.parameters[n] == q.neutral):
-            continue
-        same = [r for r, _ in likely_ones if r.effect == best.effect and (q.unit in SHARED or r is best)]
-        spans = [s for r in same if (s := _span(refits.get((r.effect, r.at, r.source)), n)) is not None]
-        # At a place where the size is another, of other sign say, it is no uncertainty of this one.
-        alike = [s for s in spans if s[0] <= best.parameters[n] <= s[1]]
-        interval = (min(low for low, _ in alike), max(high for _, high in alike)) if alike else None
-        parameters[n] = EffectSize(best.parameters[n], interval, q.unit)
-    by_place: dict[tuple[tuple[str, ...], str], float] = {}
-    for r, p in likely_ones:
-        by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
-    places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
-    delays = [late for r, _ in likely_ones if (late := r.late) is not None]
-    delay = (min(delays), max(delays)) if delays else None
-    others = [
-        n
-        for n, p in one.equations.items()
-        if p >= LIKELY * one.probability and n in one.kinds and not _equation(n, best.effect)
-    ]
-    kind = (
-        "another kind of delay as long"
-        if best.late is not None
-        else "another effect that does the same in these records"
-    )
-    other = f", or {kind} ({', '.join(others)})" if others else ""
-    return Finding(
-        best.effect, one.names, one.probability, FrozenMap(parameters), places, _text(told, parameters, best, places, other),
-        None if best.late is None else EffectSize(best.late, delay, "s"),
-    )  # fmt: skip
-
-
-def _equation(one: str, other: str) -> bool:
-    """Return True for two names that may stand for one equation."""
-    return one == other or one in effects()[other].equals or other in effects()[one].equals
-
-
-def _key_of(refit: Refit) -> tuple[str, tuple[str, ...], str]:
-    candidate = refit.placed[-1].candidate
-    return candidate.effect, candidate.at, candidate.source
-
-
-def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
-    """The 95 % interval of a parameter of the refit's last effect; None where it is not known."""
-    if refit is None:
-        return None
-    placed = refit.placed[-1]
-    std, value = refit.std.get(placed.names.get(name, "")), refit.sizes(placed).get(name)
-    if std is None or value is None:
-        return None
-    q = effects()[placed.candidate.effect].parameters[name]
-    return max(value - 1.96 * std, q.min), min(value + 1.96 * std, q.max)
-
-
-def _text(told: str, parameters: dict[str, EffectSize], best: Rival, places: Sequence[Place], other: str) -> str:
-    """Return what the best hypothesis does, with the first interval, other kinds of the effect, and other places."""
-    told = told or sentence(best, best.parameters, filled(best.expression, best.parameters))
-    size = next((s for s in parameters.values() if s.ci95 is not None and None not in s.ci95), None)
-    if size is not None and size.ci95 is not None:
-        low, high = (quantity(v, size.unit) for v in size.ci95 if v is not None)
-        told = f"{told} (95 %: {low} to {high})"
-    places_too = list(dict.fromkeys(listed(p.at) for p in places if p.at != best.at))
-    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source and p.source != best.source))
-    apart = [f"this place from {_some(places_too)}"] if places_too else []
-    apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
-    return f"{told}{other}; the records do not tell {', nor '.join(apart)}." if apart else f"{told}{other}."
-
-
-def _brought(source: str, at: Sequence[str]) -> str:
-    """The signals that an effect brings in at its places, in words."""
-    return listed(tuple(dict.fromkeys(split_sources(source, at))))
-
-
-def _some(names: Sequence[str]) -> str:
-    """Up to four names, and how many more there are."""
-    return listed(names[:4]) if len(names) <= 4 else f"{', '.join(names[:4])} or one of {len(names) - 4} more"

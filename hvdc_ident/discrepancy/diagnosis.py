@@ -13,9 +13,10 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.bode import responses
 from hvdc_ident.discrepancy.candidate_table import detectable, lines
-from hvdc_ident.discrepancy.classes import compared, separating
+from hvdc_ident.discrepancy.classes import compared
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.explain import at_given, found_of, gap, off_given
+from hvdc_ident.discrepancy.findings import separating
 from hvdc_ident.discrepancy.latent import Reach
 from hvdc_ident.discrepancy.localise import localise
 from hvdc_ident.discrepancy.nominal import Nominal, nominal

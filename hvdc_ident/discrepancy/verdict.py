@@ -11,10 +11,11 @@ import numpy as np
 
 from hvdc_ident.data import Array, event_time
 from hvdc_ident.discrepancy.alternatives import beyond
-from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, finding, formula_rivals, likely, rivals
+from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
+from hvdc_ident.discrepancy.findings import finding
 from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE
@@ -132,7 +133,7 @@ def findings_of(
         for one in likely(classes(group)):
             best = one.best
             put_in = (best.effect, best.at, best.source) == (own.effect, own.at, own.source)
-            found.append(replace(finding(of, one, own.text if put_in else ""), share=share))
+            found.append(replace(finding(of, one, own if put_in else None), share=share))
     freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
     if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
         found.append(replace(moved, share=share))

@@ -12,12 +12,13 @@ from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import beside, plain
 
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy import classes as rated
+from hvdc_ident.discrepancy import findings as told_as
+from hvdc_ident.discrepancy.classes import classes
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.explain import sentence
 from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.discrepancy.remainder import remainder_of
-from hvdc_ident.discrepancy.result import Place, Rival
+from hvdc_ident.discrepancy.result import EffectSize, Place, Rival
 from hvdc_ident.immutable import FrozenMap
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
@@ -91,11 +92,28 @@ def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(m
     spans = {"wm": (-0.035, -0.025), "err": (0.025, 0.035), "torque": (-0.036, -0.026)}
     sizes = {"wm": -0.030, "err": 0.030, "torque": -0.031}
     members = [Rival("coupling", (at,), 0.1 * k, FrozenMap({"k": v})) for k, (at, v) in enumerate(sizes.items())]
-    monkeypatch.setattr(rated, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
-    monkeypatch.setattr(rated, "_span", lambda rival, _name: spans[rival.at[0]])
+    monkeypatch.setattr(told_as, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
+    monkeypatch.setattr(told_as, "_span", lambda rival, _name: spans[rival.at[0]])
     found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
-    (one,) = rated.classes(members)
-    assert rated.finding(found, one, "").parameters["k"].ci95 == (-0.036, -0.025)
+    (one,) = classes(members)
+    assert told_as.finding(found, one).parameters["k"].ci95 == (-0.036, -0.025)
+
+
+def test_a_size_that_later_effects_moved_is_told_with_its_interval_there() -> None:
+    """The interval of the last model, wider by as much as the places make that of the effect's own round."""
+    last, own = EffectSize(0.018, (0.017, 0.019), "s"), EffectSize(0.020, (0.0195, 0.0205), "s")
+    over = told_as._over_places(last, own, [(0.0195, 0.0205), (0.0190, 0.0210), (0.030, 0.031)])
+    assert over.value == 0.018 and over.ci95 == pytest.approx((0.0165, 0.0195))
+    assert told_as._over_places(last, own, []) is last
+
+
+def test_the_delay_of_a_second_order_holds_for_its_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2 zeta/wn is longest where the damping is largest and the frequency least."""
+    spans = {"wn": (90.0, 110.0), "zeta": (0.45, 0.55)}
+    monkeypatch.setattr(told_as, "_span", lambda _refit, name: spans[name])
+    rival = Rival("second-order", ("wm",), 0.0, FrozenMap({"wn": 100.0, "zeta": 0.5}))
+    assert told_as._delay_span(rival, None) == pytest.approx((0.9 / 110.0, 1.1 / 90.0))
+    assert told_as._delay_span(Rival("gain", ("wm",), 0.0, FrozenMap({"k": 1.1})), None) is None
 
 
 @pytest.mark.parametrize(
@@ -117,29 +135,27 @@ def test_a_finding_tells_places_and_sources_apart() -> None:
         Place(("Uref1", "Uref2"), 0.3, "Q1f, Q2f"),
         Place(("Uref1", "Uref2"), 0.3, "iq1, iq2"),
     ]
-    told = rated._text("It couples", {}, best, places, "")
-    own = rated._text("", {}, best, places[:1], "")
-    assert own == "Each of eq1 and eq2 takes 0.1 of the change of its own of Q1f and Q2f."
-    assert (
-        told == "It couples; the records do not tell this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2."
-    )
+    assert sentence(best, best.parameters) == "Each of eq1 and eq2 takes 0.1 of the change of its own of Q1f and Q2f"
+    assert told_as._apart(best, places[:1]) == ""
+    apart = "; the records do not tell this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2"
+    assert told_as._apart(best, places) == apart
 
 
 def test_what_to_record_next_asks_for_signals_that_are_not_there_and_not_for_other_names_of_one_equation() -> None:
     lag = [Rival("lag", (at,), 0.0, FrozenMap({"T": 0.03})) for at in ("wm", "w")]
-    told = rated.separating([lag], {"wm"})["text"]
+    told = told_as.separating([lag], {"wm"})["text"]
     assert told.startswith("Record w as well") and "wm" not in told
-    assert rated.separating([lag], {"wm", "w"})["text"].startswith("Step an input that acts on some of wm and w")
+    assert told_as.separating([lag], {"wm", "w"})["text"].startswith("Step an input that acts on some of wm and w")
     alike = [Rival("coupling", ("e",), 0.0, FrozenMap({"k": 1.0}), source="w")]
     alike.append(Rival("droop", ("e",), 0.0, FrozenMap({"k": -1.0}), source="w", refitted=False, same_as="coupling"))
-    assert rated.separating([alike], set()) == {}
+    assert told_as.separating([alike], set()) == {}
 
 
 def test_an_effect_with_many_places_is_no_likelier_for_that() -> None:
     """Where nothing tells them apart, an effect holds what its places hold of all those it was looked for at."""
     leaks = [Rival("coupling", ("e",), 0.0, FrozenMap({"k": 0.1}), source=f"s{k}", prior=1 / 60) for k in range(12)]
     gains = [Rival("gain", (at,), 0.0, FrozenMap({"k": 0.9}), prior=1 / 10) for at in ("e", "u")]
-    found = {c.names[0]: c.probability for c in rated.classes([*leaks, *gains])}
+    found = {c.names[0]: c.probability for c in classes([*leaks, *gains])}
     assert found == {"coupling": pytest.approx(0.5), "gain": pytest.approx(0.5)}
 
 
@@ -147,5 +163,5 @@ def test_one_equation_under_two_names_counts_once() -> None:
     leak = Rival("conductance", ("e",), 0.0, FrozenMap({"g": 0.1}), source="s", prior=0.1)
     loss = Rival("loss", ("e",), 0.0, FrozenMap({"b": 0.1}), source="s", same_as="conductance", prior=0.1)
     gain = Rival("gain", ("e",), 0.0, FrozenMap({"k": 0.9}), prior=0.1)
-    one, other = rated.classes([leak, loss, gain])
+    one, other = classes([leak, loss, gain])
     assert one.probability == other.probability == pytest.approx(0.5)

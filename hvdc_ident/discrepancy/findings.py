@@ -1,0 +1,165 @@
+"""Findings: an effect class in words, with its sizes, places and what would tell it from others."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+from hvdc_ident.discrepancy.classes import EffectClass
+from hvdc_ident.discrepancy.context import Round
+from hvdc_ident.discrepancy.explain import advice, sentence
+from hvdc_ident.discrepancy.formula import filled
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival
+from hvdc_ident.effects import effects, split_sources
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed, quantity
+
+LIKELY = 0.05
+"""Probability, given its class, from which a place is told, and its size counts for the class's interval."""
+SHARED = ("s", "rad/s", "Hz", "")
+"""Units of parameters that mean the same at every place."""
+
+
+def finding(found: Round, one: EffectClass, own: FoundEffect | None = None) -> Finding:
+    """The class as it is told: what its likeliest member does, and where else it may be.
+
+    own: that member with its sizes beside all other effects, where it was put in; else they are those of its own refit.
+    """
+    best = one.best
+    refits = {_key_of(t.refit): t.refit for t in found.trials}
+    likely_ones = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
+    parameters = {}
+    for n, q in effects()[best.effect].parameters.items():
+        if n not in best.parameters or (q.optional and best.parameters[n] == q.neutral):
+            continue
+        same = [r for r, _ in likely_ones if r.effect == best.effect and (q.unit in SHARED or r is best)]
+        spans = [s for r in same if (s := _span(refits.get(_key(r)), n)) is not None]
+        before = EffectSize(best.parameters[n], _span(refits.get(_key(best)), n), q.unit)
+        parameters[n] = _over_places(before if own is None else own.parameters.get(n, before), before, spans)
+    late = best.late if own is None else own.late
+    delay = None
+    if late is not None and best.late is not None:
+        ends = [s for r, _ in likely_ones if (s := _delay_span(r, refits.get(_key(r)))) is not None]
+        delay = EffectSize(
+            late,
+            (min(low for low, _ in ends) + late - best.late, max(high for _, high in ends) + late - best.late),
+            "s",
+        )
+    by_place: dict[tuple[tuple[str, ...], str], float] = {}
+    for r, p in likely_ones:
+        by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
+    places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
+    does = own.text if own is not None else sentence(best, best.parameters, filled(best.expression, best.parameters))
+    text = f"{does}{_sizes(parameters)}{_others(one)}{_apart(best, places)}."
+    return Finding(best.effect, one.names, one.probability, FrozenMap(parameters), places, text, delay)
+
+
+def _over_places(size: EffectSize, before: EffectSize, spans: Sequence[tuple[float, float]]) -> EffectSize:
+    """The size with its interval wider by as much as its likely places make it.
+
+    before: the same where nothing was put in after it; spans: the intervals at the likely places.
+    """
+    # At a place where the size is another, of other sign say, it is no uncertainty of this one.
+    alike = [s for s in spans if s[0] <= before.value <= s[1]]
+    (low, high), (first, last) = (s.ci95 or (None, None) for s in (size, before))
+    if not alike or low is None or high is None or first is None or last is None:
+        return size
+    return replace(size, ci95=(low - first + min(s[0] for s in alike), high - last + max(s[1] for s in alike)))
+
+
+def _delay_span(rival: Rival, refit: Refit | None) -> tuple[float, float] | None:
+    """The 95 % interval of a rival's equivalent delay, s: the least and most that the intervals of its parameters leave; itself
+    where one of them is not known, None for what is no delay."""
+    if rival.late is None:
+        return None
+    spans = {n: _span(refit, n) or (v, v) for n, v in rival.parameters.items()}
+    ends = [
+        effects()[rival.effect].delay_with(dict(zip(spans, corner, strict=True))) for corner in product(*spans.values())
+    ]
+    known = [late for late in ends if late is not None]
+    return min(known), max(known)
+
+
+def _equation(one: str, other: str) -> bool:
+    """Return True for two names that may stand for one equation."""
+    return one == other or one in effects()[other].equals or other in effects()[one].equals
+
+
+def _key(rival: Rival) -> tuple[str, tuple[str, ...], str]:
+    return rival.effect, rival.at, rival.source
+
+
+def _key_of(refit: Refit) -> tuple[str, tuple[str, ...], str]:
+    candidate = refit.placed[-1].candidate
+    return candidate.effect, candidate.at, candidate.source
+
+
+def _span(refit: Refit | None, name: str) -> tuple[float, float] | None:
+    """The 95 % interval of a parameter of the refit's last effect; None where it is not known."""
+    if refit is None:
+        return None
+    placed = refit.placed[-1]
+    std, value = refit.std.get(placed.names.get(name, "")), refit.sizes(placed).get(name)
+    if std is None or value is None:
+        return None
+    q = effects()[placed.candidate.effect].parameters[name]
+    return max(value - 1.96 * std, q.min), min(value + 1.96 * std, q.max)
+
+
+def _sizes(parameters: Mapping[str, EffectSize]) -> str:
+    """The intervals of the sizes, each with its name where there are several."""
+    known = {n: s for n, s in parameters.items() if s.ci95 is not None and None not in s.ci95}
+    each = []
+    for n, s in known.items():
+        low, high = (quantity(v, s.unit) for v in s.ci95 or () if v is not None)
+        each.append(f"{n} {low} to {high}" if len(parameters) > 1 else f"{low} to {high}")
+    return f" (95 %: {', '.join(each)})" if each else ""
+
+
+def _others(one: EffectClass) -> str:
+    """The other effects of a class, as its sentence goes on."""
+    best = one.best
+    told = [n for n, p in one.equations.items() if p >= LIKELY * one.probability and n in one.kinds]
+    others = [n for n in told if not _equation(n, best.effect)]
+    kind = (
+        "another kind of delay as long"
+        if best.late is not None
+        else "another effect that does the same in these records"
+    )
+    return f", or {kind} ({', '.join(others)})" if others else ""
+
+
+def _apart(best: Rival, places: Sequence[Place]) -> str:
+    """The other places and sources, as the sentence goes on."""
+    places_too = list(dict.fromkeys(listed(p.at) for p in places if p.at != best.at))
+    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source and p.source != best.source))
+    apart = [f"this place from {_some(places_too)}"] if places_too else []
+    apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
+    return f"; the records do not tell {', nor '.join(apart)}" if apart else ""
+
+
+def _brought(source: str, at: Sequence[str]) -> str:
+    """The signals that an effect brings in at its places, in words."""
+    return listed(tuple(dict.fromkeys(split_sources(source, at))))
+
+
+def _some(names: Sequence[str]) -> str:
+    """Up to four names, and how many more there are."""
+    return listed(names[:4]) if len(names) <= 4 else f"{', '.join(names[:4])} or one of {len(names) - 4} more"
+
+
+def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:
+    """For each set with more than one member what would tell them apart, in words; empty where there is none."""
+    texts = []
+    for group in groups:
+        if len(group) > 1:
+            first = group[0]
+            # No experiment tells one equation from itself under another name.
+            others = [(r.effect, r.at) for r in group[1:] if not r.same_as]
+            told = advice(first.effect, others, first.at, recorded)
+            if told:
+                texts.append(told)
+    return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}
