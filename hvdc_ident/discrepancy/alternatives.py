@@ -7,7 +7,9 @@ name for it takes a form for told that the data do not tell.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
@@ -28,12 +30,12 @@ from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
 
 
-def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, ...], int]:
-    """The refits of forms outside the catalogue in the winner's stead, and out of how many they would be the best if all places
-    and sources were tried; none that failed.
+def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, float], ...]:
+    """The refits of forms outside the catalogue in the winner's stead, each with its prior; none that failed.
 
     Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
     winner's pick. No formula of signals at one time is a delay: for one kind of these or another filters, wherever they are.
+    A form is as likely before any data as an effect of the catalogue, and shares that with all places and sources, as one does.
     """
     winner = found.winner
     assert winner is not None and found.ruler is not None
@@ -42,23 +44,25 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, ...
     if effect.equivalent_delay is not None and not effect.needs_grid:
         tried = filters(search, found, found.before.nominal()) if found.filters is None else found.filters
         places = {c.at for c in found.candidates if c.effect == effect.name}
-        return tuple(gained(t, found.before, found.ruler) for t in tried), len(places)
+        return tuple((gained(t, found.before, found.ruler), 1.0 / len(places)) for t in tried)
     # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
     remembers = effect.states != "none" and not effect.needs_source
     if remembers or effect.needs_grid or additive(effect):
-        return (), 0
+        return ()
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
-        return (), 0
-    jobs, count = _jobs(found, placed.candidate.at[0], placed.candidate.source)
+        return ()
+    jobs, shares = _jobs(found, placed.candidate.at[0], placed.candidate.source)
+    elsewhere = sum(c.effect == effect.name and len(c.at) == 1 for c in found.candidates)
     texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
-    refits = [r for r in done(search, jobs, texts) if not r.failure]
-    # There are as many at every other place, and of every other signal that is brought in.
-    alike = sum(c.effect == effect.name and len(c.at) == 1 for c in found.candidates)
-    return tuple(gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler) for r in refits), count * alike
+    return tuple(
+        (gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler), share / elsewhere)
+        for r, share in zip(done(search, jobs, texts), shares, strict=True)
+        if not r.failure
+    )
 
 
-def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], int]:
-    """The formulas that by regression leave least for what their coefficients cost, and out of how many."""
+def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[float]]:
+    """The formulas that by regression leave least for what their coefficients cost, and the share that each has of its form."""
     paths = found.answers()
     library, formulas = _formulas(found, paths, place, source)
     regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
@@ -66,15 +70,36 @@ def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], int]:
     for formula in formulas:
         coefficients, gain = regressed.solved(formula)
         if coefficients.all():
-            ranked.append((gain - PRICE * len(formula), [library[k] for k in formula], coefficients))
+            ranked.append((gain - PRICE * len(formula), formula, coefficients))
     ranked.sort(key=lambda r: -r[0])
-    jobs = []
-    for _, chosen, coefficients in ranked[:SHORTLIST]:
+    of_form = Counter(tuple(library[k].form for k in formula) for formula in formulas)
+    jobs, shares = [], []
+    for formula, coefficients in _shortlist([(f, c) for _, f, c in ranked], library, paths):
+        chosen = [library[k] for k in formula]
         try:
             jobs.append(formula_job(found.before, place, chosen, coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model
             continue
-    return jobs, len(formulas)
+        shares.append(1.0 / of_form[tuple(t.form for t in chosen)])
+    return jobs, shares
+
+
+def _shortlist(
+    ranked: Sequence[tuple[tuple[int, ...], Array]], library: Sequence[Term], paths: Mapping[str, Path]
+) -> list[tuple[tuple[int, ...], Array]]:
+    """The best with one coefficient and the best with two, in turn, each shape once: of a signal above 0 the magnitude is itself.
+
+    A second coefficient often gains by what the regression leaves out, and a truth with one alone would not be tried.
+    """
+    kept: dict[int, list[tuple[tuple[int, ...], Array]]] = {1: [], 2: []}
+    shapes: dict[int, list[list[Array]]] = {1: [], 2: []}
+    for formula, coefficients in ranked:
+        n, shape = len(formula), at_runs(library[formula[0]], paths)
+        if not any(proportional(shape, other) for other in shapes[n]):
+            kept[n].append((formula, coefficients))
+            shapes[n].append(shape)
+    in_turn = [f for pair in zip_longest(kept[1], kept[2]) for f in pair if f is not None]
+    return in_turn[:SHORTLIST]
 
 
 def _formulas(

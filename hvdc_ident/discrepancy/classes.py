@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
-from hvdc_ident.discrepancy.options import SURE, TOLERANCE, DiagnosisOptions
+from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
@@ -109,34 +109,20 @@ def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) 
 
 
 def formula_rivals(
-    found: Round, formulas: Sequence[CandidateFit], options: DiagnosisOptions, tried: int = 1
+    found: Round, formulas: Sequence[tuple[CandidateFit, float]], options: DiagnosisOptions
 ) -> tuple[float, tuple[Rival, ...]]:
     """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
     where one is further ahead than they can be told apart.
 
-    formulas: refitted in the winner's stead; tried: out of how many, which share what is probable before any data. One
-    that explains as much with a parameter more, and would not without any of its own, is not refuted by the price of that,
-    which is not counted then: of a product around its operating point a gain makes a coupling.
+    formulas: refitted in the winner's stead, each with its prior.
     """
-    assert found.winner is not None and found.ruler is not None
-    own, *behind = behinds([found.winner, *formulas])
+    assert found.winner is not None
+    own, *behind = behinds([found.winner, *(t for t, _ in formulas)])
     within = max(options.set_bic, SLIGHT * found.winner.told)
     if own > within:
         return np.inf, ()
-    near = []
-    for b, t in zip(behind, formulas, strict=True):
-        one_more = t.refit.count - found.winner.refit.count == 1 and _all_needed(t.refit)
-        short = max(b - found.ruler.price, 0.0) if one_more else b
-        if short <= within:
-            near.append(replace(_rival(t, short), prior=1.0 / max(tried, 1)))
+    near = [replace(_rival(t, b), prior=prior) for b, (t, prior) in zip(behind, formulas, strict=True) if b <= within]
     return own, tuple(sorted(near, key=lambda r: r.delta_bic))
-
-
-def _all_needed(refit: Refit) -> bool:
-    """Return True where every parameter of the last effect is clearly off 0."""
-    sizes, names = refit.sizes(refit.placed[-1]), refit.placed[-1].names
-    stds = {n: refit.std.get(names[n]) for n in sizes}
-    return all(std is not None and abs(sizes[n]) > SURE * std for n, std in stds.items())
 
 
 def _rival(trial: CandidateFit, behind: float) -> Rival:

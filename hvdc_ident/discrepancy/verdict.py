@@ -202,14 +202,14 @@ def _with_formulas(
         if not search.options.fallback or classes(group)[0].probability < CERTAIN:
             wider.append(group)
             continue
-        formulas, tried = beyond(search, found)
-        behind, near = formula_rivals(found, formulas, search.options, tried)
-        if np.isinf(behind):
-            best = max(formulas, key=lambda t: t.told)
+        formulas = beyond(search, found)
+        behind, near = formula_rivals(found, formulas, search.options)
+        best = max((t for t, _ in formulas), key=lambda t: t.told, default=None)
+        if best is not None and np.isinf(behind):
             return (), Law(best.refit, best.gain)
         wide = (*(replace(r, delta_bic=r.delta_bic + behind) for r in group), *near)
-        if classes(wide)[0].names[0] in OUTSIDE and classes(wide)[0].probability >= CERTAIN:
-            best = max(formulas, key=lambda t: t.told)
+        likeliest = classes(wide)[0]
+        if best is not None and likeliest.names[0] in OUTSIDE and likeliest.probability >= CERTAIN:
             return (), Law(best.refit, best.gain)
         wider.append(wide)
     return tuple(wider), None

@@ -14,11 +14,13 @@ from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, Model
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy.alternatives import beyond
 from hvdc_ident.discrepancy.classes import formula_rivals
-from hvdc_ident.discrepancy.context import Round
+from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler
 from hvdc_ident.discrepancy.formula import Term, formula_job
 from hvdc_ident.discrepancy.refit import run
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -76,20 +78,28 @@ def shown(changed: Model, still: str) -> tuple[Experiment, ...]:
     return answered(changed, moved, seed=3)
 
 
-def test_a_formula_with_a_parameter_more_is_a_rival_where_it_needs_all_of_them() -> None:
-    """A product near its operating point is a coupling and a gain: the price of that gain does not refute it."""
+def test_formulas_near_the_winner_are_rivals_with_their_priors() -> None:
     before = plain(shown(model(), still="ref"))
-    terms = [Term("load*w", ("load", "w"), "xy"), Term("w", ("w",), "x")]
-    refit = run(formula_job(before, "outputs.w", terms, np.array([0.01, 0.01])))
+    refit = run(formula_job(before, "outputs.w", [Term("load*w", ("load", "w"), "xy")], np.array([0.01])))
     coupling = beside(before, "coupling", "outputs.w", {"k": 0.01}, {"k": (-1.0, 1.0)}, source="load")
     winner = CandidateFit(Pick(0, 0, 1.0, 1.0), run(coupling), 100.0)
     found = cast(Round, SimpleNamespace(winner=winner, ruler=Ruler(1800, 1800.0, 1.0)))
-    for std, gain, near in ((1e-3, 93.0, 1), (10.0, 93.0, 0), (1e-3, 80.0, 0)):
-        last = refit.placed[-1]
-        spread = FrozenMap({last.names[n]: std * abs(v) for n, v in refit.sizes(last).items()})
-        formula = CandidateFit(winner.pick, replace(refit, std=spread), gain)
-        behind, rivals = formula_rivals(found, [formula], DiagnosisOptions())
-        assert behind == 0.0 and len(rivals) == near
+    near, far, ahead = (CandidateFit(winner.pick, refit, gain) for gain in (97.0, 92.0, 107.0))
+    behind, rivals = formula_rivals(found, [(far, 0.5), (near, 0.25)], DiagnosisOptions())
+    assert behind == 0.0 and [(r.effect, r.delta_bic, r.prior) for r in rivals] == [("term", 3.0, 0.25)]
+    behind, rivals = formula_rivals(found, [(ahead, 0.5)], DiagnosisOptions())
+    assert np.isinf(behind) and not rivals
+
+
+def test_a_form_outside_the_catalogue_is_as_likely_as_an_effect() -> None:
+    """A cube at one of two places has half of what a saturation has at both."""
+    there = apply_effects(model(), [{"effect": "saturation", "at": ["drag"], "parameters": {"level": 0.25}}])
+    search = SearchContext(("saturation",), ("drag", "torque"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+    found = one_round(search, plain(answered(there, experiments(), seed=0)), 1)
+    tried = {t.refit.placed[-1].use.expression: prior for t, prior in beyond(search, found)}
+    assert tried["k1*drag**3"] == 0.5 and tried["k1*drag**2"] == 0.5
+    assert not {"k1*drag*abs(drag)", "k1*abs(drag)"} & set(tried), "of a drag above 0 they are others, or nothing"
+    assert all(prior <= 0.5 for prior in tried.values())
 
 
 def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> None:
