@@ -23,14 +23,17 @@ SHARED = ("s", "rad/s", "Hz", "")
 """Units of parameters that mean the same at every place."""
 
 
-def finding(found: Round, one: EffectClass, own: FoundEffect | None = None) -> Finding:
-    """The class as it is told: what its likeliest member does, and where else it may be.
+def finding(found: Round, one: EffectClass, put_in: FoundEffect | None = None) -> Finding:
+    """The class as it is told: what one of its likely members does, and where else it may be.
 
-    own: that member with its sizes beside all other effects, where it was put in; else they are those of its own refit.
+    put_in: what was put into the model: where that is a likely member, it is the one, with its sizes beside all other effects;
+    else it is the likeliest, as its own refit has it.
     """
-    best = one.best
     refits = {_key_of(t.refit): t.refit for t in found.trials}
     likely_ones = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
+    there = next((r for r, _ in likely_ones if put_in is not None and _key(r) == _key(put_in)), None)
+    own = put_in if there else None
+    best = there or one.best
     parameters = {}
     for n, q in effects()[best.effect].parameters.items():
         if n not in best.parameters or (q.optional and best.parameters[n] == q.neutral):
@@ -53,7 +56,7 @@ def finding(found: Round, one: EffectClass, own: FoundEffect | None = None) -> F
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
     places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
     does = own.text if own is not None else sentence(best, best.parameters, filled(best.expression, best.parameters))
-    text = f"{does}{_sizes(parameters)}{_others(one)}{_apart(best, places)}."
+    text = f"{does}{_sizes(parameters)}{_others(one, best)}{_apart(best, places)}."
     return Finding(best.effect, one.names, one.probability, FrozenMap(parameters), places, text, delay)
 
 
@@ -88,7 +91,7 @@ def _equation(one: str, other: str) -> bool:
     return one == other or one in effects()[other].equals or other in effects()[one].equals
 
 
-def _key(rival: Rival) -> tuple[str, tuple[str, ...], str]:
+def _key(rival: Rival | FoundEffect) -> tuple[str, tuple[str, ...], str]:
     return rival.effect, rival.at, rival.source
 
 
@@ -119,9 +122,8 @@ def _sizes(parameters: Mapping[str, EffectSize]) -> str:
     return f" (95 %: {', '.join(each)})" if each else ""
 
 
-def _others(one: EffectClass) -> str:
-    """The other effects of a class, as its sentence goes on."""
-    best = one.best
+def _others(one: EffectClass, best: Rival) -> str:
+    """The other effects of a class than its best, as its sentence goes on."""
     told = [n for n, p in one.equations.items() if p >= LIKELY * one.probability and n in one.kinds]
     others = [n for n in told if not _equation(n, best.effect)]
     kind = (

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, behinds, best_of, evidence_between, objections
@@ -78,7 +81,8 @@ def _met(search: SearchContext, opened: Round, nominal: Nominal) -> Round:
 def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
     """The round with its refits ranked and its winner, or what speaks against the best.
 
-    Ranked by what the fitted and the held-out data say together.
+    Ranked by what the fitted and the held-out data say together. Of those that are as good the likeliest wins: an effect's
+    probability before any data is shared by all its places and sources, so an offset goes before one of many couplings.
     """
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
@@ -90,7 +94,9 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
         return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=BEYOND)
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
     refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
-    winner = next((t for t in level if not refused[id(t)]), None)
+    many = Counter(c.effect for c in found)
+    likeliest = sorted(level, key=lambda t: 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.told)
+    winner = next((t for t in likeliest if not refused[id(t)]), None)
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
 

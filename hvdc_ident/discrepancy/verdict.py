@@ -130,10 +130,7 @@ def findings_of(
     share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
     found: list[Finding] = []
     for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
-        for one in likely(classes(group)):
-            best = one.best
-            put_in = (best.effect, best.at, best.source) == (own.effect, own.at, own.source)
-            found.append(replace(finding(of, one, own if put_in else None), share=share))
+        found += [replace(finding(of, one, own), share=share) for one in likely(classes(group))]
     freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
     if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
         found.append(replace(moved, share=share))

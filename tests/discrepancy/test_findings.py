@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.explain import sentence
 from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.discrepancy.remainder import remainder_of
-from hvdc_ident.discrepancy.result import EffectSize, Place, Rival
+from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
 from hvdc_ident.immutable import FrozenMap
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
@@ -97,6 +97,22 @@ def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(m
     found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
     (one,) = classes(members)
     assert told_as.finding(found, one).parameters["k"].ci95 == (-0.036, -0.025)
+
+
+def test_what_was_put_in_is_told_where_it_is_as_likely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sentence, sizes and the model that is written name the same place; one that is unlikely does not stand for its class."""
+    members = [
+        Rival("lag", (at,), behind, FrozenMap({"T": 0.03})) for at, behind in (("wm", 0.0), ("err", 0.5), ("w", 9.0))
+    ]
+    monkeypatch.setattr(told_as, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
+    monkeypatch.setattr(told_as, "_span", lambda _refit, _name: (0.029, 0.031))
+    found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
+    (one,) = classes(members)
+    size = FrozenMap({"T": EffectSize(0.04, (0.039, 0.041), "s")})
+    told = told_as.finding(found, one, FoundEffect("lag", ("err",), size, "err is late", 3))
+    assert told.text.startswith("err is late (95 %: 39 ms to 41 ms)") and told.parameters["T"].value == 0.04
+    told = told_as.finding(found, one, FoundEffect("lag", ("w",), size, "w is late", 3))
+    assert told.parameters["T"].value == 0.03 and "w is late" not in told.text
 
 
 def test_a_size_that_later_effects_moved_is_told_with_its_interval_there() -> None:

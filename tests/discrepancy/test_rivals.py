@@ -11,7 +11,7 @@ from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, simulate
-from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, rounds
 from hvdc_ident.discrepancy.classes import _akin, _equal, classes
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, as_recorded, behinds, objections
@@ -300,3 +300,15 @@ def test_a_refit_that_brings_many_times_what_scores_do_is_judged_by_that() -> No
     assert against(search, found.before, poor, deaf, first=True) == ""
     little = replace(poor, refit=replace(poor.refit, chi2=found.before.chi2 - 20.0))
     assert "its score is what noise gives" in against(search, found.before, little, deaf, first=True)
+
+
+def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = SearchContext(("offset", "conductance"), ("load",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+    found = one_round(search, plain(experiments(offset=0.05)), 1)
+    kinds = [c.effect for c in found.candidates]
+    assert kinds.count("offset") == 1 < kinds.count("conductance")
+    as_good = [CandidateFit(Pick(k, 0, 1.0, 500.0), found.trials[0].refit, 0.0) for k in range(len(kinds))]
+    monkeypatch.setattr(rounds, "against", lambda *_args, **_first: "")
+    for trials in (as_good, as_good[::-1]):
+        winner = rounds.closed(search, found, trials, 1).winner
+        assert winner is not None and kinds[winner.pick.candidate] == "offset"
